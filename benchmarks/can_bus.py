@@ -53,13 +53,15 @@ class _HubClient(asyncio.Protocol):
         self.inbound = b""
 
     def data_received(self, data: bytes) -> None:
-        from fieldtwin.emulators.endpoints.bus_hello import Hello
+        from fieldtwin.emulators.endpoints.bus_hello import BusHello
 
         data = self.inbound + data
         if not self.welcome and len(data) >= 24:
             self.welcome, data = True, data[24:]
             self.everybody.add(self)
-            self.transport.write(Hello(1_000_000, t_ns=int(asyncio.get_running_loop().time() * 1e9), window=64).pack())
+            self.transport.write(
+                BusHello(1_000_000, t_ns=int(asyncio.get_running_loop().time() * 1e9), window=64).pack()
+            )
         whole = len(data) - len(data) % 24
         data, self.inbound = data[:whole], data[whole:]
         if data:

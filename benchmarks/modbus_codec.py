@@ -28,7 +28,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import NULLMODEM_HOST
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -46,7 +46,7 @@ GOALS_US = {10: 12.0, 125: 90.0}
 
 def ours(framing: str, count: int, transactions: int) -> float:
     """Return the seconds for `transactions` reads of `count` registers."""
-    bank = MapBank([Span("holding", 0, len(VALUES))])
+    bank = MapBank([CellSpan("holding", 0, len(VALUES))])
     bank.poke("holding", 0, *VALUES)
     units = {UNIT: ModbusUnit(bank)}
     slave = MbapSlave(units) if framing == "mbap" else RtuSlave(units)

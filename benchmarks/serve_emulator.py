@@ -7,7 +7,7 @@ import sys
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -15,7 +15,7 @@ from fieldtwin.gateway.wallclock import WallClock
 
 
 async def main(port: int) -> None:
-    units = {1: ModbusUnit(MapBank([Span("holding", 0, 100)]))}
+    units = {1: ModbusUnit(MapBank([CellSpan("holding", 0, 100)]))}
     clock = WallClock()
     endpoint = Endpoint.parse(f"tcp://127.0.0.1:{port}")
     listener = await SocketListener.open(endpoint, lambda c: serve_mbap(c, MbapSlave(units), clock), 256)

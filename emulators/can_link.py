@@ -15,7 +15,7 @@ from fieldtwin.emulators.faults.can_engine import struck
 from fieldtwin.emulators.faults.can_fault import CanFault, CanPiece
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
 from fieldtwin.emulators.faults.fault import Active
-from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.emulators.faults.frames import FrameDirection
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import CanConnection
@@ -33,7 +33,7 @@ class CanLink:
     """
 
     def __init__(self, near: CanConnection, far: CanConnection, faults: WireFaults) -> None:
-        self.passed = dict.fromkeys(Way, 0)
+        self.passed = dict.fromkeys(FrameDirection, 0)
         """Frames that were forwarded, by direction."""
         self.lost = 0
         """Frames that the target bus did not accept, or for which there was no room in the queue."""
@@ -46,7 +46,7 @@ class CanLink:
 
     def start(self) -> None:
         """Start forwarding, and schedule the frames that faults add."""
-        for way, source in ((Way.REQUEST, self._near), (Way.REPLY, self._far)):
+        for way, source in ((FrameDirection.REQUEST, self._near), (FrameDirection.REPLY, self._far)):
             self._task(self._pump(source, way), f"CAN link, {way.value}")
         for active in self._faults.active.values():
             self._appear(active)
@@ -63,7 +63,7 @@ class CanLink:
             await end.aclose()
         self.ended.cancel()
 
-    async def _pump(self, source: CanConnection, way: Way) -> None:
+    async def _pump(self, source: CanConnection, way: FrameDirection) -> None:
         try:
             while True:
                 frame = await source.recv()
@@ -78,13 +78,13 @@ class CanLink:
             if not self.ended.done():
                 self.ended.set_result(e)
 
-    def _become(self, frame: CanFrame, way: Way) -> Sequence[CanPiece]:
+    def _become(self, frame: CanFrame, way: FrameDirection) -> Sequence[CanPiece]:
         pieces = struck(self._faults, way, frame, node_of(frame), self._now_ns()) if self._faults.active else None
         return (CanPiece(frame),) if pieces is None else pieces
 
-    async def _pass(self, frame: CanFrame, way: Way) -> None:
+    async def _pass(self, frame: CanFrame, way: FrameDirection) -> None:
         try:
-            await (self._far if way is Way.REQUEST else self._near).send(frame)
+            await (self._far if way is FrameDirection.REQUEST else self._near).send(frame)
         except WireError:
             self.lost += 1  # the transmit queue stays full; the next frame may fit
         else:
@@ -96,9 +96,9 @@ class CanLink:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
         for piece in active.fault.appears(active.aim.unit, active.random):
-            self._later(piece.delay_s + wait_s, piece.frame, Way.REPLY, active)
+            self._later(piece.delay_s + wait_s, piece.frame, FrameDirection.REPLY, active)
 
-    def _later(self, delay_s: float, frame: CanFrame, way: Way, only_while: Active | None = None) -> None:
+    def _later(self, delay_s: float, frame: CanFrame, way: FrameDirection, only_while: Active | None = None) -> None:
         if len(self._waiting) >= MOST_WAITING:
             self.lost += 1
             return

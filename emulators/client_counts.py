@@ -16,7 +16,7 @@ OLDER = "older clients"
 
 
 @dataclass(slots=True)
-class Counts:
+class ClientTraffic:
     """Requests that reached a device, and their replies. While the client is connected (`open`), its counts are kept."""
 
     requests: int = 0
@@ -28,9 +28,9 @@ class ClientCounts:
     """The counts of one bus, by client: ``HOST:PORT`` as the emulator sees it."""
 
     def __init__(self) -> None:
-        self._by_client: dict[str, Counts] = {}
+        self._by_client: dict[str, ClientTraffic] = {}
 
-    def of(self, client: str) -> Counts:
+    def of(self, client: str) -> ClientTraffic:
         """Return the counts of a client, for the caller to increase.
 
         The object stays the same while the client is remembered.
@@ -38,7 +38,7 @@ class ClientCounts:
         found = self._by_client.get(client)
         if found is None:
             self._forget_oldest()
-            found = self._by_client[client] = Counts()
+            found = self._by_client[client] = ClientTraffic()
         return found
 
     def add(self, client: str, requests: int, replies: int) -> None:

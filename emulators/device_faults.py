@@ -12,7 +12,7 @@ from typing import Any
 
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Aim, Kind, ValueFault
+from fieldtwin.emulators.faults.fault import Active, Aim, InjectionPoint, ValueFault
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted, parse_fault
 from fieldtwin.emulators.faults.values.value_ranges import check_fault
@@ -38,14 +38,14 @@ class DeviceFaults:
         """Return the faults of one wire of the device."""
         faults = WireFaults(framing)
         for spec in self._specs:
-            if spec.kind.kind is Kind.BYTES:
+            if spec.kind.kind is InjectionPoint.BYTES:
                 faults.put_in(self._active(spec))
         return faults
 
     def on_values(self, distortions: Distortions) -> None:
         """Inject the value faults into a device."""
         for spec in self._specs:
-            if spec.kind.kind is Kind.VALUE:
+            if spec.kind.kind is InjectionPoint.VALUE:
                 active = self._active(spec)
                 if isinstance(active.fault, ValueFault) and self._profile is not None:
                     active.fault.learn(self._profile.tags.values())
@@ -79,16 +79,16 @@ def check_device(spec: FaultSpec, profile: DeviceProfile | None) -> None:
             raise WrongAim(
                 key, f"fault {spec.id}: there is only one device, and no name is needed", hint="leave it out"
             )
-    if kind is Kind.CAN:
+    if kind is InjectionPoint.CAN:
         raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", expected="one of a line or socket")
     tag = _tag(aim, profile)
-    if kind is Kind.VALUE and profile is None:
+    if kind is InjectionPoint.VALUE and profile is None:
         raise WrongAim(
             "name",
             f"fault {spec.kind.name} changes the values of registers, and a recording alone does not describe them",
             hint="emulate a profile and give it the recording: fieldtwin emulate PROFILE --recording FILE",
         )
-    if kind is Kind.VALUE and tag is not None and tag.is_text:
+    if kind is InjectionPoint.VALUE and tag is not None and tag.is_text:
         raise WrongAim("register", f"{tag.name} is not a number", expected="a tag that is one")
     if profile is not None:
         check_fault(spec.make(), aim.register_, profile.tags.values())

@@ -177,7 +177,7 @@ def _plug(endpoint: Endpoint, options: LinkOptions) -> _Plug:
     )
 
 
-class Link:
+class EmulatedLink:
     """A running emulated connection between `near` and `far`.
 
     ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP,
@@ -375,7 +375,7 @@ async def run_link(
     options: LinkOptions | None = None,
     *,
     on_event: Callable[[str], None] | None = None,
-    on_ready: Callable[[Link], None] | None = None,
+    on_ready: Callable[[EmulatedLink], None] | None = None,
     faults: WireFaults | None = None,
 ) -> None:
     """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` strike the
@@ -384,7 +384,7 @@ async def run_link(
     Raises `UsageError` for endpoints that cannot be linked, `EndpointBusy` if the port to listen on is taken. A far
     side that cannot be reached yet is not an error: the link retries.
     """
-    link = Link(near, far, options, on_event, faults)
+    link = EmulatedLink(near, far, options, on_event, faults)
     await link.open()
     try:
         if on_ready is not None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 from fieldtwin.emulators.codec import decode, encode
-from fieldtwin.emulators.modbus.bank import BIT_TABLES, Access, Span, Table
+from fieldtwin.emulators.modbus.bank import BIT_TABLES, Access, CellSpan, Table
 from fieldtwin.emulators.modbus.fifo import MOST_READ, FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
@@ -91,7 +91,7 @@ def bytes_of(tag: Tag, cells: Sequence[int]) -> bytes:
     return b"".join(cell.to_bytes(2) for cell in cells)
 
 
-def spans_of(profile: DeviceProfile) -> list[Span]:
+def spans_of(profile: DeviceProfile) -> list[CellSpan]:
     """Return the cells of all tags, each once. A cell that belongs to several tags has the access rights of all of them."""
     read: dict[tuple[Table, int], bool] = {}
     written: dict[tuple[Table, int], bool] = {}
@@ -100,7 +100,7 @@ def spans_of(profile: DeviceProfile) -> list[Span]:
         for cell in ((at.table, address) for address in range(at.address, at.end)):
             read[cell] = read.get(cell, False) or tag.readable
             written[cell] = written.get(cell, False) or tag.writable
-    return [Span(*cell, 1, _access(read[cell], written[cell])) for cell in read]
+    return [CellSpan(*cell, 1, _access(read[cell], written[cell])) for cell in read]
 
 
 def _access(read: bool, written: bool) -> Access:

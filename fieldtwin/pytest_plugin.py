@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from fieldtwin.testing.handles import Device, Plc, Prototype
+    from fieldtwin.testing.handles import DeviceHandle, Plc, PrototypeHandle
     from fieldtwin.testing.outcome import ScenarioOutcome
     from fieldtwin.testing.results import Results
-    from fieldtwin.testing.runner import Runner
+    from fieldtwin.testing.runner import WorkerProcess
     from fieldtwin.testing.running_plc import RunningPlc
     from fieldtwin.testing.scenario_file import ScenarioFile
-    from fieldtwin.testing.wire import Wire
+    from fieldtwin.testing.wire import RecordedTraffic
 
 SUFFIX = ".scenario.yaml"
 MARKER = "fieldtwin"
-_RUNNER: pytest.StashKey[Runner] = pytest.StashKey()
+_RUNNER: pytest.StashKey[WorkerProcess] = pytest.StashKey()
 _RESULTS: pytest.StashKey[Results] = pytest.StashKey()
-_WIRES: pytest.StashKey[list[Wire]] = pytest.StashKey()
+_WIRES: pytest.StashKey[list[RecordedTraffic]] = pytest.StashKey()
 _OUTCOMES: pytest.StashKey[list[ScenarioOutcome]] = pytest.StashKey()
 _SHOWN = 20
 
@@ -127,12 +127,12 @@ def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
 # -- fixtures -----------------------------------------------------------------------------------------------------------
 
 
-def _runner(config: pytest.Config) -> Runner:
+def _runner(config: pytest.Config) -> WorkerProcess:
     """The other process, started when it is first needed."""
     if _RUNNER not in config.stash:
-        from fieldtwin.testing.runner import Runner, command_of
+        from fieldtwin.testing.runner import WorkerProcess, command_of
 
-        config.stash[_RUNNER] = Runner(
+        config.stash[_RUNNER] = WorkerProcess(
             command_of(config.getoption("--fieldtwin-command")), trust=config.getoption("--fieldtwin-trust")
         )
     return config.stash[_RUNNER]
@@ -161,17 +161,17 @@ def _or_fail(make: Callable[[], Any]) -> Any:
 
 
 @pytest.fixture
-def emulate(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
+def emulate(request: pytest.FixtureRequest) -> Iterator[Callable[..., DeviceHandle]]:
     """Makes devices: ``emulate("ctd-reference", on="tcp", unit=3)``. They end with the test."""
     runner, made = _runner(request.config), list[int]()
 
-    def make(device: str, **more: Any) -> Device:
-        from fieldtwin.testing.handles import Device
+    def make(device: str, **more: Any) -> DeviceHandle:
+        from fieldtwin.testing.handles import DeviceHandle
 
         said = {"seed": request.config.getoption("--fieldtwin-seed"), **_places(request), **more}
         answer = _or_fail(lambda: runner.call("device", device=device, **said))
         made.append(answer["id"])
-        found = Device(runner, answer["id"], "device", answer)
+        found = DeviceHandle(runner, answer["id"], "device", answer)
         request.node.stash.setdefault(_WIRES, []).append(found.wire)
         return found
 
@@ -186,7 +186,7 @@ def _places(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 @pytest.fixture
-def device(request: pytest.FixtureRequest, emulate: Callable[..., Device]) -> Device:
+def device(request: pytest.FixtureRequest, emulate: Callable[..., DeviceHandle]) -> DeviceHandle:
     """The device that ``@pytest.mark.fieldtwin(device=...)`` names, on a wire of its own."""
     said = {key: value for key, value in _said(request).items() if key not in ("system", "prototype", "listen", "plc")}
     if "device" not in said:
@@ -195,9 +195,9 @@ def device(request: pytest.FixtureRequest, emulate: Callable[..., Device]) -> De
 
 
 @pytest.fixture
-def prototype(request: pytest.FixtureRequest) -> Iterator[Prototype]:
+def prototype(request: pytest.FixtureRequest) -> Iterator[PrototypeHandle]:
     """The simulated field devices of the system that ``@pytest.mark.fieldtwin(system=...)`` names; no gateway, no PLC."""
-    from fieldtwin.testing.handles import Prototype
+    from fieldtwin.testing.handles import PrototypeHandle
 
     said, runner = _said(request), _runner(request.config)
     if "system" not in said:
@@ -205,19 +205,19 @@ def prototype(request: pytest.FixtureRequest) -> Iterator[Prototype]:
     keys = ("system", "prototype", "recordings", "speed", "listen", "seed")
     args = {"seed": request.config.getoption("--fieldtwin-seed"), **{key: said[key] for key in keys if key in said}}
     answer = _or_fail(lambda: runner.call("system", **_places(request), **args))
-    made = Prototype(runner, answer)
+    made = PrototypeHandle(runner, answer)
     request.node.stash.setdefault(_WIRES, []).append(made.wire)
     yield made
     _or_fail(lambda: runner.call("end", id=answer["id"]))
 
 
 @pytest.fixture
-def wire(request: pytest.FixtureRequest) -> Wire:
+def wire(request: pytest.FixtureRequest) -> RecordedTraffic:
     """What is exchanged on the wire of `device`, or on those of `prototype`."""
     if "system" in _said(request) or "prototype" in request.fixturenames:
-        whole: Prototype = request.getfixturevalue("prototype")
+        whole: PrototypeHandle = request.getfixturevalue("prototype")
         return whole.wire
-    one: Device = request.getfixturevalue("device")
+    one: DeviceHandle = request.getfixturevalue("device")
     return one.wire
 
 
@@ -230,7 +230,7 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
 
     said, runner = _said(request), _runner(request.config)
     if "plc" not in said and "system" in said:
-        whole: Prototype = request.getfixturevalue("prototype")
+        whole: PrototypeHandle = request.getfixturevalue("prototype")
         places = _places(request)
         yield _or_fail(lambda: RunningPlc(runner, whole.id, places["profiles"]))
         return  # it ends with the field simulator

@@ -41,7 +41,7 @@ from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.plc.acts import Acts
 from fieldtwin.plc.config import PlcConfig
 from fieldtwin.plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.sources import changed
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.plc.tag_view import TagView
@@ -56,7 +56,7 @@ class PlcProcess:
     def __init__(self, config: PlcConfig, image: Image) -> None:
         self._config = config
         self._alarm = StuckAlarm(config.stuck_ms) if config.stuck_ms and hasattr(signal, "setitimer") else None
-        self._runner = Runner(config, image, monotonic_ns, self._alarm)
+        self._runner = TaskRunner(config, image, monotonic_ns, self._alarm)
         self._view = TagView(image, self._runner)
         self._acts = Acts(config.audit_path)
         self._loop = asyncio.new_event_loop()

@@ -187,7 +187,7 @@ class Outbox:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class SourceLine:
     """A line of a program's source.
 
     It is stored as an instruction of a code object; the line is looked up only when it is shown."""
@@ -276,10 +276,10 @@ class Program(ABC):
         """
         return None
 
-    def place(self, name: str) -> Place | None:
+    def place(self, name: str) -> SourceLine | None:
         """Return the line that assigned output `name` last; None while it has its initial value, or a value set from outside."""
         assigned = self._assigned.get(name)
-        return Place(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
+        return SourceLine(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
 
     def put(self, name: str, value: Scalar) -> None:
         """Set a variable from outside the logic, for example for a force."""
@@ -330,13 +330,13 @@ __all__ = [
     "InputTripped",
     "Message",
     "Outbox",
-    "Place",
     "Program",
     "ProgramFailed",
     "ProgramStuck",
     "Role",
     "ScanInfo",
     "ScanStuck",
+    "SourceLine",
     "Variable",
     "message_input",
     "message_output",

@@ -100,7 +100,7 @@ def machine_key(program: StateMachine) -> Hashable:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class SearchResult:
     """The result of a search. `broken`: the invariant that does not hold (or the error that a scan raised), and `way`
     to it, scan by scan.
 
@@ -125,7 +125,7 @@ class Result:
         return self.complete and not self.broken
 
 
-def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -> Result:
+def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -> SearchResult:
     """Visit every reachable state, until an invariant is broken or the limits are reached.
 
     Raises `UsageError` if `domain` and the program's inputs differ, and if a program in Python has no key.
@@ -139,23 +139,23 @@ def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -
     while waiting:
         point = waiting.popleft()
         if point.number >= max_depth:
-            return Result(len(seen), transitions, depth, complete=False, reason=f"deeper than {max_depth} scans")
+            return SearchResult(len(seen), transitions, depth, complete=False, reason=f"deeper than {max_depth} scans")
         depth = max(depth, point.number + 1)
         for given in choices:
             following = point.after(given)
             transitions += 1
             broken = _broken(proof, following, given)
             if broken:
-                return Result(len(seen), transitions, following.number, False, broken, tuple(following.way()))
+                return SearchResult(len(seen), transitions, following.number, False, broken, tuple(following.way()))
             key = _key(proof, following)
             if key not in seen:
                 if len(seen) >= max_states:
-                    return Result(
+                    return SearchResult(
                         len(seen), transitions, depth, complete=False, reason=f"more than {max_states} states"
                     )
                 seen.add(key)
                 waiting.append(following)
-    whole = Result(len(seen), transitions, depth, complete=True)
+    whole = SearchResult(len(seen), transitions, depth, complete=True)
     return whole if proof.key is None else _tested(proof, choices, seen, whole)
 
 
@@ -181,7 +181,7 @@ def _key(proof: Proof, point: _Point) -> Hashable:
     return point.number == 0, proof.key(program), tuple(blocks)
 
 
-def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: Result) -> Result:
+def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: SearchResult) -> SearchResult:
     """Return `whole`, unless a random path breaks an invariant or reaches a state that the search did not visit."""
     random = Random(0)
     for _ in range(WALKS):
@@ -192,10 +192,10 @@ def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: 
             way.append(given)
             point = _Point(point.program, point.now_ns + round(given.ms * NS_PER_MS), point.number + 1, None, None)
             if broken := _broken(proof, point, given):
-                return Result(whole.states, whole.transitions, len(way), False, broken, tuple(way))
+                return SearchResult(whole.states, whole.transitions, len(way), False, broken, tuple(way))
             if _key(proof, point) not in seen:
                 reason = "the key omits a deciding variable: two states with the same key continue differently"
-                return Result(whole.states, whole.transitions, whole.depth, complete=False, reason=reason)
+                return SearchResult(whole.states, whole.transitions, whole.depth, complete=False, reason=reason)
     return whole
 
 

@@ -29,7 +29,7 @@ from fieldtwin.gateway.core.image.image import (
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.forces import Forces
-from fieldtwin.plc.program import Outbox, Place, ProgramFailed, Variable
+from fieldtwin.plc.program import Outbox, ProgramFailed, SourceLine, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
 """Returns a program's inputs as it read them, by variable."""
@@ -39,7 +39,7 @@ MAX_CHANGES = 16
 """How many changes of a tag are remembered, with what the program saw when it made them."""
 
 
-class Output:
+class PublishedVariable:
     """One published variable, and the attribute in which the program keeps it.
 
     `taken` is the index in INPUTS of the tag that counts how many of its messages were taken."""
@@ -60,7 +60,7 @@ class Output:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class TagChange:
     """A change of a tag: the program that made it, and what it saw, for the answer to "why". `inputs` are the
     program's, as it read them."""
 
@@ -72,7 +72,7 @@ class Change:
     after: Scalar | None
     inputs: dict[str, Scalar | None]
     forced: bool = False
-    place: Place | None = None
+    place: SourceLine | None = None
     """The line of the program that assigned `after`."""
 
     def describe(self, now_ns: int) -> dict[str, Any]:
@@ -96,11 +96,11 @@ class OutputImage:
     def __init__(self, image: Image, programs: Sequence[BoundProgram], forces: Forces | None = None) -> None:
         self.forces = Forces() if forces is None else forces
         self.writer = image.writer(OUTPUTS)
-        self.outputs: list[Output] = []
-        self.outboxes: list[tuple[Output, Outbox]] = []
+        self.outputs: list[PublishedVariable] = []
+        self.outboxes: list[tuple[PublishedVariable, Outbox]] = []
         self.consumed: list[str] = []
-        self.changes: dict[str, deque[Change]] = {}
-        self.on_change: Callable[[Change], None] | None = None
+        self.changes: dict[str, deque[TagChange]] = {}
+        self.on_change: Callable[[TagChange], None] | None = None
         """Called with each change. It must not raise."""
         self._readers: dict[str, RegionReader] = {}
         self._read: list[tuple[int, RegionReader, str]] = []
@@ -116,7 +116,7 @@ class OutputImage:
         """Whether the collected values equal those published last, apart from times."""
         self._room_for: Sequence[Scalar | None] | None = None
         """The INPUTS from which the room in the outboxes was computed; None if messages were sent since."""
-        self._by_owner: dict[str, list[Output]] = {}
+        self._by_owner: dict[str, list[PublishedVariable]] = {}
         for output in self.outputs:
             self._by_owner.setdefault(output.owner, []).append(output)
         self._resumed = self._before(image)
@@ -138,7 +138,7 @@ class OutputImage:
             if self.consumed:
                 raise FileInvalid(f"{spec.name} comes after the consumed tags", expected="a layout of process_image")
             bound, variable = made[spec.name]
-            source = Output(bound, variable, spec, index)
+            source = PublishedVariable(bound, variable, spec, index)
             self.outputs.append(source)
             if source.outbox is not None:
                 source.taken = inputs.index.get(taken_name(spec.name))
@@ -200,7 +200,7 @@ class OutputImage:
             if seen is not None:
                 self._collect(outputs, now_ns, scan, seen)
 
-    def _collect(self, outputs: list[Output], now_ns: int, scan: int, seen: Seen) -> None:
+    def _collect(self, outputs: list[PublishedVariable], now_ns: int, scan: int, seen: Seen) -> None:
         """Collect the values of one program."""
         values, forced, namespace = self._values, self.forces.outputs, outputs[0].namespace
         for output in outputs:
@@ -227,7 +227,9 @@ class OutputImage:
             if value is not before or broken:
                 kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
                 place = output.program.place(output.name) if force is None else None
-                change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place)
+                change = TagChange(
+                    output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place
+                )
                 kept.append(change)
                 if self.on_change is not None:
                     self.on_change(change)

@@ -19,7 +19,7 @@ _LOG_CAPACITY = 3
 _SHORT, _TOO_LONG = b"a", b"b" * 300
 
 
-class Watched(Relay):
+class RelayWithHistory(Relay):
     """The relay, with the history that the invariants need."""
 
     queue_capacity = 3
@@ -54,7 +54,7 @@ class Watched(Relay):
 
 
 PROOF = Proof(
-    make=Watched,
+    make=RelayWithHistory,
     domain={
         "command": [None, *(encode_period(p).data for p in (-32768, -1, 0, 1, 32767)), b"", b"\1\2\3"],
         "sample": [None, _SHORT, _TOO_LONG],

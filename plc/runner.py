@@ -24,10 +24,10 @@ from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.config import PlcConfig, TaskSpec
 from fieldtwin.plc.forces import Forces, checked
 from fieldtwin.plc.program import Program
-from fieldtwin.plc.publishing import Change, OutputImage
+from fieldtwin.plc.publishing import OutputImage, TagChange
 from fieldtwin.plc.retain import Retained
 from fieldtwin.plc.scan import Scan
-from fieldtwin.plc.sources import Source, sources
+from fieldtwin.plc.sources import ProgramSource, sources
 from fieldtwin.plc.start import InputsMissing, Starts
 from fieldtwin.plc.status import PlcStatus, StopsStatus, TaskStatus
 from fieldtwin.plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
@@ -42,7 +42,7 @@ _ROUNDING = 1e-9  # intervals such as 0.3 ms are not exact multiples of each oth
 
 
 @dataclass
-class Entry:
+class TaskEntry:
     """A task, its scan, and for a SINGLE task the state of its trigger at the last check."""
 
     spec: TaskSpec
@@ -55,7 +55,7 @@ class Entry:
         return self.spec.single
 
 
-class Runner:
+class TaskRunner:
     """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, and `Unreachable` if
     retained variables cannot be kept."""
 
@@ -65,7 +65,7 @@ class Runner:
         image: Image,
         now_ns: Callable[[], int],
         guard: Guard | None = None,
-        on_change: Callable[[Change], None] | None = None,
+        on_change: Callable[[TagChange], None] | None = None,
     ) -> None:
         """Create the runner. `on_change` is called whenever a program changes an output or a local."""
         self.config = config
@@ -73,11 +73,11 @@ class Runner:
         self.restarts = 0
         self._stops = 0
         self._last_stop = ""
-        self.entries: list[Entry] = []
-        self._triggered: list[Entry] = []
+        self.entries: list[TaskEntry] = []
+        self._triggered: list[TaskEntry] = []
         """The entries of SINGLE tasks."""
         self.programs: list[BoundProgram] = []
-        self.sources: list[Source] = []
+        self.sources: list[ProgramSource] = []
         """The files from which the programs were made."""
         self.outputs: OutputImage
         self.retained: Retained
@@ -91,8 +91,8 @@ class Runner:
         self._restart_ns = _NEVER_NS
         self._started_ns = 0
         self._began = False
-        self._stopped: Entry | None = None
-        self._ran: Entry | None = None
+        self._stopped: TaskEntry | None = None
+        self._ran: TaskEntry | None = None
         self._stepped = 0
         self._ended: StopReason | None = None
         self._assemble(self._made(), cold=config.cold)
@@ -145,7 +145,7 @@ class Runner:
             )
             cycle_ms = _EVENT_MS if spec.single else spec.interval_ms
             timing = TaskConfig(cycle_ms, spec.late_ms or config.late_ms, config.stop_after, spec.name)
-            self.entries.append(Entry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
+            self.entries.append(TaskEntry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
         self._triggered = [entry for entry in self.entries if entry.single]
 
     def _check(self, specs: tuple[TaskSpec, ...]) -> None:
@@ -231,7 +231,7 @@ class Runner:
             entry.task.stop()
             self._on_stopped(entry)
 
-    def _look_for_delay(self, entry: Entry) -> None:
+    def _look_for_delay(self, entry: TaskEntry) -> None:
         """Record which task was still running when `entry` became due, because it may have caused the late scan."""
         before = self._ran
         if before is not None and before is not entry:
@@ -243,7 +243,7 @@ class Runner:
         else:
             entry.task.held_up_by = ""
 
-    def _next(self, now_ns: int) -> Entry:
+    def _next(self, now_ns: int) -> TaskEntry:
         """Return the task of the highest priority of those that are due; if none is due, the task that will be due
         first."""
         due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
@@ -262,7 +262,7 @@ class Runner:
                 entry.task.steps += stepped
             entry.before = now
 
-    def _on_stopped(self, entry: Entry) -> None:
+    def _on_stopped(self, entry: TaskEntry) -> None:
         for other in self.entries:
             other.task.stop()
         self._stopped = entry
@@ -272,7 +272,7 @@ class Runner:
         else:
             self._ended = entry.task.stop_reason
 
-    def _restart_by_itself(self, stopped: Entry) -> None:
+    def _restart_by_itself(self, stopped: TaskEntry) -> None:
         try:
             self.restart()
         except FieldtwinError as e:  # the programs cannot be created, so the PLC stays stopped and reports why

@@ -19,7 +19,7 @@ from fieldtwin.plc.binding import BoundProgram
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ProgramSource:
     """The file of one program as it was when the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
 
     program: str
@@ -34,7 +34,7 @@ class Source:
         return {"program": self.program, "path": self.path, "cure": cure}
 
 
-def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> list[Source]:
+def sources(programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = ()) -> list[ProgramSource]:
     """Return the files of `programs`, which were just created. `before`: the sources of the programs that they
     replace."""
     imported = {source.path: source.digest for source in before if not source.compiled}
@@ -43,9 +43,9 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> 
         made = type(bound.program)
         path = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None) or ""
         digest = imported.get(path) or _digest(path)
-        found.append(Source(bound.name, path, digest, bool(made.source_path)))
+        found.append(ProgramSource(bound.name, path, digest, bool(made.source_path)))
         if path and not made.source_path:
-            found += [Source(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
+            found += [ProgramSource(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
     return found
 
 
@@ -64,7 +64,7 @@ def _beside(path: str) -> list[str]:
     return sorted(file for file in files if str(Path(file).parent) in near)
 
 
-def changed(known: Sequence[Source]) -> list[Source]:
+def changed(known: Sequence[ProgramSource]) -> list[ProgramSource]:
     """Return the sources whose file has a different content now, or cannot be read any more."""
     return [source for source in known if source.digest and _digest(source.path) != source.digest]
 

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.forces import Force
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 
 MAX_AT_ONCE = 64
 """How many tags one answer may have: a request between two scans must not delay the next one. It takes some 1 ms,
@@ -32,7 +32,7 @@ def matches(tag: str, pattern: str) -> bool:
 class TagView:
     """The view of the tags in the image that `runner` uses."""
 
-    def __init__(self, image: Image, runner: Runner) -> None:
+    def __init__(self, image: Image, runner: TaskRunner) -> None:
         self._runner = runner
         self._outputs = image.reader(OUTPUTS)
         self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}

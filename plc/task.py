@@ -50,7 +50,7 @@ class Guard(Protocol):
 
 
 class Driven(Protocol):
-    """The object that is driven: fieldtwin.plc.runner.Runner, CyclicTask."""
+    """The object that is driven: fieldtwin.plc.runner.TaskRunner, CyclicTask."""
 
     @property
     def running(self) -> bool: ...

@@ -20,7 +20,7 @@ from fieldtwin.emulators.canopen.aborts import Abort, abort
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.canopen.emcy import Emergency
 from fieldtwin.emulators.canopen.node_data import NodeData
-from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service, Source
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, NodeService, ObjectSource
 
 Number = int | float
 
@@ -111,11 +111,11 @@ Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
 """Called with all values that the device would hold and now_ns; returns the values that it holds instead. For faults."""
 
 
-class Behaviour(Service):
-    """The connection of a model with its node. It is also the node's source of values (see `service.Source`)."""
+class Behaviour(NodeService):
+    """The connection of a model with its node. It is also the node's source of values (see `service.ObjectSource`)."""
 
     def __init__(
-        self, model: DeviceModel, source: Source | None, data: NodeData, distort: Distort | None = None
+        self, model: DeviceModel, source: ObjectSource | None, data: NodeData, distort: Distort | None = None
     ) -> None:
         self._distort = distort
         self._model = model

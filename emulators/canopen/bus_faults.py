@@ -9,7 +9,7 @@ from __future__ import annotations
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
 from fieldtwin.emulators.canopen.sdo_channels import RESPONSE
-from fieldtwin.emulators.canopen.service import Core, Service
+from fieldtwin.emulators.canopen.service import Core, NodeService
 from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
 from fieldtwin.gateway.core.canframe import CanFrame
 
@@ -18,7 +18,7 @@ OVERRUN, PASSIVE, RECOVERED, COLLISION = 0x8110, 0x8120, 0x8140, 0x8150
 _MUTE = "bus-off"
 
 
-class BusFaults(Service):
+class BusFaults(NodeService):
     """The node's reaction to events of its controller: silence, emergencies and the reaction of 1029h."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:

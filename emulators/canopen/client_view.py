@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
 from fieldtwin.emulators.canopen.dictionary import Key
-from fieldtwin.emulators.canopen.service import Core, Service
+from fieldtwin.emulators.canopen.service import Core, NodeService
 from fieldtwin.emulators.canopen.tpdo import Tpdos
 
 
@@ -17,14 +17,14 @@ class ClientView:
     """An `ObjectAccess` to the live values. `refusals` are objects that the device refuses for device-specific reasons."""
 
     def __init__(
-        self, core: Core, services: Iterable[Service], tpdos: Tpdos, refusals: Mapping[Key, Abort] | None = None
+        self, core: Core, services: Iterable[NodeService], tpdos: Tpdos, refusals: Mapping[Key, Abort] | None = None
     ) -> None:
         self._core = core
         self._services = tuple(services)
         self._tpdos = tpdos
         self._refusals = dict(refusals or {})
 
-    def add(self, service: Service) -> None:
+    def add(self, service: NodeService) -> None:
         """Add a service. It is for the SDO servers, which are created after this view because they use it."""
         self._services += (service,)
 
@@ -66,5 +66,5 @@ class ClientView:
         if key in self._refusals:
             raise abort(*key, self._refusals[key])
 
-    def _owners(self, index: int) -> list[Service]:
+    def _owners(self, index: int) -> list[NodeService]:
         return [service for service in self._services if service.owns(index)]

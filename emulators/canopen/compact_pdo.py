@@ -8,7 +8,7 @@ with the identifiers of the predefined connection set as far as it defines them.
 from __future__ import annotations
 
 from fieldtwin.emulators.canopen.eds_text import Section
-from fieldtwin.emulators.canopen.entries import RECORD, DictionaryObject, Entry
+from fieldtwin.emulators.canopen.entries import RECORD, DictionaryObject, SubindexEntry
 
 _U8, _U16, _U32 = 0x05, 0x06, 0x07
 _PARAMETERS = {1: ("COB-ID", _U32), 2: ("Transmission type", _U8), 3: ("Inhibit time", _U16)} | {
@@ -51,7 +51,7 @@ def implied_pdos(info: Section, objects: dict[int, DictionaryObject]) -> dict[in
 def _communication(index: int, mask: int, number: int, base: int) -> DictionaryObject:
     predefined = number < _PREDEFINED
     cob_id = base + 0x100 * number if predefined else _INVALID
-    entries: dict[int, Entry] = {}
+    entries: dict[int, SubindexEntry] = {}
     for sub, (name, data_type) in _PARAMETERS.items():
         if mask >> (sub - 1) & 1:
             value = {1: cob_id, 2: 255}.get(sub, 0)
@@ -68,6 +68,6 @@ def _mapping(index: int) -> DictionaryObject:
 
 def _entry(
     index: int, sub: int, name: str, data_type: int, value: int, *, access: str = "rw", relative: bool = False
-) -> Entry:
+) -> SubindexEntry:
     size = {_U8: 1, _U16: 2, _U32: 4}[data_type]
-    return Entry(index, sub, name, data_type, access, False, value.to_bytes(size, "little"), relative)
+    return SubindexEntry(index, sub, name, data_type, access, False, value.to_bytes(size, "little"), relative)

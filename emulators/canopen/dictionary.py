@@ -20,8 +20,8 @@ from fieldtwin.emulators.canopen.entries import DOMAIN_OBJECT as DOMAIN_OBJECT
 from fieldtwin.emulators.canopen.entries import RECORD as RECORD
 from fieldtwin.emulators.canopen.entries import VAR as VAR
 from fieldtwin.emulators.canopen.entries import DictionaryObject as DictionaryObject
-from fieldtwin.emulators.canopen.entries import Entry as Entry
 from fieldtwin.emulators.canopen.entries import Key as Key
+from fieldtwin.emulators.canopen.entries import SubindexEntry as SubindexEntry
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import read_input
 
@@ -73,12 +73,12 @@ class Dictionary:
     def __contains__(self, index: object) -> bool:
         return index in self.objects
 
-    def entry(self, index: int, subindex: int) -> Entry | None:
+    def entry(self, index: int, subindex: int) -> SubindexEntry | None:
         """Return the entry, or None if it does not exist."""
         found = self.objects.get(index)
         return found.entries.get(subindex) if found else None
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[SubindexEntry]:
         """Return all entries, sorted by index and subindex."""
         for index in sorted(self.objects):
             yield from (self.objects[index].entries[sub] for sub in sorted(self.objects[index].entries))
@@ -233,7 +233,7 @@ def _read_object(index: int, section: Section, sections: dict[str, Section]) -> 
         if kind not in _HOLDS_NO_VALUE:
             section.note(f"ObjectType {kind:X}h of [{section.name}] is unknown, the object is left out", "ObjectType")
         return None
-    entries: dict[int, Entry] = {}
+    entries: dict[int, SubindexEntry] = {}
     count = section.number("CompactSubObj", 0)
     if count == 255:  # the highest subindex is 254 (CiA 306, 4.7.2); several public files count one more
         section.note(f"CompactSubObj 255 of [{section.name}] is taken as 254, the highest subindex", "CompactSubObj")
@@ -241,7 +241,7 @@ def _read_object(index: int, section: Section, sections: dict[str, Section]) -> 
     if not 0 <= count <= 254:
         raise section.error("CompactSubObj", "CompactSubObj", expected="0 to 254", got=str(count))
     if count:
-        entries[0] = Entry(index, 0, "Highest subindex supported", 0x05, "ro", False, bytes([count]))
+        entries[0] = SubindexEntry(index, 0, "Highest subindex supported", 0x05, "ro", False, bytes([count]))
         names = sections.get(f"{index:04x}name")
         values = sections.get(f"{index:04x}value")
         for listed in (names, values):
@@ -274,7 +274,7 @@ def _read_subobjects(sections: dict[str, Section], objects: dict[int, Dictionary
 
 def _read_entry(
     index: int, subindex: int, section: Section, sections: dict[str, Section], name: str, value_text: str = ""
-) -> Entry:
+) -> SubindexEntry:
     data_type = _basic_type(section, sections)
     if not section.text("AccessType"):
         section.note(f"AccessType of [{section.name}] is missing, taken as rw", "AccessType")
@@ -288,7 +288,7 @@ def _read_entry(
     if low is not None and high is not None and low > high:
         section.note(f"LowLimit of [{section.name}] is above its HighLimit, both are left out", "LowLimit")
         low = high = None
-    return Entry(
+    return SubindexEntry(
         index=index,
         subindex=subindex,
         name=name,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 
 COMMUNICATION_ERROR = 0x8100
 HEARTBEAT_LOST = 0x8130
@@ -28,7 +28,7 @@ _UNIT_NS = 100_000
 """1015h and the inhibit times of PDOs count in units of 100 microseconds."""
 
 
-class Emergency(Service):
+class Emergency(NodeService):
     """Active errors by code and source (two heartbeats may be missing); the error register is the union of their bits."""
 
     def __init__(self, core: Core) -> None:

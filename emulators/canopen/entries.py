@@ -13,7 +13,7 @@ VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class SubindexEntry:
     """One subindex. `default` is in bytes as sent; with `node_relative` the node ID is added to it.
 
     `size` is the value's length in bytes, None if the length varies. `low` and `high` are inclusive. `configured` says that
@@ -62,4 +62,4 @@ class DictionaryObject:
     index: int
     name: str
     kind: int
-    entries: dict[int, Entry]
+    entries: dict[int, SubindexEntry]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, NodeService
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
@@ -35,7 +35,7 @@ class ErrorReaction:
             self._change_state(NmtState.STOPPED, now_ns)
 
 
-class HeartbeatProducer(Service):
+class HeartbeatProducer(NodeService):
     """The producer that sends the state every 1017h milliseconds. A newly written period begins immediately, with a heartbeat."""
 
     due_ns: int = NEVER
@@ -80,7 +80,7 @@ class _Watched:
     lost: bool = False
 
 
-class HeartbeatConsumer(Service):
+class HeartbeatConsumer(NodeService):
     """The monitor of the nodes of 1016h, each from its first heartbeat on. A loss causes EMCY 8130h and the reaction of 1029h."""
 
     due_ns: int = NEVER

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _SOURCE = "life guarding"
 
 
-class NodeGuarding(Service):
+class NodeGuarding(NodeService):
     """The guarded side: it answers guarding requests and monitors that they arrive."""
 
     due_ns: int = NEVER

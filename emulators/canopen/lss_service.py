@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fieldtwin.emulators.canopen.lss import BIT_RATES, FROM_SLAVE, UNCONFIGURED, Identity, LssSlave, LssStore
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _MUTE = "bit timing"
 
 
-class LssService(Service):
+class LssService(NodeService):
     """The LSS slave of one node. It calls `boot` with the time when an unconfigured node has got a pending node ID."""
 
     due_ns: int = NEVER

@@ -37,15 +37,15 @@ from fieldtwin.emulators.canopen.sdo_channels import SdoChannels
 from fieldtwin.emulators.canopen.service import (
     NEVER,
     AnswersReads,
-    Change,
     Core,
     Given,
     Held,
     NmtState,
     NodeCounters,
+    NodeService,
+    ObjectChange,
+    ObjectSource,
     SentPdo,
-    Service,
-    Source,
 )
 from fieldtwin.emulators.canopen.storage import Storage
 from fieldtwin.emulators.canopen.sync import Sync
@@ -84,7 +84,7 @@ class NodeContext:
     `lss_store` is the result of LSS's store command. `journal_size` limits both journals: older entries are dropped.
     """
 
-    source: Source | None = None
+    source: ObjectSource | None = None
     model: DeviceModel | None = None
     held: Held | None = None
     given: Given | None = None
@@ -133,7 +133,7 @@ class CanopenNode:
         self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed, self._rpdo_wrote, self._sync.in_window)
         self._time = TimeService(core, context.time_period_ms * NS_PER_MS)
         self._lss = LssService(core, context.lss_store, self._boot) if lss else None
-        services: list[Service] = [self._emergency, self._consumer, self._guarding, self._faults]
+        services: list[NodeService] = [self._emergency, self._consumer, self._guarding, self._faults]
         services += [self._behaviour] if self._behaviour else []
         services += [self._heartbeat, self._sync, self._time, self._rpdos, self._tpdos, Storage(core)]
         services += [self._lss] if self._lss else []
@@ -143,7 +143,7 @@ class CanopenNode:
         view.add(self._sdo)
         self._services = (self._sdo, *services)
         # Most services never wait for a time; the others are checked with every frame and every tick.
-        self._timed = tuple(s for s in self._services if type(s).tick is not Service.tick and s.waits)
+        self._timed = tuple(s for s in self._services if type(s).tick is not NodeService.tick and s.waits)
         self._wakers = tuple(s for s in self._timed if s is not self._behaviour)
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)
@@ -174,7 +174,7 @@ class CanopenNode:
         return self._core.journal
 
     @property
-    def changes(self) -> deque[Change]:
+    def changes(self) -> deque[ObjectChange]:
         """NMT states, writes and errors, oldest first, bounded."""
         return self._core.changes
 

@@ -11,14 +11,14 @@ from enum import IntEnum
 
 from fieldtwin.emulators.canopen import codec
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.dictionary import Dictionary, Entry, Key
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Key, SubindexEntry
 from fieldtwin.gateway.core.errors import UsageError
 
 COMMUNICATION = range(0x1000, 0x2000)
 _NEVER_STORED = frozenset({0x1001, 0x1003, 0x1010, 0x1011})
 
 
-class Group(IntEnum):
+class ParameterGroup(IntEnum):
     """The parameter groups of 1010h and 1011h by subindex (CiA 301, 7.5.2.13)."""
 
     ALL = 1
@@ -26,9 +26,9 @@ class Group(IntEnum):
     APPLICATION = 3
 
     def holds(self, index: int) -> bool:
-        if self is Group.ALL:
+        if self is ParameterGroup.ALL:
             return True
-        return (index in COMMUNICATION) == (self is Group.COMMUNICATION)
+        return (index in COMMUNICATION) == (self is ParameterGroup.COMMUNICATION)
 
 
 class NodeData:
@@ -55,7 +55,7 @@ class NodeData:
         self.node_id = node_id
         self._factory = {entry.key: entry.initial(node_id) for entry in self.dictionary.entries()} | self._given
 
-    def find(self, index: int, subindex: int) -> Entry:
+    def find(self, index: int, subindex: int) -> SubindexEntry:
         """Return the entry. Raises `SdoAborted` with 06020000 or 06090011 if it does not exist."""
         entry = self.dictionary.entry(index, subindex)
         if entry is None:
@@ -120,7 +120,7 @@ class NodeData:
         if entry is not None and entry.size is not None:
             self.put(index, subindex, value.to_bytes(entry.size, "little"))
 
-    def check_value(self, entry: Entry, raw: bytes) -> None:
+    def check_value(self, entry: SubindexEntry, raw: bytes) -> None:
         """Check length and limits of a value from the bus. Raises `SdoAborted` (06070012/13, 06090031/32)."""
         self.check_size(entry, len(raw))
         if not codec.is_number(entry.data_type):
@@ -134,7 +134,7 @@ class NodeData:
             raise abort(entry.index, entry.subindex, Abort.VALUE_LOW)
 
     @staticmethod
-    def check_size(entry: Entry, size: int) -> None:
+    def check_size(entry: SubindexEntry, size: int) -> None:
         """Check the length of a value from the bus. Raises `SdoAborted` (06070012/13)."""
         if entry.size is not None and size != entry.size:
             raise abort(entry.index, entry.subindex, Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
@@ -147,13 +147,13 @@ class NodeData:
             if not communication_only or key[0] in COMMUNICATION:
                 self._live[key] = self._stored.get(key, raw)
 
-    def store(self, group: Group) -> None:
+    def store(self, group: ParameterGroup) -> None:
         """Keep the live values of the group's writable entries over resets (1010h)."""
         for entry in self.dictionary.entries():
             if entry.writable and group.holds(entry.index) and entry.index not in _NEVER_STORED:
                 self._stored[entry.key] = self._live[entry.key]
 
-    def forget(self, group: Group) -> None:
+    def forget(self, group: ParameterGroup) -> None:
         """Make the factory values the power-on values again (1011h). Live values stay until a reset."""
         self._stored = {key: raw for key, raw in self._stored.items() if not group.holds(key[0])}
 

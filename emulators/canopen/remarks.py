@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from fieldtwin.emulators.canopen import codec
 from fieldtwin.emulators.canopen.dictionary import Dictionary
-from fieldtwin.emulators.canopen.entries import Entry
+from fieldtwin.emulators.canopen.entries import SubindexEntry
 
 _SHORTEST_CYCLE_US = 50
 """A SYNC without data takes 47 bits: 47 us at 1 Mbit/s, the highest bit rate (CiA 301, 5.3)."""
@@ -42,7 +42,7 @@ def _of_another_node(dictionary: Dictionary, node_id: int) -> list[Remark]:
     """Return remarks for literal COB-IDs that the predefined connection set (CiA 301, 7.3.3) assigns to a different node."""
     if not 1 <= node_id <= 127:
         return []
-    by_node: dict[tuple[int, bool], list[Entry]] = {}
+    by_node: dict[tuple[int, bool], list[SubindexEntry]] = {}
     for entry in dictionary.entries():
         other = _owner(entry)
         if other and other != node_id:
@@ -63,7 +63,7 @@ def _of_another_node(dictionary: Dictionary, node_id: int) -> list[Remark]:
     return found
 
 
-def _owner(entry: Entry) -> int:
+def _owner(entry: SubindexEntry) -> int:
     """Return the node that owns a COB-ID in the predefined connection set.
 
     Returns 0 for a COB-ID that follows the node ID, and for other objects.
@@ -77,7 +77,7 @@ def _owner(entry: Entry) -> int:
     return cob_id & 0x7F
 
 
-def _base(entry: Entry) -> int:
+def _base(entry: SubindexEntry) -> int:
     """Return the function code that the predefined connection set has for this COB-ID; 0 for all other objects."""
     index, sub = entry.key
     if (index, sub) == (0x1014, 0):
@@ -91,7 +91,7 @@ def _base(entry: Entry) -> int:
     return 0
 
 
-def _listed(entries: list[Entry]) -> str:
+def _listed(entries: list[SubindexEntry]) -> str:
     named = [
         f"{e.index:04X}h:{e.subindex:02X} = {int(codec.decode(e.data_type, e.default)):X}h" for e in entries[:_NAMED]
     ]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, PdoParameters, pdo_indices
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 from fieldtwin.gateway.core.errors import SdoAborted
 
 _FIRST = 0x1400
@@ -33,7 +33,7 @@ class _Rpdo:
         return f"{self.parameters.index:04X}h"
 
 
-class Rpdos(Service):
+class Rpdos(NodeService):
     """All RPDOs of a node.
 
     `changed` is called with the values that a PDO changed, then `wrote` with all that it contained.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
 from fieldtwin.emulators.canopen.sdo_server import ObjectAccess, SdoServer
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 
 REQUEST, RESPONSE = 0x600, 0x580
 DEFAULT = 0x1200
@@ -18,7 +18,7 @@ _RESERVED = 0x3FFFF800
 """Includes the frame bit: 29-bit identifiers are not supported."""
 
 
-class SdoChannels(Service):
+class SdoChannels(NodeService):
     """All SDO servers of a node, each with its own transfer. `tolerate_short` accepts requests of fewer than 8 bytes."""
 
     due_ns: int = NEVER

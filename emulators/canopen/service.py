@@ -72,7 +72,7 @@ class SentPdo(msgspec.Struct, frozen=True, gc=False):
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ObjectChange:
     """A change of the node.
 
     `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself), ``emcy``, ``time`` or ``lss``. `index`,
@@ -98,7 +98,7 @@ Given = Callable[[Iterable[tuple[int, int]], int], None]
 """Called with the objects whose values the node has sent, in an SDO reply or a TPDO, and the time in ns."""
 
 
-class Source(Protocol):
+class ObjectSource(Protocol):
     """Values that change by themselves: a recorded or computed signal."""
 
     def __call__(self, now_ns: int, /) -> dict[tuple[int, int], bytes]:
@@ -122,13 +122,13 @@ class AnswersReads(Protocol):
 class Core:
     """State that all services share: values, NMT state, frames to send, counters and journals."""
 
-    def __init__(self, data: NodeData, node_id: int, source: Source | None, journal_size: int) -> None:
+    def __init__(self, data: NodeData, node_id: int, source: ObjectSource | None, journal_size: int) -> None:
         self.data = data
         self.node_id = node_id
         self.state = NmtState.INITIALISING
         self.counters = NodeCounters()
         self.journal: deque[SentPdo] = deque(maxlen=journal_size)
-        self.changes: deque[Change] = deque(maxlen=journal_size)
+        self.changes: deque[ObjectChange] = deque(maxlen=journal_size)
         self.mutes: set[str] = set()
         """Reasons why nothing can be sent now."""
         self._source = source
@@ -179,7 +179,7 @@ class Core:
 
     def note(self, now_ns: int, what: str, index: int, subindex: int, data: bytes) -> None:
         """Add an entry to the journal of changes."""
-        self.changes.append(Change(now_ns, what, index, subindex, data))
+        self.changes.append(ObjectChange(now_ns, what, index, subindex, data))
         if self.held is not None and what in _VALUES:
             self.held({(index, subindex): data}, now_ns)
 
@@ -188,7 +188,7 @@ NEVER = 1 << 63
 """A time that is never reached."""
 
 
-class Service:
+class NodeService:
     """The hooks of a service. Each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
 
     @property

@@ -6,8 +6,8 @@ Stored values last as long as the emulated node. Restored defaults take effect a
 from __future__ import annotations
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.node_data import Group
-from fieldtwin.emulators.canopen.service import Core, Service
+from fieldtwin.emulators.canopen.node_data import ParameterGroup
+from fieldtwin.emulators.canopen.service import Core, NodeService
 
 STORE, RESTORE = 0x1010, 0x1011
 _SIGNATURES = {STORE: b"save", RESTORE: b"load"}
@@ -15,7 +15,7 @@ _ON_COMMAND = 1
 """Read value: the device stores on command, not autonomously."""
 
 
-class Storage(Service):
+class Storage(NodeService):
     """The service of 1010h and 1011h.
 
     It accepts only the signatures ``save`` and ``load``; reads return the supported functions.
@@ -28,20 +28,20 @@ class Storage(Service):
         return index in _SIGNATURES
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
-        if raw != _SIGNATURES[index] or subindex not in {int(group) for group in Group}:
+        if raw != _SIGNATURES[index] or subindex not in {int(group) for group in ParameterGroup}:
             raise abort(index, subindex, Abort.NOT_STORED)
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
         self._announce()  # the signature itself cannot be read back
         if index == STORE:
-            self._core.data.store(Group(subindex))
+            self._core.data.store(ParameterGroup(subindex))
         else:
-            self._core.data.forget(Group(subindex))
+            self._core.data.forget(ParameterGroup(subindex))
 
     def reset(self, now_ns: int) -> None:
         self._announce()
 
     def _announce(self) -> None:
         for index in _SIGNATURES:
-            for group in Group:
+            for group in ParameterGroup:
                 self._core.data.put_number(index, group, _ON_COMMAND)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, NodeService
 from fieldtwin.gateway.core.canframe import CanFrame
 
 DEFAULT_COB_ID = 0x80
@@ -21,7 +21,7 @@ _NS_PER_US = 1000
 _SOURCE = "sync"
 
 
-class Sync(Service):
+class Sync(NodeService):
     """The SYNC service. It calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, also its own.
 
     `counter` is None without 1019h.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 COB_ID = 0x1012
@@ -40,7 +40,7 @@ class TimeOfDay:
         return TimeOfDay(total // _MS_PER_DAY & 0xFFFF, total % _MS_PER_DAY)
 
 
-class TimeService(Service):
+class TimeService(NodeService):
     """The node's time of day; None until it has been set or received."""
 
     due_ns: int = NEVER

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
-from fieldtwin.emulators.canopen.service import NEVER, Core, SentPdo, Service
+from fieldtwin.emulators.canopen.service import NEVER, Core, NodeService, SentPdo
 from fieldtwin.gateway.core.canframe import CanFrame
 
 SAMPLED, REMOTE = 252, 253
@@ -45,7 +45,7 @@ class _Tpdo:
         return NEVER if self.event_at_ns is None else max(self.event_at_ns, self.free_at_ns)
 
 
-class Tpdos(Service):
+class Tpdos(NodeService):
     """All TPDOs of a node."""
 
     def __init__(self, core: Core, window_end_ns: Callable[[], int | None]) -> None:

@@ -47,7 +47,7 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Hello:
+class BusHello:
     """Request and answer; fields that do not apply are 0."""
 
     bitrate: int
@@ -73,9 +73,9 @@ class Hello:
         )
 
 
-def unpack_hello(record: bytes) -> Hello | None:
+def unpack_hello(record: bytes) -> BusHello | None:
     """Return the hello in a record of 24 bytes, or None if the record is not a hello."""
     mark, version, status, options, bitrate, t_ns, magic, window, data_kbitrate = _HELLO.unpack(record)
     if mark != _MARK or magic != _MAGIC:
         return None
-    return Hello(bitrate, version, status, options, t_ns, window, data_kbitrate)
+    return BusHello(bitrate, version, status, options, t_ns, window, data_kbitrate)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 from fieldtwin.emulators.endpoints.overrun import TellsOverrun
 from fieldtwin.emulators.wires.can_bus import CanBus
-from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.emulators.wires.can_faults import ErrorRule
 from fieldtwin.gateway.core.can_error import CanErrorState, state_frame, violation_frame
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -155,11 +155,11 @@ class BusRunner:
         else:
             self._schedule()
 
-    def disturb(self, rule: Rule) -> None:
+    def disturb(self, rule: ErrorRule) -> None:
         """Destroy attempts to send as `rule` says (`can_faults.spoil` creates one)."""
         self._bus.disturb(rule)
 
-    def undisturb(self, rule: Rule) -> None:
+    def undisturb(self, rule: ErrorRule) -> None:
         """Remove a rule."""
         self._bus.undisturb(rule)
 

@@ -16,19 +16,19 @@ import errno
 import socket
 from typing import Any, cast
 
-from fieldtwin.emulators.client_counts import ClientCounts, Counts
+from fieldtwin.emulators.client_counts import ClientCounts, ClientTraffic
 from fieldtwin.emulators.endpoints.bus_hello import (
     FD_VERSION,
     VERSION,
     WANTS_CONFIRMATIONS,
     WANTS_ERRORS,
     WANTS_VIOLATIONS,
-    Hello,
+    BusHello,
     Status,
     unpack_hello,
 )
 from fieldtwin.emulators.endpoints.bus_runner import BusRunner
-from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.emulators.wires.can_faults import ErrorRule
 from fieldtwin.gateway.core.can_error import overrun_frame
 from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.connection import CanConnection
@@ -131,11 +131,11 @@ class SoftBusServer:
         """Return the bus model, to which other kinds of ports connect, for example an slcan port."""
         return self._runner
 
-    def disturb(self, rule: Rule) -> None:
+    def disturb(self, rule: ErrorRule) -> None:
         """Destroy attempts to send as `rule` says (`fieldtwin.emulators.wires.can_faults.spoil` creates one)."""
         self._runner.disturb(rule)
 
-    def undisturb(self, rule: Rule) -> None:
+    def undisturb(self, rule: ErrorRule) -> None:
         """Remove a rule."""
         self._runner.undisturb(rule)
 
@@ -176,7 +176,7 @@ class _Client(asyncio.Protocol):
         self._inbound = bytearray()
         self._outbound = bytearray()
         self._node = 0  # 0 until the hello is accepted
-        self._counts = Counts()
+        self._counts = ClientTraffic()
         self._options = 0
         self._fd = False
         self._record_size = RECORD_SIZE
@@ -309,7 +309,7 @@ class _Client(asyncio.Protocol):
             self._turn_away()
             return True
 
-    def _greet(self, hello: Hello | None) -> None:
+    def _greet(self, hello: BusHello | None) -> None:
         if hello is None:
             self._turn_away()
             return
@@ -332,7 +332,7 @@ class _Client(asyncio.Protocol):
                 return
         self._deadline.cancel()
         self._options = hello.options
-        answer = Hello(
+        answer = BusHello(
             self._runner.bitrate,
             version=FD_VERSION if hello.version == FD_VERSION else VERSION,
             status=status,

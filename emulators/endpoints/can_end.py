@@ -15,7 +15,7 @@ from pathlib import Path
 import can
 from msgspec.structs import replace
 
-from fieldtwin.emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, Hello, Status, unpack_hello
+from fieldtwin.emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, BusHello, Status, unpack_hello
 from fieldtwin.emulators.endpoints.overrun import TellsOverrun
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -66,7 +66,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
         loop = asyncio.get_running_loop()
         asked_ns = int(loop.time() * NS_PER_S)
         async with asyncio.timeout(OPEN_TIMEOUT_S):
-            writer.write(Hello(bitrate, options=WANTS_CONFIRMATIONS | WANTS_ERRORS).pack())
+            writer.write(BusHello(bitrate, options=WANTS_CONFIRMATIONS | WANTS_ERRORS).pack())
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
         if answer is None:
             raise Unreachable("the program that answers there is not a software CAN bus", where=str(endpoint))
@@ -83,7 +83,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
     return SoftBusEnd(endpoint, reader, writer, answer.window, offset_ns)
 
 
-def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
+def _judge(answer: BusHello, bitrate: int, endpoint: Endpoint) -> None:
     """Raise the error for an answer of the bus that is not a welcome."""
     if answer.status == Status.WRONG_BITRATE:
         raise UsageError(

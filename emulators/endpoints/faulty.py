@@ -13,8 +13,8 @@ from typing import Any
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
-from fieldtwin.emulators.faults.fault import Active, FaultEffect, Hang, Piece, WireFault
-from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
+from fieldtwin.emulators.faults.fault import Active, DelayedBytes, FaultEffect, Hang, WireFault
+from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, FaultFrame, FrameDirection
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
@@ -38,14 +38,14 @@ class FaultyEnd(ByteConnection):
         """Pieces that were lost because too many waited."""
         self._faults = faults
         self._loop = asyncio.get_running_loop()
-        self._requests = Assembler(Way.REQUEST, faults.framing)
-        self._replies = Assembler(Way.REPLY, faults.framing)
-        self._free_ns: dict[Way, int] = {}
+        self._requests = Assembler(FrameDirection.REQUEST, faults.framing)
+        self._replies = Assembler(FrameDirection.REPLY, faults.framing)
+        self._free_ns: dict[FrameDirection, int] = {}
         """The time until which delayed bytes block a direction, so that later bytes do not overtake them; absent if it
         is free.
         """
-        self._gathered: dict[Way, bytearray] = {}
-        self._asked: Frame | None = None
+        self._gathered: dict[FrameDirection, bytearray] = {}
+        self._asked: FaultFrame | None = None
         self._dead = False
         self._waiting = 0
         self._tasks: set[asyncio.Task[None]] = set()
@@ -78,14 +78,14 @@ class FaultyEnd(ByteConnection):
     async def write(self, data: bytes) -> None:
         for piece in self._said(data):
             await self.inner.write(piece)
-            self._show(Way.REPLY, piece)
+            self._show(FrameDirection.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
         """Do the same as `PtyEnd.answer`."""
         assert self._pty is not None
         for n, piece in enumerate(self._said(data, after_s)):
             await (self._pty.answer(piece, after_s) if n == 0 else self._pty.write(piece))
-            self._show(Way.REPLY, piece)
+            self._show(FrameDirection.REPLY, piece)
 
     async def aclose(self) -> None:
         self.detach()
@@ -110,7 +110,7 @@ class FaultyEnd(ByteConnection):
     def _now_ns(self) -> int:
         return round(self._loop.time() * NS_PER_S)
 
-    def _show(self, way: Way, data: bytes) -> None:
+    def _show(self, way: FrameDirection, data: bytes) -> None:
         if self._faults.watch is not None:
             self._faults.watch(self, way, data)
 
@@ -121,7 +121,7 @@ class FaultyEnd(ByteConnection):
     def _heard(self, data: bytes) -> bool:
         """Process a chunk from the peer; return True if a fault has handled it."""
         if self._faults.watch is not None:
-            self._show(Way.REQUEST, data)
+            self._show(FrameDirection.REQUEST, data)
         if self._dead:
             return True
         assembler = self._requests
@@ -132,11 +132,11 @@ class FaultyEnd(ByteConnection):
         self._flush_later()
         return True
 
-    def _on_request(self, frame: Frame) -> None:
+    def _on_request(self, frame: FaultFrame) -> None:
         if frame.pdu:
             self._asked = frame
         outcome = self._faults.decide(frame, self._now_ns())
-        for piece in self._carry_out(Way.REQUEST, outcome or FaultEffect((Piece(frame.data),))):
+        for piece in self._carry_out(FrameDirection.REQUEST, outcome or FaultEffect((DelayedBytes(frame.data),))):
             self._pass_in(piece)
 
     def _flush_later(self) -> None:
@@ -166,18 +166,20 @@ class FaultyEnd(ByteConnection):
             if self._asked is not None:
                 frame = replace(frame, address=self._asked.address, count=self._asked.count)
             outcome = self._faults.decide(frame, self._now_ns())
-            out += self._carry_out(Way.REPLY, outcome or FaultEffect((Piece(frame.data),)), after_s)
+            out += self._carry_out(FrameDirection.REPLY, outcome or FaultEffect((DelayedBytes(frame.data),)), after_s)
         return out
 
     # -- carrying out ---------------------------------------------------------------------------------------------------
 
-    def _carry_out(self, way: Way, outcome: FaultEffect, after_s: float = 0.0) -> list[bytes]:
+    def _carry_out(self, way: FrameDirection, outcome: FaultEffect, after_s: float = 0.0) -> list[bytes]:
         """Return the pieces to send immediately; schedule those with a delay or the opposite direction."""
         now_ns = self._now_ns()
         at_once: list[bytes] = []
         for piece in outcome.pieces:
             if piece.back:
-                self._send(Way.REPLY if way is Way.REQUEST else Way.REQUEST, piece.data)
+                self._send(
+                    FrameDirection.REPLY if way is FrameDirection.REQUEST else FrameDirection.REQUEST, piece.data
+                )
             elif piece.gather:
                 self._gather(way, piece)
             else:
@@ -195,29 +197,29 @@ class FaultyEnd(ByteConnection):
             self._hang(outcome.hang, at_once)
         return [] if self._dead else at_once
 
-    def _gather(self, way: Way, piece: Piece) -> None:
+    def _gather(self, way: FrameDirection, piece: DelayedBytes) -> None:
         if way in self._gathered:
             self._gathered[way] += piece.data
             return
         self._gathered[way] = bytearray(piece.data)
         self._loop.call_later(piece.delay_s, lambda: self._send(way, bytes(self._gathered.pop(way))))
 
-    def _send_at(self, due_ns: int, way: Way, piece: Piece) -> None:
+    def _send_at(self, due_ns: int, way: FrameDirection, piece: DelayedBytes) -> None:
         if self._waiting >= MOST_WAITING:
             self.lost_pieces += 1
             return
         self._waiting += 1
         self._loop.call_at(due_ns / NS_PER_S, self._due, way, piece)
 
-    def _due(self, way: Way, piece: Piece) -> None:
+    def _due(self, way: FrameDirection, piece: DelayedBytes) -> None:
         self._waiting -= 1
         if piece.gone is None or not piece.gone():
             self._send(way, piece.data)
 
-    def _send(self, way: Way, data: bytes) -> None:
+    def _send(self, way: FrameDirection, data: bytes) -> None:
         if self._dead or self.inner.lost is not None or not data:
             return
-        if way is Way.REQUEST:
+        if way is FrameDirection.REQUEST:
             self._pass_in(data)
         else:
             self._start(data)
@@ -230,7 +232,7 @@ class FaultyEnd(ByteConnection):
     async def _write_quietly(self, data: bytes) -> None:
         try:
             await self.inner.write(data)
-            self._show(Way.REPLY, data)
+            self._show(FrameDirection.REPLY, data)
         except ConnectionLost:
             pass  # it was too late
 

@@ -13,7 +13,7 @@ from fieldtwin.emulators.faults.can_engine import aimed, seen, struck
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault, CanPiece
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
 from fieldtwin.emulators.faults.fault import Active
-from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.emulators.faults.frames import FrameDirection
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import CANConnection, CanConnection
@@ -52,7 +52,7 @@ class FaultyCan(CanConnection):
         return self._inner_at_once is not None and not self._faults.active and self._inner_at_once(frame)
 
     async def send(self, frame: CanFrame) -> None:
-        pieces = self._struck(Way.REPLY, frame)
+        pieces = self._struck(FrameDirection.REPLY, frame)
         if pieces is None:
             await self.inner.send(frame)
             return
@@ -79,7 +79,7 @@ class FaultyCan(CanConnection):
         return round(self._loop.time() * NS_PER_S)
 
     def _heard(self, frame: CanFrame) -> bool:
-        pieces = self._struck(Way.REQUEST, frame)
+        pieces = self._struck(FrameDirection.REQUEST, frame)
         if pieces is None:
             return False
         for piece in pieces:
@@ -89,7 +89,7 @@ class FaultyCan(CanConnection):
                 self._loop.call_later(piece.delay_s, self.inner.feed_through, piece.frame)
         return True
 
-    def _struck(self, way: Way, frame: CanFrame) -> list[CanPiece] | None:
+    def _struck(self, way: FrameDirection, frame: CanFrame) -> list[CanPiece] | None:
         """Return the frames that replace `frame`, or None if no fault strikes it."""
         if not self._faults.active or frame.error:
             return None
@@ -145,7 +145,7 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
         if attempts is None and again is not None and again.key() == frame.key():
             again = None  # its controller sends it again, successfully
             return None
-        if not aimed(active, frame) or not active.strikes(seen(Way.REPLY, frame.can_id & 0x7F), now_ns()):
+        if not aimed(active, frame) or not active.strikes(seen(FrameDirection.REPLY, frame.can_id & 0x7F), now_ns()):
             return None
         again = frame
         spoilt += 1

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from fieldtwin.emulators.endpoints.ports import Datagrams
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import FaultEffect, Piece
-from fieldtwin.emulators.faults.frames import Way, understood
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect
+from fieldtwin.emulators.faults.frames import FrameDirection, understood
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
@@ -48,16 +48,16 @@ class FaultyDatagrams(Datagrams):
 
     async def send(self, data: bytes, peer: tuple[str, int]) -> None:
         address, count = self._asked.pop(peer, (-1, -1))
-        frame = replace(understood(Way.REPLY, self._faults.framing, data), address=address, count=count)
+        frame = replace(understood(FrameDirection.REPLY, self._faults.framing, data), address=address, count=count)
         outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
-        for piece in (outcome or FaultEffect((Piece(data),))).pieces:
+        for piece in (outcome or FaultEffect((DelayedBytes(data),))).pieces:
             if piece.back:
                 self._pass_in(piece.data, peer)
             elif piece.delay_s > 0:
                 self._later(piece, self._send, peer)
             else:
                 await self._inner.send(piece.data, peer)
-                self._show(Way.REPLY, piece.data, peer)
+                self._show(FrameDirection.REPLY, piece.data, peer)
 
     async def aclose(self) -> None:
         for task in (self._listening, *self._tasks):
@@ -78,13 +78,15 @@ class FaultyDatagrams(Datagrams):
     async def _send_quietly(self, data: bytes, peer: tuple[str, int]) -> None:
         with contextlib.suppress(ConnectionLost):  # it was too late
             await self._inner.send(data, peer)
-            self._show(Way.REPLY, data, peer)
+            self._show(FrameDirection.REPLY, data, peer)
 
-    def _show(self, way: Way, data: bytes, peer: tuple[str, int]) -> None:
+    def _show(self, way: FrameDirection, data: bytes, peer: tuple[str, int]) -> None:
         if self._faults.watch is not None:
             self._faults.watch(peer, way, data)
 
-    def _later(self, piece: Piece, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]) -> None:
+    def _later(
+        self, piece: DelayedBytes, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]
+    ) -> None:
         """Call `then` when the piece is due, unless the piece has already been forwarded."""
 
         def due() -> None:
@@ -97,12 +99,12 @@ class FaultyDatagrams(Datagrams):
         try:
             while True:
                 data, peer = await self._inner.receive()
-                self._show(Way.REQUEST, data, peer)
-                frame = understood(Way.REQUEST, self._faults.framing, data)
+                self._show(FrameDirection.REQUEST, data, peer)
+                frame = understood(FrameDirection.REQUEST, self._faults.framing, data)
                 if len(self._asked) < MOST_WAITING:
                     self._asked[peer] = frame.address, frame.count
                 outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
-                for piece in (outcome or FaultEffect((Piece(data),))).pieces:
+                for piece in (outcome or FaultEffect((DelayedBytes(data),))).pieces:
                     if piece.back:
                         self._send(piece.data, peer)
                     elif piece.delay_s > 0:

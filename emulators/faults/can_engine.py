@@ -5,11 +5,11 @@ from __future__ import annotations
 from fieldtwin.emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, CanFault, CanPiece
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active
-from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection, Framing
 from fieldtwin.gateway.core.canframe import CanFrame
 
 
-def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
+def struck(faults: WireFaults, way: FrameDirection, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
     """Return the frames that replace `frame`, or None if no fault strikes it.
 
     Several faults are applied one after the other.
@@ -47,6 +47,6 @@ def aimed(active: Active, frame: CanFrame) -> bool:
     return sdo and int.from_bytes(frame.data[1:3], "little") == aim.index
 
 
-def seen(way: Way, node: int) -> Frame:
+def seen(way: FrameDirection, node: int) -> FaultFrame:
     """Return a node's frame in the form that an `Active` counts."""
-    return Frame(way, Framing.RAW, b"", node)
+    return FaultFrame(way, Framing.RAW, b"", node)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from random import Random
 from typing import ClassVar
 
-from fieldtwin.emulators.faults.fault import Fault, Kind
-from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.emulators.faults.fault import Fault, InjectionPoint
+from fieldtwin.emulators.faults.frames import FrameDirection
 from fieldtwin.gateway.core.canframe import CanFrame
 
 HEARTBEAT, EMCY, SDO_REPLY, SDO_REQUEST, SYNC = 0x700, 0x80, 0x580, 0x600, 0x80
@@ -28,8 +28,8 @@ class CanPiece:
 class CanFault(Fault):
     """A fault that strikes frames which a node sends (REPLY) or receives (REQUEST). `node` is the node ID."""
 
-    kind = Kind.CAN
-    ways = frozenset((Way.REPLY,))
+    kind = InjectionPoint.CAN
+    ways = frozenset((FrameDirection.REPLY,))
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         """Return whether the fault applies to this kind of frame."""
@@ -47,8 +47,8 @@ class CanFault(Fault):
 class BusFault(Fault):
     """A fault that destroys attempts to send; only a modelled CAN bus supports it."""
 
-    kind = Kind.CAN
-    ways: ClassVar[frozenset[Way]] = frozenset((Way.REPLY,))
+    kind = InjectionPoint.CAN
+    ways: ClassVar[frozenset[FrameDirection]] = frozenset((FrameDirection.REPLY,))
     attempts: ClassVar[int | None] = None
     """Number of attempts that are destroyed; None: all that match while the fault lasts."""
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from fieldtwin.emulators.faults.fault import Active, FaultEffect, Hang, Piece, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
+from fieldtwin.emulators.faults.fault import Active, DelayedBytes, FaultEffect, Hang, WireFault, passed
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection, Framing, understood
 
 
 class WireFaults:
@@ -19,7 +19,7 @@ class WireFaults:
         self.active: dict[str, Active] = {}
         self.listeners: list[Callable[[Active], None]] = []
         """Called with each fault that is put in, in the order of their subscription."""
-        self.watch: Callable[[object, Way, bytes], None] | None = None
+        self.watch: Callable[[object, FrameDirection, bytes], None] | None = None
         """Called with the bytes on the wire: the end that carries them, their direction, the bytes.
 
         A reply that a fault holds back is not on the wire; a request is on the wire even if the emulator never receives
@@ -50,7 +50,7 @@ class WireFaults:
             active.struck += 1
         return bool(refusing)
 
-    def decide(self, frame: Frame, now_ns: int) -> FaultEffect | None:
+    def decide(self, frame: FaultFrame, now_ns: int) -> FaultEffect | None:
         """Return the effect on the frame, or None if no fault strikes it.
 
         Faults are applied in the order in which they were injected, except that faults which divide the frame come last.
@@ -75,17 +75,17 @@ def in_time(active: Active, now_ns: int) -> bool:
     return active.from_ns <= now_ns and (active.until_ns is None or now_ns < active.until_ns)
 
 
-def _struck(before: FaultEffect | None, frame: Frame, fault: WireFault, active: Active) -> FaultEffect:
+def _struck(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, active: Active) -> FaultEffect:
     """Apply a fault, and count it as struck if it changed anything."""
     after = _joined(before, frame, fault, active)
     active.struck += after != (before or passed(frame.data))
     return after
 
 
-def _joined(before: FaultEffect | None, frame: Frame, fault: WireFault, active: Active) -> FaultEffect:
+def _joined(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, active: Active) -> FaultEffect:
     if before is None:
         return fault.strike(frame, active.random)
-    pieces: list[Piece] = []
+    pieces: list[DelayedBytes] = []
     hang: Hang | None = before.hang
     for piece in before.pieces:
         if piece.back or not piece.data:
@@ -93,16 +93,17 @@ def _joined(before: FaultEffect | None, frame: Frame, fault: WireFault, active: 
             continue
         seen = understood(frame.way, frame.framing, piece.data)
         after = fault.strike(
-            Frame(seen.way, seen.framing, seen.data, seen.unit, seen.pdu, frame.address, frame.count), active.random
+            FaultFrame(seen.way, seen.framing, seen.data, seen.unit, seen.pdu, frame.address, frame.count),
+            active.random,
         )
         pieces += _later(after.pieces, piece)
         hang = hang or after.hang
     return FaultEffect(tuple(pieces), hang)
 
 
-def _later(pieces: Iterable[Piece], behind: Piece) -> list[Piece]:
+def _later(pieces: Iterable[DelayedBytes], behind: DelayedBytes) -> list[DelayedBytes]:
     return [
-        Piece(
+        DelayedBytes(
             p.data,
             p.delay_s + behind.delay_s,
             p.overtake or behind.overtake,

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 from fieldtwin.gateway.core.files.profile import Tag
 
 
@@ -31,7 +31,7 @@ class Hang(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class DelayedBytes:
     """Bytes to forward, `delay_s` after the frame arrived and after all bytes that still wait.
 
     With `overtake` they are forwarded before bytes that still wait, with `gather` together with bytes that arrive within that
@@ -51,13 +51,13 @@ class Piece:
 class FaultEffect:
     """The effect of a fault on a frame: pieces in order, and the effect on the connection after them."""
 
-    pieces: tuple[Piece, ...] = ()
+    pieces: tuple[DelayedBytes, ...] = ()
     hang: Hang | None = None
 
 
 def passed(*data: bytes) -> FaultEffect:
     """Return an outcome that forwards these bytes without delay."""
-    return FaultEffect(tuple(Piece(d) for d in data))
+    return FaultEffect(tuple(DelayedBytes(d) for d in data))
 
 
 LOST = FaultEffect()
@@ -105,7 +105,7 @@ class Nothing(Parameters):
     """A fault without parameters."""
 
 
-class Kind(Enum):
+class InjectionPoint(Enum):
     """The places at which a fault can be injected."""
 
     BYTES = "serial lines and sockets"
@@ -118,9 +118,9 @@ class Fault(ABC):
 
     name: ClassVar[str]
     summary: ClassVar[str]
-    kind: ClassVar[Kind]
+    kind: ClassVar[InjectionPoint]
     form: ClassVar[type[Parameters]] = Nothing
-    ways: ClassVar[frozenset[Way]] = frozenset((Way.REPLY,))
+    ways: ClassVar[frozenset[FrameDirection]] = frozenset((FrameDirection.REPLY,))
     """The directions in which it strikes if its aim does not give one."""
     codes: ClassVar[Mapping[int, str]] = {}
     """The meanings that the standard gives to its parameter `code`."""
@@ -132,10 +132,10 @@ class Fault(ABC):
 class WireFault(Fault):
     """A fault that strikes frames on serial lines and sockets."""
 
-    kind = Kind.BYTES
+    kind = InjectionPoint.BYTES
 
     @abstractmethod
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         """Return the effect on `frame`."""
 
     def appears(self) -> Hang | None:
@@ -155,8 +155,8 @@ class WireFault(Fault):
 class ValueFault(Fault):
     """A fault that changes the values that a device holds."""
 
-    kind = Kind.VALUE
-    ways: ClassVar[frozenset[Way]] = frozenset()
+    kind = InjectionPoint.VALUE
+    ways: ClassVar[frozenset[FrameDirection]] = frozenset()
 
     def learn(self, tags: Iterable[Tag]) -> None:
         """Record the tags of the device into which the fault is injected, before it strikes."""
@@ -189,7 +189,7 @@ class Active:
     functions: frozenset[int] = frozenset()
     """Function codes of the table that contains the addresses; empty: all."""
 
-    def strikes(self, frame: Frame, now_ns: int) -> bool:
+    def strikes(self, frame: FaultFrame, now_ns: int) -> bool:
         """Return whether the fault strikes this frame, and count frames that match its aim.
 
         If the fault then changes the frame, the caller increases `struck`. A fault without an effect has tested nothing.
@@ -197,7 +197,7 @@ class Active:
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):
             return False
-        if aim.direction not in ("both", "") and frame.way is not Way(aim.direction):
+        if aim.direction not in ("both", "") and frame.way is not FrameDirection(aim.direction):
             return False
         if not aim.direction and frame.way not in self.fault.ways:
             return False

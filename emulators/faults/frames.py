@@ -45,7 +45,7 @@ class Framing(Enum):
         return self in (Framing.THREAD, Framing.MQTT)
 
 
-class Way(Enum):
+class FrameDirection(Enum):
     """The direction of a frame: a request to the device, or its reply."""
 
     REQUEST = "request"
@@ -53,13 +53,13 @@ class Way(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class FaultFrame:
     """One frame. If it is not understood, `pdu` is empty, and `unit` and `function` are -1.
 
     `address` (the first register or bit) and `count` are those of the request, also in the frame of its reply; -1: none.
     """
 
-    way: Way
+    way: FrameDirection
     framing: Framing
     data: bytes
     unit: int = -1
@@ -88,13 +88,13 @@ class Assembler:
     `feed` returns the whole frames; `flush` returns the remaining bytes unchanged.
     """
 
-    def __init__(self, way: Way, framing: Framing) -> None:
+    def __init__(self, way: FrameDirection, framing: Framing) -> None:
         self.way = way
         self.framing = framing
         self.pending = bytearray()
         """Bytes that wait for more."""
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[FaultFrame]:
         self.pending += data
         frames = []
         while self.pending:
@@ -104,7 +104,7 @@ class Assembler:
             frames.append(self._take(length or len(self.pending)))
         return frames
 
-    def flush(self) -> list[Frame]:
+    def flush(self) -> list[FaultFrame]:
         """Return the remaining bytes as one frame of unknown content."""
         return [self._take(len(self.pending))] if self.pending else []
 
@@ -126,7 +126,7 @@ class Assembler:
             return end + 2 if end >= 0 else 0
         return len(buffer) if len(buffer) >= 4 and crc16(bytes(buffer)) == 0 else 0
 
-    def _take(self, length: int) -> Frame:
+    def _take(self, length: int) -> FaultFrame:
         data = bytes(self.pending[:length])
         del self.pending[:length]
         return understood(self.way, self.framing, data)
@@ -142,7 +142,7 @@ def _mqtt_length(buffer: bytearray) -> int:
     return 0 if len(buffer) < 5 else len(buffer)
 
 
-def understood(way: Way, framing: Framing, data: bytes) -> Frame:
+def understood(way: FrameDirection, framing: Framing, data: bytes) -> FaultFrame:
     """Return `data` as a frame, with unit ID and PDU if they can be determined."""
     adu = b""
     if framing is Framing.MBAP and len(data) > _MBAP_HEADER and len(data) == 6 + int.from_bytes(data[4:6]):
@@ -155,10 +155,10 @@ def understood(way: Way, framing: Framing, data: bytes) -> Frame:
         except ValueError:
             adu = b""
     if len(adu) < 2:
-        return Frame(way, framing, data)
+        return FaultFrame(way, framing, data)
     unit, pdu = adu[0], adu[1:]
     address = count = -1
-    if way is Way.REQUEST and pdu[0] in _ADDRESSED and len(pdu) >= 3:
+    if way is FrameDirection.REQUEST and pdu[0] in _ADDRESSED and len(pdu) >= 3:
         address = int.from_bytes(pdu[1:3])
         count = 1 if pdu[0] in _SINGLE else int.from_bytes(pdu[3:5]) if len(pdu) >= 5 else -1
-    return Frame(way, framing, data, unit, pdu, address, count)
+    return FaultFrame(way, framing, data, unit, pdu, address, count)

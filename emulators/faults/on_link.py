@@ -8,7 +8,7 @@ from typing import Any
 
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Kind
+from fieldtwin.emulators.faults.fault import Active, InjectionPoint
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.schema import FaultSpec, addressed, counted, parse_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 
 def check_link(spec: FaultSpec) -> None:
     """Raise `WrongAim` for a fault that needs a system file, devices, register names, values or a CAN bus."""
-    _check_kind(spec, Kind.BYTES, "one of a line or socket")
+    _check_kind(spec, InjectionPoint.BYTES, "one of a line or socket")
     _check_names(spec, "unit, function, address")
     if spec.aim.address is not None:
         addressed(spec.aim.address)
@@ -25,7 +25,7 @@ def check_link(spec: FaultSpec) -> None:
 
 def check_can_link(spec: FaultSpec) -> None:
     """Do the same as `check_link` for a link between two CAN buses."""
-    _check_kind(spec, Kind.CAN, "one of a CAN bus")
+    _check_kind(spec, InjectionPoint.CAN, "one of a CAN bus")
     _check_names(spec, "unit, cob_id, index")
     if issubclass(spec.kind, BusFault):
         raise WrongAim(
@@ -36,7 +36,7 @@ def check_can_link(spec: FaultSpec) -> None:
         raise WrongAim("name", f"fault {spec.kind.name} is sent by a node", expected="unit: the node ID")
 
 
-def _check_kind(spec: FaultSpec, kind: Kind, expected: str) -> None:
+def _check_kind(spec: FaultSpec, kind: InjectionPoint, expected: str) -> None:
     if spec.kind.kind is not kind:
         raise WrongAim("name", f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected=expected)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from fieldtwin.emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 from fieldtwin.emulators.modbus.ascii import lrc
 from fieldtwin.emulators.modbus.rtu_shapes import with_crc
 
 
-def remade(frame: Frame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:
+def remade(frame: FaultFrame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:
     """Return the bytes of `frame` with these parts replaced. A frame of unknown content is returned unchanged."""
     if not frame.pdu:
         return frame.data

@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from fieldtwin.emulators.faults.fault import Aim, Fault, Kind
+from fieldtwin.emulators.faults.fault import Aim, Fault, InjectionPoint
 from fieldtwin.emulators.faults.registry import fault_class
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
@@ -24,9 +24,9 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, expected_value
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
 _NOT_OF = {
-    Kind.BYTES: frozenset({"cob_id", "index"}),
-    Kind.CAN: frozenset({"function", "address", "registers"}),
-    Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until", "optional"},
+    InjectionPoint.BYTES: frozenset({"cob_id", "index"}),
+    InjectionPoint.CAN: frozenset({"function", "address", "registers"}),
+    InjectionPoint.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until", "optional"},
 }
 """The keys of an aim that have no meaning for a kind of fault."""
 

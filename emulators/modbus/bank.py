@@ -34,7 +34,7 @@ class IllegalFunction(Refusal):
     code = 1
 
 
-class IllegalAddress(Refusal):
+class NoSuchAddress(Refusal):
     code = 2
 
 
@@ -52,7 +52,7 @@ class Acknowledge(Refusal):
     code = 5
 
 
-class Busy(Refusal):
+class DeviceIsBusy(Refusal):
     code = 6
 
 
@@ -89,7 +89,7 @@ class RegisterBank(ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class CellSpan:
     """`count` adjacent cells that exist. `access` is the client's access; discrete and input cells are never writable."""
 
     table: Table
@@ -154,7 +154,7 @@ class MapBank(RegisterBank):
     """
 
     def __init__(
-        self, spans: Iterable[Span], on_write: OnWrite | None = None, undeclared: Undeclared = "exception"
+        self, spans: Iterable[CellSpan], on_write: OnWrite | None = None, undeclared: Undeclared = "exception"
     ) -> None:
         cells = dict[int, int] if undeclared == "exception" else _Zeros
         self._cells: dict[Table, dict[int, int]] = {table: cells() for table in get_args(Table)}
@@ -169,7 +169,7 @@ class MapBank(RegisterBank):
         for span in spans:
             self._declare(span)
 
-    def _declare(self, span: Span) -> None:
+    def _declare(self, span: CellSpan) -> None:
         addresses = range(span.start, span.start + span.count)
         twice = self._declared[span.table].intersection(addresses)
         if twice:
@@ -182,7 +182,7 @@ class MapBank(RegisterBank):
             self._writable[span.table].update(addresses)
 
     def hook(self, table: Table, address: int, hooks: CellHooks) -> None:
-        """Set the side effects of a cell, replacing earlier ones. Raises `IllegalAddress` if the cell does not exist."""
+        """Set the side effects of a cell, replacing earlier ones. Raises `NoSuchAddress` if the cell does not exist."""
         self._require(self._declared, table, range(address, address + 1), "hooked")
         self._hooks[table, address] = hooks
         self._plans.clear()
@@ -231,15 +231,15 @@ class MapBank(RegisterBank):
     def peek(self, table: Table, address: int) -> int:
         """Return the value of a cell from the device's side, also of a cell that a client may not read.
 
-        Raises `IllegalAddress` if it does not exist.
+        Raises `NoSuchAddress` if it does not exist.
         """
         try:
             return self._cells[table][address]  # undeclared cells that `undeclared` fills read as 0
         except KeyError:
-            raise IllegalAddress("not a readable cell", where=f"{table}:{address}") from None
+            raise NoSuchAddress("not a readable cell", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
-        """Set cells from the device's side, also read-only cells. Raises `IllegalAddress` or `IllegalValue`."""
+        """Set cells from the device's side, also read-only cells. Raises `NoSuchAddress` or `IllegalValue`."""
         limit = 1 if table in BIT_TABLES else 0xFFFF
         for value in values:
             if not 0 <= value <= limit:
@@ -255,4 +255,4 @@ class MapBank(RegisterBank):
         filled = bool(declared) and verb in self._filled
         for address in addresses:
             if address not in allowed[table] and not (filled and address not in declared):
-                raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{address}")
+                raise NoSuchAddress(f"no cell that can be {verb}", where=f"{table}:{address}")

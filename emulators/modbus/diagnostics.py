@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fieldtwin.emulators.modbus.bank import IllegalFunction, IllegalValue
-from fieldtwin.emulators.modbus.event_log import ENTERED_LISTEN_ONLY, RESTARTED, EventLog
+from fieldtwin.emulators.modbus.event_log import ENTERED_LISTEN_ONLY, RESTARTED, CommEventLog
 
 RETURN_QUERY_DATA = 0x00
 RESTART = 0x01
@@ -74,7 +74,7 @@ _FRAME_CHARACTERS = frozenset(b":0123456789ABCDEFabcdef\r")
 """Characters that can occur inside an ASCII frame, and therefore cannot end one."""
 
 
-class Diagnostics:
+class UnitDiagnostics:
     """Functions 07, 08, 0B and 0C of one unit.
 
     `status` holds the eight outputs of function 07, `register` the value that 08/02 reads; the device sets both.
@@ -83,7 +83,7 @@ class Diagnostics:
 
     def __init__(self, counters: UnitCounters) -> None:
         self.counters = counters
-        self.log = EventLog()
+        self.log = CommEventLog()
         self.listen_only = False
         self.status = 0
         self.register = 0

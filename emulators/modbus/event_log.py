@@ -18,7 +18,7 @@ _SENT_FLAGS = {1: 0x01, 2: 0x01, 3: 0x01, 4: 0x02, 5: 0x04, 6: 0x04, 7: 0x08}
 """Exception code -> flag of a send event: read exception, abort, busy, program NAK."""
 
 
-class EventLog:
+class CommEventLog:
     """The events of a unit as bytes. `content` is what function 0Ch returns."""
 
     def __init__(self) -> None:

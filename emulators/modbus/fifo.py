@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
-from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalValue
+from fieldtwin.emulators.modbus.bank import IllegalValue, NoSuchAddress
 from fieldtwin.gateway.core.errors import UsageError
 
 MOST_READ = 31
@@ -31,7 +31,7 @@ class FifoQueues:
             self._queues[address] = deque()
 
     def push(self, address: int, *values: int) -> None:
-        """Append registers (0 to 65535). Raises `IllegalAddress` if there is no queue, or `IllegalValue`."""
+        """Append registers (0 to 65535). Raises `NoSuchAddress` if there is no queue, or `IllegalValue`."""
         queue = self._queue(address)
         for value in values:
             if not 0 <= value <= 0xFFFF:
@@ -42,7 +42,7 @@ class FifoQueues:
                 queue.append(value)
 
     def take(self, address: int, count: int = 1) -> list[int]:
-        """Remove up to `count` registers from the head, as the device does, and return them. Raises `IllegalAddress`."""
+        """Remove up to `count` registers from the head, as the device does, and return them. Raises `NoSuchAddress`."""
         queue = self._queue(address)
         return [queue.popleft() for _ in range(min(count, len(queue)))]
 
@@ -58,5 +58,5 @@ class FifoQueues:
 
     def _queue(self, address: int) -> deque[int]:
         if address not in self._queues:
-            raise IllegalAddress(f"no queue at {address}")
+            raise NoSuchAddress(f"no queue at {address}")
         return self._queues[address]

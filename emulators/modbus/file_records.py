@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalValue
+from fieldtwin.emulators.modbus.bank import IllegalValue, NoSuchAddress
 from fieldtwin.gateway.core.errors import UsageError
 
 REFERENCE_TYPE = 6
@@ -20,7 +20,7 @@ _MOST_READ, _MOST_ASKED, _MOST_WRITTEN = 0xF5, 0xF5, 0xFB
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class RecordGroup:
     """One sub-request; `values` holds the records of a write."""
 
     file: int
@@ -45,12 +45,12 @@ class FileRecords:
         self._read_only = frozenset(read_only)
 
     def peek(self, file: int, record: int, count: int = 1) -> list[int]:
-        """Return records of a file as the device sees them. Raises `IllegalAddress`."""
-        return self._span(Group(file, record, count))[record : record + count]
+        """Return records of a file as the device sees them. Raises `NoSuchAddress`."""
+        return self._span(RecordGroup(file, record, count))[record : record + count]
 
     def poke(self, file: int, record: int, *values: int) -> None:
-        """Set records from the device's side, read-only files included. Raises `IllegalAddress`."""
-        self._span(Group(file, record, len(values)))[record : record + len(values)] = values
+        """Set records from the device's side, read-only files included. Raises `NoSuchAddress`."""
+        self._span(RecordGroup(file, record, len(values)))[record : record + len(values)] = values
 
     def respond_read(self, pdu: bytes, now_ns: int) -> bytes:
         """Answer function 14h: return all requested spans, or raise a `Refusal`."""
@@ -83,24 +83,24 @@ class FileRecords:
                 )
             at += len(data)
             values = tuple(data[i] << 8 | data[i + 1] for i in range(0, len(data), 2))
-            groups.append(Group(group.file, group.record, group.count, values))
+            groups.append(RecordGroup(group.file, group.record, group.count, values))
         for group in groups:
             self._span(group)
             if group.file in self._read_only:
-                raise IllegalAddress(f"file {group.file} is read-only")
+                raise NoSuchAddress(f"file {group.file} is read-only")
         for group in groups:
             self.poke(group.file, group.record, *group.values)
         return pdu
 
-    def _span(self, group: Group) -> list[int]:
+    def _span(self, group: RecordGroup) -> list[int]:
         records = self._files.get(group.file)
         if records is None or not 1 <= group.count <= len(records) - group.record:
-            raise IllegalAddress(f"{group.count} records from {group.record} of file {group.file}")
+            raise NoSuchAddress(f"{group.count} records from {group.record} of file {group.file}")
         return records
 
 
-def _group(data: bytes) -> Group:
+def _group(data: bytes) -> RecordGroup:
     if data[0] != REFERENCE_TYPE:  # the flow chart of AP 6.14 gives 02 for every field of a sub-request
-        raise IllegalAddress("reference type", expected=str(REFERENCE_TYPE), got=str(data[0]))
+        raise NoSuchAddress("reference type", expected=str(REFERENCE_TYPE), got=str(data[0]))
     file, record, count = (data[i] << 8 | data[i + 1] for i in (1, 3, 5))
-    return Group(file, record, count)
+    return RecordGroup(file, record, count)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalFunction, IllegalValue
+from fieldtwin.emulators.modbus.bank import IllegalFunction, IllegalValue, NoSuchAddress
 from fieldtwin.gateway.core.errors import UsageError
 
 MEI_TYPE = 0x0E
@@ -54,7 +54,7 @@ class Identification:
         code, first = pdu[2], pdu[3]
         if code == INDIVIDUAL:
             if first not in self.objects:
-                raise IllegalAddress(f"identification object {first}")
+                raise NoSuchAddress(f"identification object {first}")
             return self._frame(code, [first], following=0)
         numbers = [n for n in self.objects if n <= _LAST_OF[code]]
         if first in numbers:

@@ -32,7 +32,7 @@ class ServedFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 @dataclass(frozen=True, slots=True)
-class LineCounters:
+class UnitLineCounters:
     """Traffic counters of a line.
 
     `frames` are complete frames, whatever their unit ID; `crc_errors` are damaged frames, with wrong LRCs and
@@ -74,8 +74,8 @@ class LineSlave(ABC):
         self._receiver = receiver
 
     @property
-    def counters(self) -> LineCounters:
-        return LineCounters(self._receiver.frames, self._receiver.crc_errors, self._receiver.noise_bytes)
+    def counters(self) -> UnitLineCounters:
+        return UnitLineCounters(self._receiver.frames, self._receiver.crc_errors, self._receiver.noise_bytes)
 
     @property
     def gap_ns(self) -> int:

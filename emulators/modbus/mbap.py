@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from fieldtwin.emulators.client_counts import Counts
+from fieldtwin.emulators.client_counts import ClientTraffic
 from fieldtwin.emulators.modbus.line import ServedFrame
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import Desync, UsageError
@@ -46,7 +46,7 @@ class MbapSlave:
         units: Mapping[int, ModbusUnit],
         max_in_flight: int = MAX_IN_FLIGHT,
         allow: Allow | None = None,
-        counts: Counts | None = None,
+        counts: ClientTraffic | None = None,
         *,
         any_unit: bool = False,
     ) -> None:
@@ -58,7 +58,7 @@ class MbapSlave:
         self.units = dict(units)
         self.max_in_flight = max_in_flight
         self.desync: Desync | None = None
-        self.counts = counts or Counts()
+        self.counts = counts or ClientTraffic()
         """Requests that reached a unit, and the replies to them."""
         self.requests = 0
         self.discarded = 0

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fieldtwin.emulators.modbus.bank import ADDRESSES, IllegalAddress, IllegalValue, RegisterBank, Table
+from fieldtwin.emulators.modbus.bank import ADDRESSES, IllegalValue, NoSuchAddress, RegisterBank, Table
 from fieldtwin.gateway.core.errors import UsageError
 
 STANDARD_FUNCTIONS = frozenset({*range(0x01, 0x09), 0x0B, 0x0C, 0x0F, 0x10, 0x11, 0x14, 0x15, 0x16, 0x17, 0x18, 0x2B})
@@ -146,7 +146,7 @@ class RegisterFunctions:
             raise IllegalValue("half a value", expected="an even count", got=str(count))
         _require_range(address, count)
         if pairs and address % 2:
-            raise IllegalAddress("half a value", expected="an even address", got=str(address))
+            raise NoSuchAddress("half a value", expected="an even address", got=str(address))
 
 
 def _words(data: bytes) -> list[int]:
@@ -190,4 +190,4 @@ def _require_words(data: bytes, count: int) -> None:
 
 def _require_range(address: int, count: int) -> None:
     if address + count > ADDRESSES:
-        raise IllegalAddress("after the end of the table", got=f"{count} from {address}")
+        raise NoSuchAddress("after the end of the table", got=f"{count} from {address}")

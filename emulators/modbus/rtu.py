@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.emulators.modbus.line import LineCounters, LineSlave, ServedFrame
+from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame, UnitLineCounters
 from fieldtwin.emulators.modbus.rtu_receiver import FRAME_GAP_NS, RtuReceiver, with_crc
 from fieldtwin.emulators.modbus.rtu_shapes import Declared
 from fieldtwin.emulators.modbus.rtu_strict import StrictReceiver
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
-__all__ = ["LineCounters", "RtuSlave", "ServedFrame"]
+__all__ = ["RtuSlave", "ServedFrame", "UnitLineCounters"]
 
 
 class RtuSlave(LineSlave):

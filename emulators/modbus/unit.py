@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypedDict
 
-from fieldtwin.emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
-from fieldtwin.emulators.modbus.diagnostics import Diagnostics, UnitCounters
+from fieldtwin.emulators.modbus.bank import DeviceIsBusy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
+from fieldtwin.emulators.modbus.diagnostics import UnitCounters, UnitDiagnostics
 from fieldtwin.emulators.modbus.event_log import MAX_EVENTS
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
@@ -79,7 +79,7 @@ class ModbusUnit:
         self.limits = limits or UnitLimits()
         self.name = name
         self.counters = UnitCounters()
-        self.diagnostics = Diagnostics(self.counters)
+        self.diagnostics = UnitDiagnostics(self.counters)
         self.files = files
         self.fifos = fifos
         self.latency_s = 0.0
@@ -210,7 +210,7 @@ class ModbusUnit:
             return None
         try:
             if busy or (now_ns < self._busy_until_ns and pdu[0] not in WHILE_BUSY):
-                raise Busy("too many requests under way")
+                raise DeviceIsBusy("too many requests under way")
             handler = self._handlers.get(pdu[0])
             if handler is None:
                 raise IllegalFunction(f"function {pdu[0]:02X}h")
@@ -219,7 +219,7 @@ class ModbusUnit:
             response = handler(pdu, now_ns)
         except Refusal as refusal:
             self.counters.exceptions += 1
-            self.counters.busy += isinstance(refusal, Busy)
+            self.counters.busy += isinstance(refusal, DeviceIsBusy)
             self.counters.naks += isinstance(refusal, NegativeAcknowledge)
             return bytes((pdu[0] | 0x80, refusal.code))
         self.diagnostics.completed(pdu)

@@ -6,7 +6,7 @@ from fieldtwin.emulators.wires.acoustic import AcousticMedium
 
 
 class AcousticLink:
-    """Both directions of the modem `name` in `medium` (`packet_link.Outgoing` and `Incoming`).
+    """Both directions of the modem `name` in `medium` (`packet_link.PacketSource` and `Incoming`).
 
     Each packet is sent `times` times, `every_ns` apart, because the modem gets no acknowledgements and the channel may lose any
     of these copies. `resent` counts the additional copies.

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from fieldtwin.emulators.canopen import codec
 from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
 from fieldtwin.emulators.canopen.node_data import NodeData
-from fieldtwin.emulators.canopen.service import AnswersReads, Source
+from fieldtwin.emulators.canopen.service import AnswersReads, ObjectSource
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.models.played_objects import whole
 from fieldtwin.gateway.core.files.profile import Tag
@@ -28,7 +28,7 @@ class DistortedObjects:
         self,
         tags: Iterable[Tag],
         dictionary: Dictionary,
-        source: Source | None,
+        source: ObjectSource | None,
         *,
         has_model: bool = False,
         named: bool = False,

@@ -15,8 +15,8 @@ from fieldtwin.emulators.canopen.aborts import Abort
 from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Objects, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.models import drive_objects as od
-from fieldtwin.emulators.models.drive_homing import METHODS, Axis, Speeds, Way, plan
-from fieldtwin.emulators.models.drive_states import Cause, DriveState, Transition, command_of, transition
+from fieldtwin.emulators.models.drive_homing import METHODS, DriveAxis, HomingPath, Speeds, plan
+from fieldtwin.emulators.models.drive_states import DriveState, DriveTransition, TransitionCause, command_of, transition
 from fieldtwin.emulators.models.motion import Motion, by_torque, to_place, to_speed
 from fieldtwin.gateway.core.clock import NS_PER_S
 
@@ -31,7 +31,7 @@ position).
 
 HEARTBEAT_LOST, BUS_OFF = 0x8130, 0x8140
 _COMMUNICATION = frozenset({HEARTBEAT_LOST, BUS_OFF})
-_REACTIONS = {1: Cause.ERROR, 2: Cause.DISABLE_VOLTAGE, 3: Cause.QUICK_STOP}
+_REACTIONS = {1: TransitionCause.ERROR, 2: TransitionCause.DISABLE_VOLTAGE, 3: TransitionCause.QUICK_STOP}
 """Abort connection option code 6007h: the effect of a lost connection."""
 
 _SPAN = 1 << 32
@@ -63,9 +63,9 @@ class Drive(DeviceModel):
         self_test_s: float = 0.02,
         coasting: float = 20_000.0,
         rated: float = 500_000.0,
-        axis: Axis | None = None,
+        axis: DriveAxis | None = None,
     ) -> None:
-        self._rated, self._axis = rated, axis or Axis()
+        self._rated, self._axis = rated, axis or DriveAxis()
         self._zero = 0.0  # the place where 6064h is 0
         self._exists: dict[Key, Number] = {}
         """6502h and 60E3h: the modes and homing methods of the data sheet that the model supports."""
@@ -86,7 +86,7 @@ class Drive(DeviceModel):
         self._queue: _SetPoint | None = None
         self._acknowledge = False
         self._limited = False
-        self._homing: Way | None = None
+        self._homing: HomingPath | None = None
         self._homed = 0  # bits of the statusword in homing mode
         self._wanted: int | None = None  # the demand value of cyclic synchronous position
         self._torque: float | None = None  # of cyclic synchronous torque, after its first use
@@ -138,13 +138,13 @@ class Drive(DeviceModel):
         """Process the events that are due since the last step: the end of the self-test, the end of a ramp."""
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
-            self._go(Cause.INITIALISED, now_ns, objects)
+            self._go(TransitionCause.INITIALISED, now_ns, objects)
         if now_ns < self._end_ns():
             return
         if self.state is DriveState.QUICK_STOP:
-            self._go(Cause.STOPPED, now_ns, objects)
+            self._go(TransitionCause.STOPPED, now_ns, objects)
         elif self.state is DriveState.FAULT_REACTION:
-            self._go(Cause.REACTED, now_ns, objects)
+            self._go(TransitionCause.REACTED, now_ns, objects)
         elif self._homing is not None:
             self._arrive(self._homing, objects)
         elif self._queue is not None and self._in(od.PROFILE_POSITION) and not self._controlword & HALT:
@@ -156,7 +156,7 @@ class Drive(DeviceModel):
         present = frozenset(situation.errors)
         arisen, self._seen = present - self._seen, present
         for code in sorted(arisen):
-            cause: Cause | None = Cause.ERROR
+            cause: TransitionCause | None = TransitionCause.ERROR
             if code in _COMMUNICATION:
                 cause = _REACTIONS.get(situation.objects.whole(od.ABORT_CONNECTION, default=1))
             if cause is not None:
@@ -166,7 +166,7 @@ class Drive(DeviceModel):
         """Process a new controlword. It can trigger two transitions at once: switch on and enable operation."""
         before, self._controlword = self._controlword, objects.whole(od.CONTROLWORD)
         command = command_of(self._controlword, before)
-        if command is Cause.FAULT_RESET and self._disconnected(objects):
+        if command is TransitionCause.FAULT_RESET and self._disconnected(objects):
             return  # the cause of the fault is still present
         for _ in range(2):
             if command is None or self._go(command, now_ns, objects) is None:
@@ -183,7 +183,7 @@ class Drive(DeviceModel):
     def _disconnected(self, objects: Objects) -> bool:
         return bool(self._seen & _COMMUNICATION) and objects.whole(od.ABORT_CONNECTION, default=1) == 1
 
-    def _go(self, cause: Cause, now_ns: int, objects: Objects) -> Transition | None:
+    def _go(self, cause: TransitionCause, now_ns: int, objects: Objects) -> DriveTransition | None:
         """Take the transition that `cause` triggers in this state, if there is one, with its effect on the motor."""
         option = objects.whole(od.QUICK_STOP_OPTION, default=2)
         taken = transition(self.state, cause, stays_stopped=option >= 5)
@@ -200,12 +200,12 @@ class Drive(DeviceModel):
         elif taken.number == 11:
             self._slow_down(option - 4 if option >= 5 else option, now_ns, objects)
             if option == 0:
-                self._go(Cause.STOPPED, now_ns, objects)
+                self._go(TransitionCause.STOPPED, now_ns, objects)
         elif taken.number == 13:
             if powered:
                 self._slow_down(objects.whole(od.FAULT_OPTION, default=2), now_ns, objects)
             if not powered or objects.whole(od.FAULT_OPTION, default=2) == 0:
-                self._go(Cause.REACTED, now_ns, objects)
+                self._go(TransitionCause.REACTED, now_ns, objects)
         elif taken.number in (9, 12):
             self._ramp(now_ns, 0.0, self._coasting)
         return taken
@@ -322,7 +322,7 @@ class Drive(DeviceModel):
         self._move(way.motion, now_ns)
         self._homing = way
 
-    def _arrive(self, way: Way, objects: Objects) -> None:
+    def _arrive(self, way: HomingPath, objects: Objects) -> None:
         """Finish homing: the home position gets the value of the home offset (607Ch)."""
         self._homing, self._homed = None, BIT_12 if way.home is not None else BIT_13
         if way.home is not None:

@@ -32,7 +32,7 @@ _BETWEEN = {
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class DriveAxis:
     """The positions of the switches of the axis, in increments from the position at the first power-on.
 
     The limit switches are active beyond `negative` and `positive`, the home switch from `home_from` to `home_to`. Index
@@ -71,18 +71,18 @@ class Speeds:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class HomingPath:
     """The motion of the drive and the home position; None if the search ended at a limit switch (a homing error)."""
 
     motion: Motion
     home: float | None
 
 
-def plan(method: int, axis: Axis, x: float, v: float, speeds: Speeds) -> Way:
+def plan(method: int, axis: DriveAxis, x: float, v: float, speeds: Speeds) -> HomingPath:
     """Return the path of a method from position `x` with speed `v`. `method` is one of `METHODS`."""
     if method in (35, 37):
         stop = Motion(x, v, to_speed(v, 0.0, speeds.acceleration, speeds.acceleration))
-        return Way(stop, stop.at(stop.duration_s)[0])
+        return HomingPath(stop, stop.at(stop.duration_s)[0])
     edges, place, found = _search(method, axis, x)
     ramps: list[Ramp] = []
     at, speed = x, v
@@ -91,12 +91,12 @@ def plan(method: int, axis: Axis, x: float, v: float, speeds: Speeds) -> Way:
         ramps += more
         at, speed = Motion(at, speed, more).at(sum(duration for duration, _ in more))
     if not found:
-        return Way(Motion(x, v, tuple(ramps)), None)
+        return HomingPath(Motion(x, v, tuple(ramps)), None)
     ramps += to_place(place - at, speed, speeds.zero, speeds.acceleration, speeds.acceleration)
-    return Way(Motion(x, v, tuple(ramps)), place)
+    return HomingPath(Motion(x, v, tuple(ramps)), place)
 
 
-def _search(method: int, axis: Axis, x: float) -> tuple[list[float], float, bool]:
+def _search(method: int, axis: DriveAxis, x: float) -> tuple[list[float], float, bool]:
     """Return the edges that the search passes in order, the home position, and whether the search finds it."""
     if method in (33, 34):
         return [], axis.index_beside(x, _LEFT if method == 33 else _RIGHT), True

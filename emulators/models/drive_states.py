@@ -43,7 +43,7 @@ STATE_MASK = 0x6F
 """Bits 0 to 3, 5 and 6 of the statusword. Bit 5 is not part of the pattern in states where the standard leaves it open."""
 
 
-class Cause(Enum):
+class TransitionCause(Enum):
     """The causes of a transition: the commands of the controlword, and events inside the drive."""
 
     SHUTDOWN = "shutdown"
@@ -58,7 +58,7 @@ class Cause(Enum):
     REACTED = "fault reaction completed"
 
 
-class Bit(IntEnum):
+class ControlBit(IntEnum):
     """Bits of the controlword that the state machine reads."""
 
     SWITCH_ON = 1 << 0
@@ -69,7 +69,7 @@ class Bit(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Transition:
+class DriveTransition:
     """One transition, with the standard's `number`.
 
     The drive takes 1, 12, 13 and 14 by itself; a command can also cause 12.
@@ -77,32 +77,36 @@ class Transition:
 
     number: int
     source: DriveState
-    cause: Cause
+    cause: TransitionCause
     target: DriveState
 
 
-_S, _C = DriveState, Cause
+_S, _C = DriveState, TransitionCause
 TRANSITIONS = (
-    Transition(1, _S.NOT_READY, _C.INITIALISED, _S.SWITCH_ON_DISABLED),
-    Transition(2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY),
-    Transition(3, _S.READY, _C.SWITCH_ON, _S.SWITCHED_ON),
-    Transition(3, _S.READY, _C.ENABLE_OPERATION, _S.SWITCHED_ON),  # and on to 4 with the same controlword
-    Transition(4, _S.SWITCHED_ON, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
-    Transition(5, _S.OPERATION_ENABLED, _C.SWITCH_ON, _S.SWITCHED_ON),
-    Transition(6, _S.SWITCHED_ON, _C.SHUTDOWN, _S.READY),
-    Transition(7, _S.READY, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    Transition(7, _S.READY, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    Transition(8, _S.OPERATION_ENABLED, _C.SHUTDOWN, _S.READY),
-    Transition(9, _S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    Transition(10, _S.SWITCHED_ON, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    Transition(10, _S.SWITCHED_ON, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    Transition(11, _S.OPERATION_ENABLED, _C.QUICK_STOP, _S.QUICK_STOP),
-    Transition(12, _S.QUICK_STOP, _C.STOPPED, _S.SWITCH_ON_DISABLED),
-    Transition(12, _S.QUICK_STOP, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    *(Transition(13, state, _C.ERROR, _S.FAULT_REACTION) for state in _S if state not in (_S.FAULT, _S.FAULT_REACTION)),
-    Transition(14, _S.FAULT_REACTION, _C.REACTED, _S.FAULT),
-    Transition(15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
-    Transition(
+    DriveTransition(1, _S.NOT_READY, _C.INITIALISED, _S.SWITCH_ON_DISABLED),
+    DriveTransition(2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY),
+    DriveTransition(3, _S.READY, _C.SWITCH_ON, _S.SWITCHED_ON),
+    DriveTransition(3, _S.READY, _C.ENABLE_OPERATION, _S.SWITCHED_ON),  # and on to 4 with the same controlword
+    DriveTransition(4, _S.SWITCHED_ON, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    DriveTransition(5, _S.OPERATION_ENABLED, _C.SWITCH_ON, _S.SWITCHED_ON),
+    DriveTransition(6, _S.SWITCHED_ON, _C.SHUTDOWN, _S.READY),
+    DriveTransition(7, _S.READY, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    DriveTransition(7, _S.READY, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    DriveTransition(8, _S.OPERATION_ENABLED, _C.SHUTDOWN, _S.READY),
+    DriveTransition(9, _S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    DriveTransition(10, _S.SWITCHED_ON, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    DriveTransition(10, _S.SWITCHED_ON, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    DriveTransition(11, _S.OPERATION_ENABLED, _C.QUICK_STOP, _S.QUICK_STOP),
+    DriveTransition(12, _S.QUICK_STOP, _C.STOPPED, _S.SWITCH_ON_DISABLED),
+    DriveTransition(12, _S.QUICK_STOP, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    *(
+        DriveTransition(13, state, _C.ERROR, _S.FAULT_REACTION)
+        for state in _S
+        if state not in (_S.FAULT, _S.FAULT_REACTION)
+    ),
+    DriveTransition(14, _S.FAULT_REACTION, _C.REACTED, _S.FAULT),
+    DriveTransition(15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    DriveTransition(
         16, _S.QUICK_STOP, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED
     ),  # if the option code permits the drive to stay there
 )
@@ -110,7 +114,7 @@ TRANSITIONS = (
 _BY_CAUSE = {(t.source, t.cause): t for t in TRANSITIONS}
 
 
-def transition(state: DriveState, cause: Cause, *, stays_stopped: bool = False) -> Transition | None:
+def transition(state: DriveState, cause: TransitionCause, *, stays_stopped: bool = False) -> DriveTransition | None:
     """Return the transition that `cause` triggers in `state`; None if there is none, so that nothing happens.
 
     `stays_stopped`: the quick stop option code is 5 to 8, so the drive stays in QUICK STOP ACTIVE after it has stopped.
@@ -118,22 +122,22 @@ def transition(state: DriveState, cause: Cause, *, stays_stopped: bool = False) 
     found = _BY_CAUSE.get((state, cause))
     if found is not None and found.number == 16 and not stays_stopped:
         return None
-    if found is not None and cause is Cause.STOPPED and stays_stopped:
+    if found is not None and cause is TransitionCause.STOPPED and stays_stopped:
         return None
     return found
 
 
-def command_of(controlword: int, before: int) -> Cause | None:
+def command_of(controlword: int, before: int) -> TransitionCause | None:
     """Return the command in a controlword; `before` is the previous controlword (fault reset is an edge of bit 7).
 
     While bit 7 is set, the word is no other command (CiA 402-2, table "Command coding").
     """
-    if controlword & Bit.FAULT_RESET:
-        return None if before & Bit.FAULT_RESET else Cause.FAULT_RESET
-    if not controlword & Bit.ENABLE_VOLTAGE:
-        return Cause.DISABLE_VOLTAGE
-    if not controlword & Bit.QUICK_STOP:
-        return Cause.QUICK_STOP
-    if not controlword & Bit.SWITCH_ON:
-        return Cause.SHUTDOWN
-    return Cause.ENABLE_OPERATION if controlword & Bit.ENABLE_OPERATION else Cause.SWITCH_ON
+    if controlword & ControlBit.FAULT_RESET:
+        return None if before & ControlBit.FAULT_RESET else TransitionCause.FAULT_RESET
+    if not controlword & ControlBit.ENABLE_VOLTAGE:
+        return TransitionCause.DISABLE_VOLTAGE
+    if not controlword & ControlBit.QUICK_STOP:
+        return TransitionCause.QUICK_STOP
+    if not controlword & ControlBit.SWITCH_ON:
+        return TransitionCause.SHUTDOWN
+    return TransitionCause.ENABLE_OPERATION if controlword & ControlBit.ENABLE_OPERATION else TransitionCause.SWITCH_ON

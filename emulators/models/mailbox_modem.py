@@ -13,8 +13,8 @@ from random import Random
 
 from fieldtwin.emulators.codec import encode
 from fieldtwin.emulators.journal import DeviceValueLog
-from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
-from fieldtwin.emulators.models.packet_link import TAME, Incoming, LinkImpairments, Outgoing, PacketLink
+from fieldtwin.emulators.modbus.bank import CellSpan, IllegalValue, MapBank, RegisterBank, Table
+from fieldtwin.emulators.models.packet_link import TAME, LinkImpairments, PacketLink, PacketSink, PacketSource
 from fieldtwin.emulators.stated import bytes_of, cells_held
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import Box, DeviceProfile, RegisterRange, Tag
@@ -34,7 +34,11 @@ class MailboxModem(RegisterBank):
     """
 
     def __init__(
-        self, profile: DeviceProfile, outgoing: Outgoing, incoming: Incoming, identity: Mapping[str, str] | None = None
+        self,
+        profile: DeviceProfile,
+        outgoing: PacketSource,
+        incoming: PacketSink,
+        identity: Mapping[str, str] | None = None,
     ) -> None:
         if profile.inbox is None or profile.outbox is None:
             raise FileInvalid("the profile has no mailbox", path=profile.path, expected="`mailbox:`")
@@ -166,22 +170,22 @@ class ModemPair:
         self.up, self.down = up, down
 
 
-def _spans(profile: DeviceProfile) -> list[Span]:
+def _spans(profile: DeviceProfile) -> list[CellSpan]:
     """Return the cells of the mailboxes and of the tags.
 
     The device writes the inbox and the outbox's acknowledge register; the client writes the outbox and the inbox's
     acknowledge register.
     """
 
-    def box(b: Box, message: str, ack: str) -> list[Span]:
+    def box(b: Box, message: str, ack: str) -> list[CellSpan]:
         return [
-            Span("holding", b.at.address, b.at.count, "ro" if message == "ro" else "rw"),
-            Span("holding", b.ack.address, 1, "ro" if ack == "ro" else "rw"),
+            CellSpan("holding", b.at.address, b.at.count, "ro" if message == "ro" else "rw"),
+            CellSpan("holding", b.ack.address, 1, "ro" if ack == "ro" else "rw"),
         ]
 
     assert profile.inbox is not None
     assert profile.outbox is not None
     spans = box(profile.inbox, "ro", "rw") + box(profile.outbox, "rw", "ro")
     return spans + [
-        Span(t.registers.table, t.registers.address, t.registers.count, "ro") for t in profile.tags.values()
+        CellSpan(t.registers.table, t.registers.address, t.registers.count, "ro") for t in profile.tags.values()
     ]

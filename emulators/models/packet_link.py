@@ -20,7 +20,7 @@ OVERHEAD_BYTES = 8
 MAX_RESENDS = 50
 
 
-class Outgoing(Protocol):
+class PacketSource(Protocol):
     """The interface that takes packets from a modem."""
 
     sent: int
@@ -31,7 +31,7 @@ class Outgoing(Protocol):
         ...
 
 
-class Incoming(Protocol):
+class PacketSink(Protocol):
     """The interface that delivers packets to a modem."""
 
     delivered: int
@@ -41,7 +41,7 @@ class Incoming(Protocol):
         ...
 
 
-class ModemEnd(Outgoing, Incoming, Protocol):
+class ModemEnd(PacketSource, PacketSink, Protocol):
     """Both directions of a link, for one modem."""
 
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from fieldtwin.emulators.codec import decode, encode
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.journal import DeviceValueLog
-from fieldtwin.emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
+from fieldtwin.emulators.modbus.bank import Access, CellSpan, IllegalValue, MapBank, RegisterBank, Table
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.emulators.stated import bytes_of, cells_held, touches
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -164,12 +164,12 @@ class SampledSensor(RegisterBank):
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
 
-def _spans(profile: DeviceProfile) -> list[Span]:
+def _spans(profile: DeviceProfile) -> list[CellSpan]:
     """Return the cells that exist: those of the tags, each cell once."""
-    spans: dict[tuple[str, int], Span] = {}
+    spans: dict[tuple[str, int], CellSpan] = {}
     for tag in profile.tags.values():
         at = tag.registers
         access: Access = "ro" if tag.access == "ro" else "rw" if tag.access == "rw" else "wo"
         for address in range(at.address, at.end):
-            spans.setdefault((at.table, address), Span(at.table, address, 1, access))
+            spans.setdefault((at.table, address), CellSpan(at.table, address, 1, access))
     return list(spans.values())

@@ -1,7 +1,7 @@
 """The recorded results of one repeated read: kept in columns, and decoded on access.
 
-A recording of a day contains the same few reads a million times. A `Column` holds the replies to one of these reads, in one
-situation (`replay.situation`), as consecutive bytes. `Outcomes` presents a column as a sequence for a virtual context.
+A recording of a day contains the same few reads a million times. An `OutcomeColumn` holds the replies to one of these reads in
+one situation (`replay.situation`), as consecutive bytes. `Outcomes` presents a column as a sequence for a virtual context.
 `CellValues` presents the values of one cell from all columns that contain it, in recorded order. A recording therefore needs only
 its bytes in memory, and is usable as soon as it has been read. Pure.
 """
@@ -25,7 +25,7 @@ _WORDS: dict[bytes, RECORDING] = {}
 """One object for each content of a cell that was ever requested: at most 65,536."""
 
 
-class Column:
+class OutcomeColumn:
     """The outcomes of `request` while the unit was in `situation`.
 
     `odd` holds by position the outcomes that are not a normal reply (b"" for silence); every other outcome has `stride` bytes in
@@ -116,7 +116,7 @@ class _View(Sequence[Recorded], ABC):
 class Outcomes(_View):
     """All outcomes of a column's request, silence included."""
 
-    def __init__(self, column: Column) -> None:
+    def __init__(self, column: OutcomeColumn) -> None:
         self._column = column
 
     def __len__(self) -> int:
@@ -132,7 +132,7 @@ class Merged:
     The order is computed on first access, once for all cells that these columns contain.
     """
 
-    def __init__(self, columns: Sequence[Column]) -> None:
+    def __init__(self, columns: Sequence[OutcomeColumn]) -> None:
         self.columns = columns
         self.size = sum(len(c) - len(c.odd) for c in columns)
         self._which: array[int] | None = None

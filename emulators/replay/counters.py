@@ -42,7 +42,7 @@ class _Counter:
         self.seen: set[int] = set()
 
 
-class Counters:
+class RecordingCounters:
     """The counters of a recording. `torn` counts registers that were recorded without the rest of their counter."""
 
     def __init__(self, spans: Iterable[CounterSpan], context: VirtualContext) -> None:
@@ -54,9 +54,9 @@ class Counters:
             for i in range(span.count):
                 self._by_cell[span.unit, (span.table, span.address + i)] = (counter, i)
 
-    def copy(self, context: VirtualContext) -> Counters:
+    def copy(self, context: VirtualContext) -> RecordingCounters:
         """Return the same counters on a copy of the context, in their initial state."""
-        other = Counters((), context)
+        other = RecordingCounters((), context)
         other.torn = self.torn
         made: dict[int, _Counter] = {}
         for place, (counter, i) in self._by_cell.items():

@@ -15,8 +15,8 @@ from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.modbus.register_functions import STANDARD_FUNCTIONS
 from fieldtwin.emulators.replay import requests
-from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Column, Merged, Outcomes
-from fieldtwin.emulators.replay.counters import Counters
+from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Merged, OutcomeColumn, Outcomes
+from fieldtwin.emulators.replay.counters import RecordingCounters
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell, Situations
 from fieldtwin.gateway.core.files.recording import RecordedExchange
@@ -57,7 +57,7 @@ class LearntUnit:
         self.most_read: dict[int, int] = {}  # function -> most cells ever answered
         self.least_refused: dict[int, int] = {}  # function -> fewest cells ever refused with 03
         self.latency: dict[int, tuple[int, float]] = {}  # function -> number, sum
-        self.by_situation: dict[int, dict[bytes, Column]] = {0: {}}  # while learning
+        self.by_situation: dict[int, dict[bytes, OutcomeColumn]] = {0: {}}  # while learning
         self.columns = self.by_situation[0]  # of the situation that is being recorded
         self.addresses: dict[Table, list[int]] | None = None  # recorded ones, computed when a gap between them is read
 
@@ -86,7 +86,11 @@ class Learner:
     `counters.misfits` counts replies that fit no request."""
 
     def __init__(
-        self, exchanges: Iterable[RecordedExchange], context: VirtualContext, spans: Counters, counters: ReplayCounters
+        self,
+        exchanges: Iterable[RecordedExchange],
+        context: VirtualContext,
+        spans: RecordingCounters,
+        counters: ReplayCounters,
     ) -> None:
         self.context = context
         self.units: dict[int, LearntUnit] = {}
@@ -116,7 +120,7 @@ class Learner:
                     self._drop_oldest(order)
                     size = sum(len(c) * (c.stride + BESIDE) for c in self._columns())
 
-    def _columns(self) -> Iterator[Column]:
+    def _columns(self) -> Iterator[OutcomeColumn]:
         for unit in self.units.values():
             for columns in unit.by_situation.values():
                 yield from columns.values()
@@ -140,7 +144,7 @@ class Learner:
         else:
             self._counters.misfits += 1
 
-    def _learn(self, exchange: RecordedExchange) -> Column | None:
+    def _learn(self, exchange: RecordedExchange) -> OutcomeColumn | None:
         """Learn an exchange; return the new column for a read."""
         request = requests.parse_request(exchange.request)
         if exchange.unit == 0 and exchange.reply == b"":  # on TCP, unit 0 can be a device that answers
@@ -153,7 +157,7 @@ class Learner:
         unit = self._unit(exchange.unit)
         unit.functions.add(exchange.request[0])
         if request is not None and request.values is None:
-            column = unit.columns[exchange.request] = Column(request, unit.situations.learned)
+            column = unit.columns[exchange.request] = OutcomeColumn(request, unit.situations.learned)
             return column
         if exchange.request[0] not in STANDARD_FUNCTIONS:
             unit.request_lengths.setdefault(exchange.request[0], set()).add(len(exchange.request))
@@ -184,7 +188,7 @@ class Learner:
         """Convert the columns to the contents of the context: outcomes of each request, values of each cell."""
         columns = [c for found in unit.by_situation.values() for c in found.values() if len(c)]
         columns.sort(key=lambda c: c.orders[0])
-        holding: dict[Cell, dict[int, list[tuple[Column, int]]]] = {}
+        holding: dict[Cell, dict[int, list[tuple[OutcomeColumn, int]]]] = {}
         for column in columns:
             request, situation = column.request, column.situation
             shape = shape_key(unit_id, struct.pack(">BHH", request.function, request.address, request.count))
@@ -214,7 +218,7 @@ class Learner:
         unit.columns = {}
 
     @staticmethod
-    def _count(unit: LearntUnit, column: Column) -> None:
+    def _count(unit: LearntUnit, column: OutcomeColumn) -> None:
         """Learn the latency of reads, and the largest quantity that the device returns."""
         silent = [i for i, reply in column.odd.items() if not reply.data]
         function, answered = column.request.function, len(column) - len(silent)
@@ -225,7 +229,7 @@ class Learner:
         if len(column) > len(column.odd):
             unit.most_read[function] = max(column.request.count, unit.most_read.get(function, 0))
 
-    def _count_on(self, unit_id: int, counted: set[Cell], columns: Sequence[Column]) -> None:
+    def _count_on(self, unit_id: int, counted: set[Cell], columns: Sequence[OutcomeColumn]) -> None:
         """Learn the cells of counters, in recorded order because their values are assembled register by register."""
         if not counted:
             return

@@ -12,7 +12,7 @@ from __future__ import annotations
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.replay import requests
 from fieldtwin.emulators.replay.own_functions import add_own_functions
-from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay, ReplayedReply
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.emulators.stated import Effects, cells_of, parts_of
@@ -54,7 +54,7 @@ class ProfiledReplay(ReplayUnit):
             return not self.replay.was_recorded(self.unit_id, pdu)
         return pdu[0] in self._counting or super().computes(pdu)
 
-    def recall(self, pdu: bytes) -> Answer:
+    def recall(self, pdu: bytes) -> ReplayedReply:
         answer = self._recall(pdu)
         request = requests.parse_request(pdu) if self._effects else None
         if request is not None and answer.reply is not None and answer.reply[0] == pdu[0]:
@@ -63,7 +63,7 @@ class ProfiledReplay(ReplayUnit):
                 self.replay.put(self.unit_id, at.table, at.address, cells_of(tag, value))
         return answer
 
-    def _recall(self, pdu: bytes) -> Answer:
+    def _recall(self, pdu: bytes) -> ReplayedReply:
         if self.replay.was_recorded(self.unit_id, pdu):
             return super().recall(pdu)
         request, allowed = requests.parse_request(pdu), self._limits.functions

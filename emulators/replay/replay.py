@@ -20,7 +20,7 @@ from pathlib import Path
 from fieldtwin.emulators.context import MAX_ENTRIES, EndOfRecording, Recorded, UsedUp, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.replay import requests
-from fieldtwin.emulators.replay.counters import Counters, CounterSpan
+from fieldtwin.emulators.replay.counters import CounterSpan, RecordingCounters
 from fieldtwin.emulators.replay.learning import (
     CELL_KEY,
     TABLE_CODES,
@@ -50,7 +50,7 @@ class NeverRecorded(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ReplayedReply:
     """The device's reply, None for silence, and its latency in the recording."""
 
     reply: bytes | None
@@ -81,7 +81,7 @@ class ExchangeReplay:
         self.never_recorded = never_recorded
         self.counters = ReplayCounters()
         self.truncated = False
-        self._spans = Counters(counters, self.context)
+        self._spans = RecordingCounters(counters, self.context)
         self._last_answers: dict[bytes, Recorded] = {}
         self._units = Learner(exchanges, self.context, self._spans, self.counters).units
 
@@ -120,19 +120,19 @@ class ExchangeReplay:
         """Return the unit IDs that were recorded."""
         return tuple(sorted(self._units))
 
-    def respond(self, unit_id: int, pdu: bytes) -> Answer:
+    def respond(self, unit_id: int, pdu: bytes) -> ReplayedReply:
         """Return the recorded unit's next answer to `pdu` (function code and data)."""
         if not pdu:
-            return Answer(None)
+            return ReplayedReply(None)
         unit = self._units.get(unit_id)
         if unit is None:
             self.counters.never_recorded += 1
-            return self._counted(pdu, Answer(None))
+            return self._counted(pdu, ReplayedReply(None))
         try:
             return self._counted(pdu, self._answer(unit_id, unit, pdu))
         except UsedUp:
             self.counters.used_up += 1
-            return self._counted(pdu, Answer(requests.exception(pdu, requests.DEVICE_FAILURE)))
+            return self._counted(pdu, ReplayedReply(requests.exception(pdu, requests.DEVICE_FAILURE)))
 
     def broadcast(self, pdu: bytes, unit_id: int | None = None) -> None:
         """Process a broadcast for `unit_id`, or for all units: writes have their effect, and no unit answers."""
@@ -147,17 +147,17 @@ class ExchangeReplay:
         unit = self._units.get(unit_id)
         return unit is not None and shape_key(unit_id, pdu) in unit.recorded_in
 
-    def refuse(self, unit_id: int, pdu: bytes, code: int) -> Answer:
+    def refuse(self, unit_id: int, pdu: bytes, code: int) -> ReplayedReply:
         """Return the answer to a request that the device is known to refuse, although it was not recorded."""
         latency_s = self._units[unit_id].usual_latency_s(pdu[0])
-        return self._counted(pdu, Answer(requests.exception(pdu, code), latency_s))
+        return self._counted(pdu, ReplayedReply(requests.exception(pdu, code), latency_s))
 
-    def accept(self, unit_id: int, request: CellRequest, pdu: bytes) -> Answer:
+    def accept(self, unit_id: int, request: CellRequest, pdu: bytes) -> ReplayedReply:
         """Return the answer to a write that the device is known to accept, although it was not recorded."""
         unit = self._units[unit_id]
         unit.write(request, request.values or ())
         latency_s = unit.usual_latency_s(pdu[0]) or unit.usual_latency_s(3)
-        return self._counted(pdu, Answer(requests.written_reply(request, pdu), latency_s))
+        return self._counted(pdu, ReplayedReply(requests.written_reply(request, pdu), latency_s))
 
     def own_request_lengths(self, unit_id: int) -> dict[int, int]:
         """Return the PDU lengths, in bytes, of non-standard functions whose recorded requests all have the same length."""
@@ -172,7 +172,7 @@ class ExchangeReplay:
         """Set cells from the device's side, counters included: they keep the values until they are written or put again."""
         self._units[unit_id].put.update({(table, address + i): value for i, value in enumerate(values)})
 
-    def _counted(self, pdu: bytes, answer: Answer) -> Answer:
+    def _counted(self, pdu: bytes, answer: ReplayedReply) -> ReplayedReply:
         if answer.reply is None:
             self.counters.silences += 1
         elif requests.is_exception(pdu, answer.reply):
@@ -183,24 +183,26 @@ class ExchangeReplay:
 
     # -- answering ------------------------------------------------------------------------------------------------
 
-    def _answer(self, unit_id: int, unit: LearntUnit, pdu: bytes) -> Answer:
+    def _answer(self, unit_id: int, unit: LearntUnit, pdu: bytes) -> ReplayedReply:
         request = requests.parse_request(pdu)
         outcome = self._outcome(unit, shape_key(unit_id, pdu))
         if outcome is not None:
             reply = outcome.response.data
             if not reply:
-                return Answer(None, outcome.latency_s)
+                return ReplayedReply(None, outcome.latency_s)
             if request is None or requests.is_exception(pdu, reply):
-                return Answer(reply, outcome.latency_s)
+                return ReplayedReply(reply, outcome.latency_s)
             if request.values is None and requests.parse_values(request, reply) is None:
-                return Answer(reply, outcome.latency_s)  # the device's own mistake, replayed as recorded
+                return ReplayedReply(reply, outcome.latency_s)  # the device's own mistake, replayed as recorded
             if request.values is not None:
                 if requests.is_written(request, pdu, reply):
                     unit.write(request, request.values)
-                return Answer(reply, outcome.latency_s)
+                return ReplayedReply(reply, outcome.latency_s)
             if not self._knows_all(unit_id, unit, request):
-                return Answer(reply, outcome.latency_s)  # only part of a counter was recorded: return what there is
-            return Answer(self._read(unit_id, unit, request), outcome.latency_s)
+                return ReplayedReply(
+                    reply, outcome.latency_s
+                )  # only part of a counter was recorded: return what there is
+            return ReplayedReply(self._read(unit_id, unit, request), outcome.latency_s)
         if request is None or pdu[0] not in unit.functions:
             known = pdu[0] in unit.functions
             if known and requests.leaves_the_table(pdu):
@@ -210,30 +212,34 @@ class ExchangeReplay:
             return self._answer_new_read(unit_id, unit, request, pdu)
         return self._answer_new_write(unit, request, request.values, pdu)
 
-    def _answer_new_read(self, unit_id: int, unit: LearntUnit, request: CellRequest, pdu: bytes) -> Answer:
+    def _answer_new_read(self, unit_id: int, unit: LearntUnit, request: CellRequest, pdu: bytes) -> ReplayedReply:
         """Answer a read of a range that was not recorded."""
         refused = unit.least_refused.get(request.function)
         if refused is not None and refused <= request.count > unit.most_read.get(request.function, 0):
-            return Answer(requests.exception(pdu, requests.ILLEGAL_VALUE), unit.usual_latency_s(request.function))
+            return ReplayedReply(
+                requests.exception(pdu, requests.ILLEGAL_VALUE), unit.usual_latency_s(request.function)
+            )
         if not self._knows_all(unit_id, unit, request) and not self._between_all(unit_id, unit, request):
             return self._never(pdu, requests.ILLEGAL_ADDRESS)
-        return Answer(self._read(unit_id, unit, request), unit.usual_latency_s(request.function))
+        return ReplayedReply(self._read(unit_id, unit, request), unit.usual_latency_s(request.function))
 
-    def _answer_new_write(self, unit: LearntUnit, request: CellRequest, values: tuple[int, ...], pdu: bytes) -> Answer:
+    def _answer_new_write(
+        self, unit: LearntUnit, request: CellRequest, values: tuple[int, ...], pdu: bytes
+    ) -> ReplayedReply:
         """Answer a write of a range or a value that was not recorded."""
         if all((request.table, address) in unit.writable for address in request.addresses):
             unit.write(request, values)
-            return Answer(requests.written_reply(request, pdu), unit.usual_latency_s(request.function))
+            return ReplayedReply(requests.written_reply(request, pdu), unit.usual_latency_s(request.function))
         refused = unit.refused_writes.get((request.function, request.address, request.count))
         if refused is not None:
-            return Answer(refused.response.data, refused.latency_s)
+            return ReplayedReply(refused.response.data, refused.latency_s)
         return self._never(pdu, requests.ILLEGAL_ADDRESS)
 
-    def _never(self, pdu: bytes, code: int) -> Answer:
+    def _never(self, pdu: bytes, code: int) -> ReplayedReply:
         self.counters.never_recorded += 1
         if self.never_recorded is NeverRecorded.SILENCE:
-            return Answer(None)
-        return Answer(requests.exception(pdu, code))
+            return ReplayedReply(None)
+        return ReplayedReply(requests.exception(pdu, code))
 
     def _outcome(self, unit: LearntUnit, shape: bytes) -> Recorded | None:
         """Return the outcome of a request of this shape, in recorded order; None if none was recorded.

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fieldtwin.emulators.modbus.bank import IllegalAddress, RegisterBank, Table
+from fieldtwin.emulators.modbus.bank import NoSuchAddress, RegisterBank, Table
 from fieldtwin.emulators.modbus.unit import WHILE_BUSY, Handler, ModbusUnit, UnitParts
-from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay, ReplayedReply
 from fieldtwin.gateway.core.errors import UsageError
 
 
@@ -19,10 +19,10 @@ class _NoBank(RegisterBank):
     """An empty bank, because a recorded unit computes no answers."""
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
-        raise IllegalAddress(f"{table}:{address}")
+        raise NoSuchAddress(f"{table}:{address}")
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
-        raise IllegalAddress(f"{table}:{address}")
+        raise NoSuchAddress(f"{table}:{address}")
 
 
 class ReplayUnit(ModbusUnit):
@@ -76,7 +76,7 @@ class ReplayUnit(ModbusUnit):
         """Return whether the unit computes this answer itself, regardless of the recording."""
         return pdu[0] in self._registered
 
-    def recall(self, pdu: bytes) -> Answer:
+    def recall(self, pdu: bytes) -> ReplayedReply:
         """Return the answer of the recorded unit."""
         return self.replay.respond(self.unit_id, pdu)
 

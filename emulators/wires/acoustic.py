@@ -65,7 +65,7 @@ LOSSES = ("collision", "speaking", "chance", "fault")
 
 
 @dataclass(slots=True)
-class Counters:
+class ModemCounters:
     """Counters of one modem.
 
     `lost` counts lost packets by cause: ``collision``, ``speaking`` (the modem itself transmitted), ``chance``, ``fault``.
@@ -85,7 +85,7 @@ class _Modem:
         self.number = number
         self.at_m = at_m
         self.random = random
-        self.counters = Counters()
+        self.counters = ModemCounters()
         self.to_say: deque[tuple[int, bytes]] = deque()
         """Waiting packets, each with the earliest time of its transmission."""
         self.heard: deque[bytes] = deque()
@@ -123,7 +123,7 @@ class AcousticMedium:
         self._number = 0
 
     @property
-    def counters(self) -> dict[str, Counters]:
+    def counters(self) -> dict[str, ModemCounters]:
         return {name: modem.counters for name, modem in self._modems.items()}
 
     @property

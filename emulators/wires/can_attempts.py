@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from fieldtwin.emulators.wires import can_verdict
-from fieldtwin.emulators.wires.can_events import Delivery, ErrorFrame, Notice
-from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
+from fieldtwin.emulators.wires.can_events import CanErrorFrame, Delivery, Notice
+from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Disturbance, ErrorRule
 from fieldtwin.emulators.wires.can_fd_timing import data_phase
 from fieldtwin.emulators.wires.can_load import BusLoad
-from fieldtwin.emulators.wires.can_nodes import BusOff, Node, Start
+from fieldtwin.emulators.wires.can_nodes import BusOffNodes, Node, Start
 from fieldtwin.emulators.wires.can_timing import INTERFRAME_BITS, bits_to_end
 from fieldtwin.emulators.wires.can_verdict import FailedAttempt
 from fieldtwin.gateway.core.can_error import CanErrorState
@@ -47,11 +47,11 @@ class Attempts:
         self.load = BusLoad(bitrate)
         self.nodes: dict[int, Node] = {}
         self.waiting: dict[int, Node] = {}
-        self.off = BusOff()
-        self.rules: list[Rule] = []
+        self.off = BusOffNodes()
+        self.rules: list[ErrorRule] = []
         self.done: list[Delivery] = []
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
-        self.faults: deque[ErrorFrame] = deque(maxlen=MAX_NOTICES)
+        self.faults: deque[CanErrorFrame] = deque(maxlen=MAX_NOTICES)
         self._others: dict[int, tuple[int, ...]] = {}
         """Receivers of the frames of each node, while no node joins, leaves or is in bus-off."""
         self._joined_ns = 0
@@ -215,7 +215,7 @@ class Attempts:
             node.errors += 1
             counters.append((number, node.faults.tec, node.faults.rec))
         self.faults.append(
-            ErrorFrame(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters))
+            CanErrorFrame(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters))
         )
 
     def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:

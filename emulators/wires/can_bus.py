@@ -26,8 +26,8 @@ from typing import Any
 
 from fieldtwin.emulators.wires import can_verdict
 from fieldtwin.emulators.wires.can_attempts import Attempts
-from fieldtwin.emulators.wires.can_events import Delivery, ErrorFrame, Notice
-from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Rule
+from fieldtwin.emulators.wires.can_events import CanErrorFrame, Delivery, Notice
+from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, ErrorRule
 from fieldtwin.emulators.wires.can_nodes import Node, Pending, Start
 from fieldtwin.emulators.wires.can_timing import arbitration_key, bits_to_end
 from fieldtwin.gateway.core.can_error import CanErrorState
@@ -162,14 +162,14 @@ class CanBus:
         faults = self._node(node).faults
         return faults.state, faults.tec, faults.rec
 
-    def disturb(self, rule: Rule) -> None:
+    def disturb(self, rule: ErrorRule) -> None:
         """Destroy attempts as `rule` says (`can_faults.spoil` creates one).
 
         The first rule that returns a disturbance decides.
         """
         self._wire.rules.append(rule)
 
-    def undisturb(self, rule: Rule) -> None:
+    def undisturb(self, rule: ErrorRule) -> None:
         """Remove a rule; an unknown rule is ignored."""
         if rule in self._wire.rules:
             self._wire.rules.remove(rule)
@@ -193,7 +193,7 @@ class CanBus:
         self._wire.notices.clear()
         return notices
 
-    def take_faults(self) -> list[ErrorFrame]:
+    def take_faults(self) -> list[CanErrorFrame]:
         """Return the error frames up to the last `advance`, in order; each is returned once."""
         faults = list(self._wire.faults)
         self._wire.faults.clear()

@@ -36,7 +36,7 @@ class Notice:
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorFrame:
+class CanErrorFrame:
     """An error frame: an attempt to send `frame` that failed and is repeated.
 
     `kind` is ``bit`` (the sender read a different level than it sent, including collisions), ``crc`` or ``stuff`` (a receiver

@@ -1,7 +1,7 @@
 """Fault confinement of a CAN node, and how errors are injected into the modelled bus (ISO 11898-1, 12.1.4).
 
 `Confinement` holds one node's transmit and receive error counters and the state that follows from them. With
-`Disturbance` and `Rule`, a test or a fault file destroys frames: a rule is called once for each attempt to send and
+`Disturbance` and `ErrorRule`, a test or a fault file destroys frames: a rule is called once for each attempt to send and
 returns the error. This module knows no bus and no time.
 """
 
@@ -99,7 +99,7 @@ class Disturbance:
     seen_by: frozenset[int] = frozenset()
 
 
-class Rule(Protocol):
+class ErrorRule(Protocol):
     """A function that is called once for each attempt to send a frame that won its arbitration. It returns None for no error."""
 
     def __call__(self, frame: CanFrame, start_ns: int, senders: tuple[int, ...], /) -> Disturbance | None: ...
@@ -111,7 +111,7 @@ def spoil(
     match: Callable[[CanFrame], bool] = lambda frame: True,
     skip: int = 0,
     times: int | None = 1,
-) -> Rule:
+) -> ErrorRule:
     """Return a rule that destroys attempts to send frames that `match`: after `skip` undisturbed attempts the next `times`.
 
     If `times` is None, it destroys all further attempts.

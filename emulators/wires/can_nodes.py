@@ -81,7 +81,7 @@ class Node:
         }
 
 
-class BusOff(dict[int, int]):
+class BusOffNodes(dict[int, int]):
     """The nodes in bus-off, each with the number of recessive sequences that it still waits for."""
 
     def enter(self, number: int) -> None:

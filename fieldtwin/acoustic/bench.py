@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import Kind, Trace
+from fieldtwin.results.trace import Trace, TraceKind
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.scenarios.bench import Bench, Can, Stopped, TagReading
 
@@ -39,8 +39,8 @@ class MemberTrace(Trace):
     def offset_ns(self) -> int:
         return self._later_ns()
 
-    def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
-        if kind is Kind.FAULT:
+    def note(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
+        if kind is TraceKind.FAULT:
             if data.get("target"):
                 data = {**data, "target": self._prefix + data["target"]}
         else:
@@ -58,7 +58,7 @@ class Part:
 
 
 class NetworkBench:
-    """A `fieldtwin.scenarios.bench.Bench`.
+    """A `fieldtwin.scenarios.bench.WorkerBench`.
 
     `parts` by the names of the network's members; `topside` sends from the topside modem.
     """
@@ -146,7 +146,7 @@ class NetworkBench:
             self._where[id] = WATER
             target = f"{WATER} {fault.get('device', '')}".strip()
             self.trace.note(
-                self.now_ns(), Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault}
+                self.now_ns(), TraceKind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault}
             )
             return
         await self.parts[where].bench.inject(local)
@@ -164,7 +164,7 @@ class NetworkBench:
             raise UsageError(f"no fault {id!r} is active", expected=", ".join(self._where) or "one; there is none")
         if where == WATER:
             self.faults.clear(id)
-            self.trace.note(self.now_ns(), Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+            self.trace.note(self.now_ns(), TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})
         else:
             await self.parts[where].bench.clear(id)
 

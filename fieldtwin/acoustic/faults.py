@@ -12,7 +12,7 @@ from typing import Any
 from fieldtwin.acoustic.schema import WATER
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active
-from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection, Framing
 from fieldtwin.emulators.faults.loss.drop import Drop
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
@@ -45,7 +45,7 @@ class AcousticFaults:
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
         """Return whether a fault strikes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
-        return self._wire.decide(Frame(Way.REPLY, Framing.RAW, payload, listener), t_ns) is not None
+        return self._wire.decide(FaultFrame(FrameDirection.REPLY, Framing.RAW, payload, listener), t_ns) is not None
 
     def inject(self, said: Mapping[str, Any]) -> str:
         """Inject a fault and return its id. Raises `UsageError`."""

@@ -21,7 +21,7 @@ from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.virtual.group_kinds import Drawing, LiveRequest, VirtualSystems
 from fieldtwin.run.virtual.system_check import SystemCheck
 from fieldtwin.scenarios.language.form import Scenario
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.prototype.group import SystemGroup
 
 
@@ -58,7 +58,7 @@ async def virtual(
     trace: Trace,
     seed: int,
     commands: Sequence[Scripted] | None,
-    probes: Sequence[Probe] = (),
+    probes: Sequence[ScenarioProbe] = (),
 ) -> AsyncIterator[VirtualSystems]:
     from fieldtwin.acoustic.virtual import VirtualNetwork
 

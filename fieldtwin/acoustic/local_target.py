@@ -15,10 +15,10 @@ from fieldtwin.acoustic.session import NetworkOptions, NetworkSession
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.results.model import ScenarioResult
-from fieldtwin.results.trace import TOPSIDE, Kind, Trace
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind
 from fieldtwin.run.benches.control_bench import ControlBench, Where
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.scenarios.judging.runner import Runner
+from fieldtwin.scenarios.judging.runner import ScenarioRunner
 from fieldtwin.scenarios.language.form import Scenario
 
 
@@ -50,7 +50,7 @@ async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> Sce
         if session.topside is not None:
             session.topside.on_send = _told(bench)
             bench.topside = session.topside
-        return await Runner(scenario, bench).run()
+        return await ScenarioRunner(scenario, bench).run()
 
 
 class _Tidy:
@@ -90,6 +90,6 @@ def _gone(session: RunSession) -> Callable[[], FieldtwinError | None]:
 def _told(bench: NetworkBench) -> Callable[[int], None]:
     def commanded(period_s: int) -> None:
         data = {"text": f"commands {period_s} s", "period_s": period_s}
-        bench.trace.note(bench.now_ns(), Kind.NOTE, TOPSIDE, data)
+        bench.trace.note(bench.now_ns(), TraceKind.NOTE, TOPSIDE, data)
 
     return commanded

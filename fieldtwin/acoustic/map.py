@@ -22,7 +22,7 @@ AROUND = 110.0
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MemberPosition:
     """A member: a system with its file and devices, or the topside controller. `at_m` as in the file."""
 
     name: str
@@ -32,7 +32,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class AcousticPath:
     """Two members that hear each other, with their distance and the sound's travel time."""
 
     one: str
@@ -51,8 +51,8 @@ class Map:
 
     network: str
     water: str
-    places: tuple[Place, ...]
-    ways: tuple[Way, ...]
+    places: tuple[MemberPosition, ...]
+    ways: tuple[AcousticPath, ...]
 
     def as_data(self) -> dict[str, Any]:
         """Return the map as JSON data."""
@@ -63,11 +63,15 @@ def network_map(network: Network) -> Map:
     """Return the map of `network`."""
     water, members = network.water, network.members
     where = network.places
-    places = [Place(name, m.system.name, tuple(m.system.devices), tuple(where[name])) for name, m in members.items()]
+    places = [
+        MemberPosition(name, m.system.name, tuple(m.system.devices), tuple(where[name])) for name, m in members.items()
+    ]
     if SHIP in where:
-        places.append(Place(SHIP, "", (), tuple(where[SHIP])))
+        places.append(MemberPosition(SHIP, "", (), tuple(where[SHIP])))
     apart = [(a.name, b.name, dist(a.at_m, b.at_m)) for a, b in combinations(places, 2)]
-    ways = [Way(a, b, round(d, 1), round(d / water.sound_m_per_s, 3)) for a, b, d in apart if d <= water.range_m]
+    ways = [
+        AcousticPath(a, b, round(d, 1), round(d / water.sound_m_per_s, 3)) for a, b, d in apart if d <= water.range_m
+    ]
     said = f"range {water.range_m / 1000:g} km, {water.bytes_per_s:g} byte/s, {water.loss * 100:g} % lost by chance"
     return Map(network.name, said, tuple(places), tuple(ways))
 
@@ -116,7 +120,7 @@ def _spots(drawn: Map) -> tuple[dict[str, tuple[float, float]], float]:
     return spots, EDGE + 60 + high + 5 * LINE + EDGE
 
 
-def _way(way: Way, spots: dict[str, tuple[float, float]]) -> list[Markup]:
+def _way(way: AcousticPath, spots: dict[str, tuple[float, float]]) -> list[Markup]:
     (x1, y1), (x2, y2) = spots[way.one], spots[way.other]
     at = ((x1 + x2) / 2, (y1 + y2) / 2 - 8)
     return [
@@ -125,7 +129,9 @@ def _way(way: Way, spots: dict[str, tuple[float, float]]) -> list[Markup]:
     ]
 
 
-def _place(place: Place, spot: tuple[float, float], taken: list[tuple[float, float, float, float]]) -> list[Markup]:
+def _place(
+    place: MemberPosition, spot: tuple[float, float], taken: list[tuple[float, float, float, float]]
+) -> list[Markup]:
     """Draw a dot, with its texts below it, or above if another label is there."""
     metres = ", ".join(f"{m:g}" for m in place.at_m) + " m"
     rows = [(place.name, "name"), (place.system, ""), (", ".join(place.devices), "soft"), (metres, "soft")]

@@ -30,7 +30,7 @@ from fieldtwin.twin.site.system import System, load_system
 
 
 @dataclass(frozen=True)
-class Member(GroupMember):
+class AcousticMember(GroupMember):
     """A system of a network. `modem` is the device in the acoustic channel, at position `at_m`."""
 
     modem: str
@@ -46,7 +46,7 @@ class Member(GroupMember):
 class Network(SystemGroup):
     """A network file, resolved."""
 
-    members: Mapping[str, Member]
+    members: Mapping[str, AcousticMember]
     water: AcousticProperties
     ship: TopsideForm | None
     file: YamlFile
@@ -139,7 +139,7 @@ class Network(SystemGroup):
         )
 
 
-def _renamed(program: ProgramForm, member: Member) -> ProgramForm:
+def _renamed(program: ProgramForm, member: AcousticMember) -> ProgramForm:
     beside = member.system.path.parent / program.source
     return ProgramForm.model_construct(
         source=str(beside.resolve()) if beside.is_file() else program.source,
@@ -168,7 +168,7 @@ def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:
     return Network(form.network, path, form.seed, members, water, form.ship, file)
 
 
-def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: tuple[Path, ...]) -> Member:
+def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: tuple[Path, ...]) -> AcousticMember:
     said, loc = form.systems[name], ("systems", name)
     try:
         system = load_system(str(find("systems", said.system, beside=path, extra=profiles)), profiles)
@@ -189,7 +189,7 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
             expected=", ".join(modems) or "a device with `model: mailbox` in its prototype file",
             hint=did_you_mean(said.modem, modems),
         )
-    return Member(name, system, prototype, said.modem, tuple(said.at_m))
+    return AcousticMember(name, system, prototype, said.modem, tuple(said.at_m))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -197,7 +197,7 @@ def _files(folder: Path) -> list[Path]:
     return [p for place in (folder, folder / "systems") for p in sorted(place.glob("*.yaml")) if "." not in p.stem]
 
 
-def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> None:
+def _check(file: YamlFile, form: NetworkForm, members: dict[str, AcousticMember]) -> None:
     """Check what concerns several systems: coordinates, names, mailbox sizes and modem addresses."""
     first = next(iter(form.systems.values()))
     places: list[tuple[tuple[Key, ...], list[float]]] = [(("systems", n), m.at_m) for n, m in form.systems.items()]

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from fieldtwin.twin.site.schema import Name, Strict
+from fieldtwin.twin.site.schema import Name, SiteModel
 
 WATER = "water"
 """The name of the acoustic channel in faults, used like the name of a bus."""
@@ -19,7 +19,7 @@ SHIP = "ship"
 Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 
 
-class AcousticForm(Strict):
+class AcousticForm(SiteModel):
     """The acoustic channel: its range, propagation speed, data rate and losses."""
 
     range_m: float = Field(gt=0, le=1_000_000)
@@ -33,7 +33,7 @@ class AcousticForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class MemberForm(Strict):
+class MemberForm(SiteModel):
     """A system of the network, which of its devices is the modem, and the modem's position."""
 
     system: str
@@ -44,7 +44,7 @@ class MemberForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class TopsideForm(Strict):
+class TopsideForm(SiteModel):
     """The source of commands: a topside modem that sends each command several times, because none is acknowledged."""
 
     at_m: Place
@@ -54,7 +54,7 @@ class TopsideForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class NetworkForm(Strict):
+class NetworkForm(SiteModel):
     """Several systems whose modems hear each other, all run as prototypes, and the acoustic channel between them."""
 
     fieldtwin: Literal[1]

@@ -22,7 +22,7 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.results.trace import TOPSIDE, Kind, Trace
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.processes.topside import Scripted, TopsideController
 
@@ -110,4 +110,4 @@ class VirtualNetwork(AsyncResource):
 
     def _commanded(self, period_s: int) -> None:
         data = {"text": f"commands {period_s} s", "period_s": period_s}
-        self.trace.note(self.bench.now_ns(), Kind.NOTE, TOPSIDE, data)
+        self.trace.note(self.bench.now_ns(), TraceKind.NOTE, TOPSIDE, data)

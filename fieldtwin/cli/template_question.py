@@ -24,7 +24,7 @@ TRUST: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class SourceOptions:
+class TemplateSearchOptions:
     """The folders in which profiles and systems are searched first, and the user's consent to a template's code."""
 
     profiles: tuple[Path, ...] = option("--profiles", **PROFILES)

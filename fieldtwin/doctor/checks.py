@@ -12,7 +12,14 @@ from pathlib import Path
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.doctor import host as here
-from fieldtwin.doctor.verdicts import Check, HostVerdict, judged_can, judged_clock, judged_processor, judged_watches
+from fieldtwin.doctor.verdicts import (
+    DoctorCheck,
+    HostVerdict,
+    judged_can,
+    judged_clock,
+    judged_processor,
+    judged_watches,
+)
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.twin.plant.instance import runtime_root
 from fieldtwin.twin.site.data_files import data_root
@@ -22,9 +29,9 @@ MIN_FREE_BYTES = 200 * 1024 * 1024
 MIN_OPEN_FILES = 1024
 
 
-def examine() -> list[Check]:
+def examine() -> list[DoctorCheck]:
     """Run every check; they change nothing except temporary files."""
-    checks: tuple[Callable[[], Check], ...] = (
+    checks: tuple[Callable[[], DoctorCheck], ...] = (
         _python,
         _data,
         _run_directory,
@@ -41,25 +48,25 @@ def examine() -> list[Check]:
     return [check() for check in checks]
 
 
-def _python() -> Check:
+def _python() -> DoctorCheck:
     found = f"fieldtwin {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    return Check("python", HostVerdict.OK, found)
+    return DoctorCheck("python", HostVerdict.OK, found)
 
 
-def _data() -> Check:
+def _data() -> DoctorCheck:
     try:
         root = data_root()
         system = load_system(str(root / "profiles" / "systems" / "observatory.yaml"))
     except FieldtwinError as e:
-        return Check("shipped data", HostVerdict.BAD, str(e), "reinstall fieldtwin")
+        return DoctorCheck("shipped data", HostVerdict.BAD, str(e), "reinstall fieldtwin")
     profiles = len(list((root / "profiles" / "devices").glob("*.yaml")))
     recordings = len(list((root / "recordings").glob("*.jsonl")))
-    return Check(
+    return DoctorCheck(
         "shipped data", HostVerdict.OK, f"system {system.name}, {profiles} profiles, {recordings} recordings in {root}"
     )
 
 
-def _run_directory() -> Check:
+def _run_directory() -> DoctorCheck:
     root = runtime_root()
     try:
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -67,15 +74,15 @@ def _run_directory() -> Check:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as e:
-        return Check(
+        return DoctorCheck(
             "run directory", HostVerdict.BAD, f"{root}: {e.strerror}", "set FIELDTWIN_RUN to a folder of yours"
         )
-    return Check("run directory", HostVerdict.OK, str(root))
+    return DoctorCheck("run directory", HostVerdict.OK, str(root))
 
 
-def _pty() -> Check:
+def _pty() -> DoctorCheck:
     if not hasattr(os, "openpty"):
-        return Check(
+        return DoctorCheck(
             "virtual serial", HostVerdict.NOTE, "this system has none", "emulate on tcp, or on real serial ports"
         )
     import tty
@@ -90,32 +97,36 @@ def _pty() -> Check:
             os.close(master)
             os.close(slave)
     except OSError as e:
-        return Check("virtual serial", HostVerdict.BAD, f"no pseudo-terminal: {e.strerror}", "mount devpts on /dev/pts")
+        return DoctorCheck(
+            "virtual serial", HostVerdict.BAD, f"no pseudo-terminal: {e.strerror}", "mount devpts on /dev/pts"
+        )
     if not whole:
-        return Check("virtual serial", HostVerdict.BAD, "a raw pty changes bytes", "report this")
-    return Check("virtual serial", HostVerdict.OK, "ptys work")
+        return DoctorCheck("virtual serial", HostVerdict.BAD, "a raw pty changes bytes", "report this")
+    return DoctorCheck("virtual serial", HostVerdict.OK, "ptys work")
 
 
-def _serial() -> Check:
+def _serial() -> DoctorCheck:
     from fieldtwin.gateway.connections.serial_port import local_ports
 
     ports = local_ports()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
     if closed:
-        return Check("serial ports", HostVerdict.NOTE, f"no access to {', '.join(closed)}", here.join_advice(closed))
-    return Check("serial ports", HostVerdict.OK, ", ".join(ports) or "none (prototypes need none)")
+        return DoctorCheck(
+            "serial ports", HostVerdict.NOTE, f"no access to {', '.join(closed)}", here.join_advice(closed)
+        )
+    return DoctorCheck("serial ports", HostVerdict.OK, ", ".join(ports) or "none (prototypes need none)")
 
 
-def _can() -> Check:
+def _can() -> DoctorCheck:
     if not hasattr(socket, "PF_CAN"):
-        return Check(
+        return DoctorCheck(
             "kernel CAN", HostVerdict.NOTE, "this Python has no SocketCAN", "prototypes use the software CAN bus"
         )
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as e:
         reason = "no CAN in this kernel" if e.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT) else str(e.strerror)
-        return Check(
+        return DoctorCheck(
             "kernel CAN",
             HostVerdict.NOTE,
             reason,
@@ -124,44 +135,46 @@ def _can() -> Check:
     return judged_can(here.can_interfaces())
 
 
-def _realtime() -> Check:
+def _realtime() -> DoctorCheck:
     allowed, found = here.may_realtime()
     if not allowed:
         advice = (
             "for a steadier scan: rtprio and memlock in /etc/security/limits.d, or CAP_SYS_NICE (systemd: LimitRTPRIO)"
         )
-        return Check("real time", HostVerdict.NOTE, found, advice)
-    return Check("real time", HostVerdict.OK, found)
+        return DoctorCheck("real time", HostVerdict.NOTE, found, advice)
+    return DoctorCheck("real time", HostVerdict.OK, found)
 
 
-def _files() -> Check:
+def _files() -> DoctorCheck:
     """Check the hard limit: a process that serves many devices raises its own limit up to it."""
     hard = here.most_open_files()
     if hard is None:
-        return Check("open files", HostVerdict.OK, "no limit")
+        return DoctorCheck("open files", HostVerdict.OK, "no limit")
     if hard < MIN_OPEN_FILES:
-        return Check("open files", HostVerdict.NOTE, f"limit {hard}", f"ulimit -Hn {MIN_OPEN_FILES} for many devices")
-    return Check("open files", HostVerdict.OK, f"limit {hard}")
+        return DoctorCheck(
+            "open files", HostVerdict.NOTE, f"limit {hard}", f"ulimit -Hn {MIN_OPEN_FILES} for many devices"
+        )
+    return DoctorCheck("open files", HostVerdict.OK, f"limit {hard}")
 
 
-def _watches() -> Check:
+def _watches() -> DoctorCheck:
     return judged_watches(here.kernel_number("fs/inotify/max_user_instances"))
 
 
-def _processor() -> Check:
+def _processor() -> DoctorCheck:
     return judged_processor(here.cpu_count(), here.cgroup_quota())
 
 
-def _clock() -> Check:
+def _clock() -> DoctorCheck:
     return judged_clock(here.clock_state())
 
 
-def _disk() -> Check:
+def _disk() -> DoctorCheck:
     root = runtime_root()
     # Path.exists raises if a parent folder is not accessible.
     existing = next((p for p in (root, *root.parents) if os.path.exists(p)), Path("/"))
     free = shutil.disk_usage(existing).free
     found = f"{free // (1024 * 1024)} MiB free at {existing}"
     if free < MIN_FREE_BYTES:
-        return Check("disk", HostVerdict.BAD, found, "logs and stores need space")
-    return Check("disk", HostVerdict.OK, found)
+        return DoctorCheck("disk", HostVerdict.BAD, found, "logs and stores need space")
+    return DoctorCheck("disk", HostVerdict.OK, found)

@@ -20,7 +20,7 @@ class HostVerdict(Enum):
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """One check: its name, the verdict, the finding and, where something is missing, the remedy."""
 
     name: str
@@ -38,26 +38,26 @@ class ClockState:
     year: int
 
 
-def judged_clock(state: ClockState | None) -> Check:
+def judged_clock(state: ClockState | None) -> DoctorCheck:
     """Judge the clock.
 
     Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
     """
     if state is None:
-        return Check(
+        return DoctorCheck(
             "clock", HostVerdict.NOTE, "this system does not report whether it is synchronised", "use NTP or PTP"
         )
     if state.year < 2024:
-        return Check(
+        return DoctorCheck(
             "clock", HostVerdict.BAD, f"the year is {state.year}", "set the clock, and use a backup battery or NTP"
         )
     if not state.synchronised:
         advice = "start chrony or systemd-timesyncd: time stamps of logs and certificates depend on it"
-        return Check("clock", HostVerdict.NOTE, "the kernel's clock is not synchronised", advice)
-    return Check("clock", HostVerdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
+        return DoctorCheck("clock", HostVerdict.NOTE, "the kernel's clock is not synchronised", advice)
+    return DoctorCheck("clock", HostVerdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
 
 
-def judged_can(interfaces: Mapping[str, bool]) -> Check:
+def judged_can(interfaces: Mapping[str, bool]) -> DoctorCheck:
     """Judge the kernel's CAN interfaces; `interfaces` maps each name to whether it is up.
 
     The bit rate has to be set before an interface is brought up, by an authorised user.
@@ -66,35 +66,35 @@ def judged_can(interfaces: Mapping[str, bool]) -> Check:
     down = [name for name, up in interfaces.items() if not up]
     if down:
         rate = "" if down[0].startswith("v") else " type can bitrate 125000 restart-ms 100"
-        return Check("kernel CAN", HostVerdict.NOTE, found, f"sudo ip link set {down[0]} up{rate}")
-    return Check("kernel CAN", HostVerdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
+        return DoctorCheck("kernel CAN", HostVerdict.NOTE, found, f"sudo ip link set {down[0]} up{rate}")
+    return DoctorCheck("kernel CAN", HostVerdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
 
 
-def judged_watches(instances: int | None) -> Check:
+def judged_watches(instances: int | None) -> DoctorCheck:
     """Judge the inotify limit.
 
     fieldtwin does not use inotify; udev, journald and systemd need it to announce ports and start services.
     """
     if instances is None:
-        return Check("inotify", HostVerdict.OK, "not on this system")
+        return DoctorCheck("inotify", HostVerdict.OK, "not on this system")
     if instances < MIN_INOTIFY:
         advice = "sysctl fs.inotify.max_user_instances=128"
-        return Check("inotify", HostVerdict.NOTE, f"{instances} instances per user", advice)
-    return Check("inotify", HostVerdict.OK, f"{instances} instances per user")
+        return DoctorCheck("inotify", HostVerdict.NOTE, f"{instances} instances per user", advice)
+    return DoctorCheck("inotify", HostVerdict.OK, f"{instances} instances per user")
 
 
-def judged_processor(cpus: int, quota: float | None) -> Check:
+def judged_processor(cpus: int, quota: float | None) -> DoctorCheck:
     """Judge the processors. `quota`: the processors that a cgroup allows, None for no limit.
 
     A quota stops all processes until its period is over.
     """
     if quota is None:
-        return Check("processors", HostVerdict.OK, f"{cpus}, no quota")
+        return DoctorCheck("processors", HostVerdict.OK, f"{cpus}, no quota")
     found = f"{cpus}, of which a cgroup grants {quota:g} at most"
     if quota < MIN_CPUS:
         advice = "scans are late whenever the quota is used up: grant at least one (docker --cpus, systemd CPUQuota)"
-        return Check("processors", HostVerdict.NOTE, found, advice)
-    return Check("processors", HostVerdict.OK, found)
+        return DoctorCheck("processors", HostVerdict.NOTE, found, advice)
+    return DoctorCheck("processors", HostVerdict.OK, found)
 
 
 def quota_of(text: str) -> float | None:

@@ -9,7 +9,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fieldtwin.results.trace import Event
+from fieldtwin.results.trace import TraceEvent
 
 if TYPE_CHECKING:  # verdicts and results are also made where no system can be read
     from fieldtwin.twin.site.system import System
@@ -79,7 +79,7 @@ class Struck:
 
 
 @dataclass
-class Counts:
+class AccessCounts:
     """What was accessed, and how often. `touched` and `refused`: (device, access, table, address, count, subindex)."""
 
     services: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -93,7 +93,7 @@ class Counts:
     pairs: Counter[tuple[str, str, str]] = field(default_factory=Counter)
     """(fault's name, PROGRAM.VARIABLE, state)."""
 
-    def add(self, other: Counts) -> None:
+    def add(self, other: AccessCounts) -> None:
         """Add the counts of another run."""
         for each in fields(self):
             getattr(self, each.name).update(getattr(other, each.name))
@@ -126,10 +126,10 @@ class ScenarioResult:
     reproduce: str = ""
     simulated_s: float = 0.0
     took_s: float = 0.0
-    trace: Sequence[Event] = ()
+    trace: Sequence[TraceEvent] = ()
     trace_hash: str = ""
     dropped: int = 0
-    counts: Counts | None = None
+    counts: AccessCounts | None = None
     earlier: tuple[str, ...] = ()
     """The reasons of the attempts before this one, each of which was INCONCLUSIVE (`--retry-inconclusive`)."""
     case: str = ""

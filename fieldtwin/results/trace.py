@@ -24,7 +24,7 @@ _AT_ONCE = 256
 TOPSIDE = "topside"
 
 
-class Kind(Enum):
+class TraceKind(Enum):
     """The kind of an event, with the meaning of its `where` and `data`.
 
     FRAME   a bus           ``dir`` sent | received (as the gateway sees it), ``bytes`` hex; on CAN also ``id``, and ``rtr``,
@@ -47,16 +47,16 @@ class Kind(Enum):
     NOTE = "note"
 
 
-class Event(NamedTuple):
+class TraceEvent(NamedTuple):
     """One event, `t_ns` after the run's start."""
 
     t_ns: int
-    kind: Kind
+    kind: TraceKind
     where: str
     data: dict[str, Any]
 
 
-_Noted = tuple[int, Kind, str, dict[str, Any]]
+_Noted = tuple[int, TraceKind, str, dict[str, Any]]
 """An event's fields."""
 
 
@@ -69,7 +69,7 @@ class Trace:
 
     def __init__(self, capacity: int = CAPACITY, sink: BinaryIO | None = None) -> None:
         self._kept: deque[_Noted] = deque(maxlen=capacity)
-        self._told: dict[str, list[Callable[[Event], None]]] = {kind.value: [] for kind in Kind}
+        self._told: dict[str, list[Callable[[TraceEvent], None]]] = {kind.value: [] for kind in TraceKind}
         self._hash = hashlib.sha256()
         self._hashed = 0
         self._pending: list[_Noted] = []
@@ -78,9 +78,9 @@ class Trace:
         self._encode_lines = msgspec.json.Encoder(order="sorted").encode_lines
 
     @property
-    def events(self) -> list[Event]:
+    def events(self) -> list[TraceEvent]:
         """The latest events, oldest first."""
-        return [Event(*noted) for noted in self._kept]
+        return [TraceEvent(*noted) for noted in self._kept]
 
     @property
     def count(self) -> int:
@@ -92,15 +92,15 @@ class Trace:
         """Number of events that are no longer in memory; the hash and the sink have them."""
         return self.count - len(self._kept)
 
-    def listen(self, listener: Callable[[Event], None], *kinds: Kind) -> None:
+    def listen(self, listener: Callable[[TraceEvent], None], *kinds: TraceKind) -> None:
         """Call `listener` from now on with each event, or with each event of these kinds, after the listeners that
         registered before. It must not raise."""
-        for kind in kinds or Kind:
+        for kind in kinds or TraceKind:
             self._told[kind.value].append(listener)
 
-    def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+    def note(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         """Add an event. `data` must be JSON data that is not changed afterwards."""
-        noted = t_ns, kind, where, data  # a tuple: an `Event` is made only for listeners, as there are millions
+        noted = t_ns, kind, where, data  # a tuple: an `TraceEvent` is made only for listeners, as there are millions
         self._kept.append(noted)
         self._pending.append(noted)
         if len(self._pending) >= _AT_ONCE:
@@ -108,9 +108,9 @@ class Trace:
         if self._told[kind._value_]:  # `value` goes through a descriptor, a Kind's hash through Python: slow
             self.tell(t_ns, kind, where, data)
 
-    def tell(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+    def tell(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         """Call the listeners with an event, in the order of their registration."""
-        event = Event(t_ns, kind, where, data)
+        event = TraceEvent(t_ns, kind, where, data)
         for listener in self._told[kind._value_]:
             listener(event)
 
@@ -141,7 +141,7 @@ class Trace:
 
 REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
 """The keys in the data of a REFUSED event, from an entry of the gateway's journal
-(`fieldtwin.gateway.runtime.outputs.refusals.Refusal`)."""
+(`fieldtwin.gateway.runtime.outputs.refusals.RefusedOutput`)."""
 
 
 def refusal_data(described: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,9 +167,9 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def read_trace(lines: list[bytes]) -> list[Event]:
+def read_trace(lines: list[bytes]) -> list[TraceEvent]:
     """Return the events that were written to a sink."""
-    return [Event(t, Kind(kind), where, data) for t, kind, where, data in map(msgspec.json.decode, lines)]
+    return [TraceEvent(t, TraceKind(kind), where, data) for t, kind, where, data in map(msgspec.json.decode, lines)]
 
 
 def open_sink(path: Path) -> BinaryIO:

@@ -14,10 +14,10 @@ from types import TracebackType
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.service.events import Event, Priority, changes
+from fieldtwin.service.events import Priority, ServiceEvent, changes
 from fieldtwin.service.exposition import render
 from fieldtwin.service.journal import EventLog, Format
-from fieldtwin.service.metrics import Snapshot, families
+from fieldtwin.service.metrics import RunState, families
 from fieldtwin.service.metrics_server import MetricsServer, parse_place
 from fieldtwin.service.notify import Notifier
 
@@ -41,11 +41,11 @@ def check(options: ServiceOptions) -> None:
         parse_place(options.metrics)
 
 
-def snapshot(session: RunSession) -> Snapshot:
+def snapshot(session: RunSession) -> RunState:
     """Return the present state of the session."""
     now_ns = session.clock.monotonic_ns()
     asked = min((session.answered_ns.get(name, session.started_ns) for name in NEEDED), default=now_ns)
-    return Snapshot(
+    return RunState(
         system=session.system.name,
         mode="prototype" if session.options.prototype else "plant",
         uptime_s=session.elapsed_s,
@@ -57,7 +57,7 @@ def snapshot(session: RunSession) -> Snapshot:
     )
 
 
-def short(seen: Snapshot) -> str:
+def short(seen: RunState) -> str:
     """Return one line for `systemctl status`."""
     if seen.gateway is None or seen.plc is None:
         return f"{seen.system}: the {'gateway' if seen.gateway is None else 'PLC'} does not answer"
@@ -67,7 +67,7 @@ def short(seen: Snapshot) -> str:
     return text + (f"; not {', '.join(away[:5])}{'...' if len(away) > 5 else ''}" if away else "")
 
 
-class Service:
+class RunService:
     """``async with Service(session, options)`` around the run's waiting; `url` is the address of the metrics, or empty."""
 
     def __init__(self, session: RunSession, options: ServiceOptions, notifier: Notifier) -> None:
@@ -77,11 +77,11 @@ class Service:
         self._server: MetricsServer | None = None
         self._nursery = Nursery()
         self._log = EventLog(options.log, session.system.name, session.clock.utc_ns) if options.log else None
-        self._seen: Snapshot | None = None
+        self._seen: RunState | None = None
         self._hung_up = asyncio.Event()
         self.url = ""
 
-    async def __aenter__(self) -> Service:
+    async def __aenter__(self) -> RunService:
         try:
             if self._options.metrics:
                 self._server = MetricsServer(lambda: render(families(snapshot(self._session))))
@@ -89,7 +89,7 @@ class Service:
             if self._log is not None:
                 self._log.write(self._started())
                 for warning in self._session.system.warnings:
-                    self._log.write(Event(Priority.WARNING, "system_file", warning))
+                    self._log.write(ServiceEvent(Priority.WARNING, "system_file", warning))
                 self._nursery.start(self._tell(), "events")
             self._nursery.start(self._reload(), "reload")
             if self._notifier.wanted:
@@ -112,10 +112,10 @@ class Service:
             await self._server.aclose()
         if self._log is not None:
             if kind is None:
-                self._log.write(Event(Priority.NOTICE, "stopping", f"{self._session.system.name}: stopping"))
+                self._log.write(ServiceEvent(Priority.NOTICE, "stopping", f"{self._session.system.name}: stopping"))
             self._log.close()
 
-    def note(self, event: Event) -> None:
+    def note(self, event: ServiceEvent) -> None:
         """Log an event that the statuses do not show."""
         if self._log is not None:
             self._log.write(event)
@@ -136,18 +136,18 @@ class Service:
                     print(f"fieldtwin: {event.message}", file=sys.stderr)
             self._notifier.ready(event.message if event is not None else "read again")
 
-    async def _reloaded(self) -> Event | None:
+    async def _reloaded(self) -> ServiceEvent | None:
         """Return the result of a failed reload; None if something was applied, which the statuses show."""
         try:
             done = await self._session.reload("SIGHUP")
         except FieldtwinError as e:
             text = f"not reloaded, nothing was changed: {e}"
-            return Event(Priority.ERROR, "not_reloaded", text, {"error": str(e)})
+            return ServiceEvent(Priority.ERROR, "not_reloaded", text, {"error": str(e)})
         if done.restart:
             named = "; ".join(f"{c['where']}: {c['what']}" for c in done.restart[:MOST_NAMED])
             more = f"; {len(done.restart) - MOST_NAMED} more" if len(done.restart) > MOST_NAMED else ""
             text = f"not reloaded, nothing was changed; these changes need a restart: {named}{more}"
-            return Event(Priority.ERROR, "not_reloaded", text, {"error": "needs a restart"})
+            return ServiceEvent(Priority.ERROR, "not_reloaded", text, {"error": "needs a restart"})
         if done.applied and self._log is not None:
             return None
         what = (
@@ -155,18 +155,20 @@ class Service:
             if done.applied
             else ("reloaded: the files have not changed")
         )
-        return Event(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
+        return ServiceEvent(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
 
-    def healthy(self, seen: Snapshot, patience_s: float) -> bool:
+    def healthy(self, seen: RunState, patience_s: float) -> bool:
         """Return whether gateway and PLC both answered within `patience_s` seconds."""
         return seen.gateway is not None and seen.plc is not None and seen.asked_ago_s <= patience_s
 
-    def _started(self) -> Event:
+    def _started(self) -> ServiceEvent:
         options = self._session.options
         mode = "prototype" if options.prototype else "plant"
         writes = "writes allowed" if options.prototype or options.allow_writes else "read-only"
         fields = {"mode": mode, "writes": writes, "run_dir": str(self._session.instance.dir), "metrics": self.url}
-        return Event(Priority.NOTICE, "started", f"{mode} {self._session.system.name}: started, {writes}", fields)
+        return ServiceEvent(
+            Priority.NOTICE, "started", f"{mode} {self._session.system.name}: started, {writes}", fields
+        )
 
     async def _feed(self) -> None:
         """Feed the watchdog every third of its timeout; update the status line in any case."""

@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus
-from fieldtwin.service.metrics import Snapshot
+from fieldtwin.service.metrics import RunState
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
 
@@ -25,7 +25,7 @@ class Priority(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class ServiceEvent:
     """An event. `fields` are short names with text or numbers: device, bus, error..."""
 
     priority: Priority
@@ -34,7 +34,7 @@ class Event:
     fields: Mapping[str, str | int | float] = field(default_factory=dict)
 
 
-def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
+def changes(before: RunState | None, now: RunState) -> list[ServiceEvent]:
     """Yield the events between two snapshots. Without an earlier snapshot, everything that is not well is an event."""
     return [
         *_children(before, now),
@@ -48,52 +48,52 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
     ]
 
 
-def _buses_of(seen: Snapshot | None) -> Mapping[str, BusStatus]:
+def _buses_of(seen: RunState | None) -> Mapping[str, BusStatus]:
     return seen.gateway.buses if seen is not None and seen.gateway is not None else {}
 
 
-def _devices_of(seen: Snapshot | None) -> Mapping[str, DeviceStatus]:
+def _devices_of(seen: RunState | None) -> Mapping[str, DeviceStatus]:
     return seen.gateway.devices if seen is not None and seen.gateway is not None else {}
 
 
-def _children(before: Snapshot | None, now: Snapshot) -> list[Event]:
+def _children(before: RunState | None, now: RunState) -> list[ServiceEvent]:
     found = []
     for name, lives in now.children.items():
         if not lives and (before is None or before.children.get(name, True)):
-            found.append(Event(Priority.ERROR, "process_ended", f"the {name} process ended", {"process": name}))
+            found.append(ServiceEvent(Priority.ERROR, "process_ended", f"the {name} process ended", {"process": name}))
     return found
 
 
-def _buses(before: Mapping[str, BusStatus], now: Mapping[str, BusStatus]) -> list[Event]:
+def _buses(before: Mapping[str, BusStatus], now: Mapping[str, BusStatus]) -> list[ServiceEvent]:
     found = []
     for name, bus in now.items():
         was = before.get(name)
         if bus.connected and (was is None or not was.connected):
-            found.append(Event(Priority.INFO, "bus_open", f"{name}: open", {"bus": name}))
+            found.append(ServiceEvent(Priority.INFO, "bus_open", f"{name}: open", {"bus": name}))
         elif bus.error and (was is None or was.error != bus.error):
             text = f"{name}: {bus.error}"
-            found.append(Event(Priority.ERROR, "bus_closed", text, {"bus": name, "error": bus.error}))
+            found.append(ServiceEvent(Priority.ERROR, "bus_closed", text, {"bus": name, "error": bus.error}))
     return found
 
 
-def _devices(before: Mapping[str, DeviceStatus], now: Mapping[str, DeviceStatus]) -> list[Event]:
+def _devices(before: Mapping[str, DeviceStatus], now: Mapping[str, DeviceStatus]) -> list[ServiceEvent]:
     found = []
     for name, device in now.items():
         was = before.get(name)
         fields = {"device": name, "bus": device.bus}
         if device.online and (was is None or not was.online):
-            found.append(Event(Priority.NOTICE, "device_online", f"{name}: answers", fields))
+            found.append(ServiceEvent(Priority.NOTICE, "device_online", f"{name}: answers", fields))
         elif not device.online and device.error and (was is None or was.online or was.error != device.error):
             named = {**fields, "error": device.error}
-            found.append(Event(Priority.WARNING, "device_offline", f"{name}: {device.error}", named))
+            found.append(ServiceEvent(Priority.WARNING, "device_offline", f"{name}: {device.error}", named))
         codes = device.emcy or []
         if codes and codes != ((was.emcy if was is not None else None) or []):
             named = {**fields, "emcy": " ".join(codes)}
-            found.append(Event(Priority.WARNING, "device_emcy", f"{name}: emergency {' '.join(codes)}", named))
+            found.append(ServiceEvent(Priority.WARNING, "device_emcy", f"{name}: emergency {' '.join(codes)}", named))
     return found
 
 
-def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[Event]:
+def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[ServiceEvent]:
     if now is None:
         return []
     if before is not None and (now.state, now.error) == (before.state, before.error):
@@ -102,20 +102,20 @@ def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[Event]:
     priority = Priority.NOTICE if healthy else Priority.ERROR
     why = now.error or "; ".join(f"program {program} for {start.reason}" for program, start in now.waiting.items())
     text = f"PLC: {now.state}" + (f": {why}" if why else "")
-    return [Event(priority, "plc_state", text, {"state": now.state, "error": now.error})]
+    return [ServiceEvent(priority, "plc_state", text, {"state": now.state, "error": now.error})]
 
 
-def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
+def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[ServiceEvent]:
     """Return the event of a reload, regardless of its origin."""
     if before is None or now is None or not before.config or not now.config:
         return []
     if before.config.reloads == now.config.reloads:
         return []
     text = "reloaded: " + "; ".join(now.config.changed)
-    return [Event(Priority.NOTICE, "reloaded", text, {"hash": now.config.hash})]
+    return [ServiceEvent(Priority.NOTICE, "reloaded", text, {"hash": now.config.hash})]
 
 
-def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> list[Event]:
+def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> list[ServiceEvent]:
     """Yield the events of the digital thread: trouble of its carrier and of its log's store, and the end of the trouble."""
     if now is None:
         return []
@@ -126,11 +126,11 @@ def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> 
     ):
         if text != was:
             priority = Priority.WARNING if text else Priority.NOTICE
-            found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'recovered'}", {"error": text}))
+            found.append(ServiceEvent(priority, f"thread_{key}", f"{what}: {text or 'recovered'}", {"error": text}))
     return found
 
 
-def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
+def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[ServiceEvent]:
     """Yield writes that did not reach their device. As everywhere here, the fields contain no value."""
     last = max((e.number for e in (before.refusals.entries if before is not None else [])), default=0)
     found = []
@@ -139,18 +139,18 @@ def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Ev
             priority = Priority.WARNING if entry.fault else Priority.NOTICE
             named = {"tag": entry.tag, "cause": entry.cause, "by": entry.by, "place": entry.place}
             text = f"{entry.tag}: a write did not reach the device ({entry.cause})"
-            found.append(Event(priority, "output_refused", text, named))
+            found.append(ServiceEvent(priority, "output_refused", text, named))
     return found
 
 
-def _dropped(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
+def _dropped(before: GatewayStatus | None, now: GatewayStatus | None) -> list[ServiceEvent]:
     if now is None:
         return []
     lost = now.log_dropped - (before.log_dropped if before is not None else 0)
     found = []
     if lost > 0:
         text = f"the exchange log lost {lost} entries"
-        found.append(Event(Priority.WARNING, "log_dropped", text, {"count": lost}))
+        found.append(ServiceEvent(Priority.WARNING, "log_dropped", text, {"count": lost}))
     if now.writes.safe and not (before is not None and before.writes.safe):
-        found.append(Event(Priority.WARNING, "outputs_safe", "outputs are at their safe values"))
+        found.append(ServiceEvent(Priority.WARNING, "outputs_safe", "outputs are at their safe values"))
     return found

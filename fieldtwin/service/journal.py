@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Literal, TextIO
 
-from fieldtwin.service.events import Event
+from fieldtwin.service.events import ServiceEvent
 
 JOURNAL = "/run/systemd/journal/socket"
 Format = Literal["text", "json", "journal"]
@@ -44,7 +44,7 @@ class EventLog:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             self._socket.setblocking(False)
 
-    def write(self, event: Event) -> None:
+    def write(self, event: ServiceEvent) -> None:
         """Write one event. Never waits."""
         if self._format == "text":
             print(event.message, file=self._out, flush=True)
@@ -57,12 +57,12 @@ class EventLog:
             self._socket.close()
             self._socket = None
 
-    def _json(self, event: Event) -> str:
+    def _json(self, event: ServiceEvent) -> str:
         at = datetime.fromtimestamp(self._utc_ns() / 1e9, UTC).isoformat(timespec="milliseconds")
         named = {"t": at, "priority": int(event.priority), "event": event.name, "system": self._system}
         return json.dumps({**named, "message": event.message, **event.fields}, ensure_ascii=False)
 
-    def _to_journal(self, event: Event) -> bool:
+    def _to_journal(self, event: ServiceEvent) -> bool:
         assert self._socket is not None
         named = {
             "MESSAGE": event.message,

@@ -17,7 +17,7 @@ from msgspec import UnsetType
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.values import Quality
-from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
+from fieldtwin.gateway.protocols.canopen.sdo_channel import SdoCounters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client import ClientCounters
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
@@ -35,7 +35,7 @@ ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tupl
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class RunState:
     """The latest known state of a run.
 
     A status is None while its process does not answer. `states`: whether each child runs.
@@ -70,7 +70,7 @@ class Page:
         return self.families.setdefault(family.name, family)
 
 
-def families(seen: Snapshot) -> list[Family]:
+def families(seen: RunState) -> list[Family]:
     """Return all metrics of `seen`. Without an answering process its metrics are missing, and `fieldtwin_up` is 0."""
     page = Page()
     page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(

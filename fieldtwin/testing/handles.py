@@ -8,11 +8,11 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from typing import Any
 
-from fieldtwin.testing.runner import FieldtwinRefused, Runner
-from fieldtwin.testing.wire import Wire
+from fieldtwin.testing.runner import FieldtwinRefused, WorkerProcess
+from fieldtwin.testing.wire import RecordedTraffic
 
 
-class Endpoint:
+class EndpointHandle:
     """The address of a device or bus.
 
     It has `url`, and where they apply `path` (serial port), `host` and `port`, `interface` and `channel` (python-can),
@@ -37,25 +37,25 @@ class Endpoint:
         return f"<{self.url}>"
 
 
-class Device:
+class DeviceHandle:
     """One emulated device.
 
     `endpoint` is its address, whose parts are attributes of the device as well: `device.path`, `device.port`; `unit` is
     its unit ID or node ID.
     """
 
-    def __init__(self, runner: Runner, bench: int, name: str, description: dict[str, Any]) -> None:
+    def __init__(self, runner: WorkerProcess, bench: int, name: str, description: dict[str, Any]) -> None:
         facts = description["devices"][name]
         self.name = name
         self.unit: int = facts["unit"]
         self.node: int = facts["unit"]
         self.profile: str = facts["profile"]
         self.tags: tuple[str, ...] = tuple(facts["tags"])
-        self.endpoint = Endpoint(description["buses"][facts["bus"]])
+        self.endpoint = EndpointHandle(description["buses"][facts["bus"]])
         far = description["far"].get(name)
-        self.far = Endpoint(far) if far else None
+        self.far = EndpointHandle(far) if far else None
         """The remote end of a transmitter's link."""
-        self.wire = Wire(runner, bench, name)
+        self.wire = RecordedTraffic(runner, bench, name)
         self._runner = runner
         self._bench = bench
 
@@ -78,26 +78,28 @@ class Device:
         return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
 
     def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
-        """Inject a fault: ``with device.fault("silence"):``; see `Wire.fault`."""
+        """Inject a fault: ``with device.fault("silence"):``; see `RecordedTraffic.fault`."""
         return self.wire.fault(name, **more)
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self.profile} at {self.endpoint.url}, unit {self.unit}>"
 
 
-class Prototype:
-    """The field simulator of a system. ``prototype["ctd"]`` is a `Device`; `buses` and `far` hold the endpoints."""
+class PrototypeHandle:
+    """The field simulator of a system. ``prototype["ctd"]`` is a `DeviceHandle`; `buses` and `far` hold the endpoints."""
 
-    def __init__(self, runner: Runner, description: dict[str, Any]) -> None:
+    def __init__(self, runner: WorkerProcess, description: dict[str, Any]) -> None:
         self.id: int = description["id"]
         self.system: str = description["system"]
         self.file: str = description["file"]
-        self.buses = {name: Endpoint(words) for name, words in description["buses"].items()}
-        self.far = {name: Endpoint(words) for name, words in description["far"].items()}
-        self.wire = Wire(runner, description["id"])
-        self._devices = {name: Device(runner, description["id"], name, description) for name in description["devices"]}
+        self.buses = {name: EndpointHandle(words) for name, words in description["buses"].items()}
+        self.far = {name: EndpointHandle(words) for name, words in description["far"].items()}
+        self.wire = RecordedTraffic(runner, description["id"])
+        self._devices = {
+            name: DeviceHandle(runner, description["id"], name, description) for name in description["devices"]
+        }
 
-    def __getitem__(self, name: str) -> Device:
+    def __getitem__(self, name: str) -> DeviceHandle:
         """Return a device by its name in the system file."""
         __tracebackhide__ = True
         try:
@@ -112,7 +114,7 @@ class Prototype:
         return len(self._devices)
 
     def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
-        """Inject a fault: ``with prototype.fault("silence", device="ctd"):``; see `Wire.fault`."""
+        """Inject a fault: ``with prototype.fault("silence", device="ctd"):``; see `RecordedTraffic.fault`."""
         return self.wire.fault(name, **more)
 
 
@@ -124,7 +126,13 @@ class Plc:
     """
 
     def __init__(
-        self, runner: Runner, source: str, folders: tuple[str, ...] = (), cycle_ms: float = 10.0, *, system: str = ""
+        self,
+        runner: WorkerProcess,
+        source: str,
+        folders: tuple[str, ...] = (),
+        cycle_ms: float = 10.0,
+        *,
+        system: str = "",
     ) -> None:
         """Load a program.
 
@@ -165,4 +173,4 @@ class Plc:
             raise KeyError(f"no variable {name!r}; there are {', '.join(self.values)}") from None
 
 
-__all__ = ["Device", "Endpoint", "FieldtwinRefused", "Plc", "Prototype"]
+__all__ = ["DeviceHandle", "EndpointHandle", "FieldtwinRefused", "Plc", "PrototypeHandle"]

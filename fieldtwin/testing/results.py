@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, Runner, command_of
+from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, WorkerProcess, command_of
 
 _WORKER = re.compile(r"\[gw\d+\] ")
 """The line that xdist adds before the text of a failure."""
@@ -56,7 +56,7 @@ class Results:
         }
 
     def pytest_sessionfinish(self) -> None:
-        runner = Runner(command_of(self._config.getoption("--fieldtwin-command")))
+        runner = WorkerProcess(command_of(self._config.getoption("--fieldtwin-command")))
         try:
             runner.call(
                 "report",

@@ -40,7 +40,7 @@ def command_of(said: str = "") -> list[str]:
     return shlex.split(text) if text else [sys.executable, "-P", "-m", "fieldtwin"]
 
 
-class Runner:
+class WorkerProcess:
     """One process ``COMMAND test-host``; starts at the first `call`. Calls may come from any thread, one at a time."""
 
     def __init__(self, command: Sequence[str] = (), *, trust: bool = False) -> None:

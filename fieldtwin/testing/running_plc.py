@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
 
-from fieldtwin.testing.runner import Runner
+from fieldtwin.testing.runner import WorkerProcess
 
 POLL_S = 0.02
 WITHIN_S = 10.0
@@ -24,7 +24,7 @@ class RunningPlc:
     by the wall clock; `wait` waits. A test's commands are recorded as those of ``test``, in the way of a user's.
     """
 
-    def __init__(self, runner: Runner, bench: int, profiles: Sequence[str] = ()) -> None:
+    def __init__(self, runner: WorkerProcess, bench: int, profiles: Sequence[str] = ()) -> None:
         self._runner = runner
         self._bench = bench
         self.names: tuple[str, ...] = tuple(runner.call("control", id=bench, profiles=list(profiles))["names"])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
 
-from fieldtwin.testing.runner import Runner
+from fieldtwin.testing.runner import WorkerProcess
 
 POLL_S = 0.02
 SHOWN = 10
@@ -76,10 +76,10 @@ def _exchange(plain: dict[str, Any]) -> Exchange:
     return Exchange(**{**known, "registers": tuple(plain.get("registers", ()))})
 
 
-class Wire:
+class RecordedTraffic:
     """The traffic of all buses of a field simulator, or that of one `device`."""
 
-    def __init__(self, runner: Runner, bench: int, device: str = "") -> None:
+    def __init__(self, runner: WorkerProcess, bench: int, device: str = "") -> None:
         self._runner = runner
         self._bench = bench
         self._device = device

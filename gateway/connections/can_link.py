@@ -28,7 +28,7 @@ _TIMEOUT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class CanLink:
+class CanInterface:
     """A network interface. `bitrate` in bit/s is 0 if the interface has none (vcan) or none was set.
 
     `kind` is ``vcan`` or ``vxcan`` for virtual interfaces, ``can`` for controllers, or empty if the driver names no kind.
@@ -47,7 +47,7 @@ class CanLink:
     """The controller's error counters (ISO 11898-1, 12.1.4), 0 if the driver does not report them."""
 
 
-def query_link(name: str) -> CanLink:
+def query_link(name: str) -> CanInterface:
     """Ask the kernel about interface `name`. Raises `OSError` (ENODEV if the interface does not exist)."""
     index = socket.if_nametoindex(name)
     request = _MESSAGE.pack(_MESSAGE.size + _LINK.size, _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
@@ -57,7 +57,7 @@ def query_link(name: str) -> CanLink:
         return read_link(netlink.recv(65536))
 
 
-def read_link(answer: bytes) -> CanLink:
+def read_link(answer: bytes) -> CanInterface:
     """Read an RTM_NEWLINK message. Raises `OSError` if the kernel answered with an error or a different message."""
     if len(answer) < _MESSAGE.size + _LINK.size:
         raise OSError(0, "the kernel's answer about the interface is too short")
@@ -72,7 +72,7 @@ def read_link(answer: bytes) -> CanLink:
     state = _number(data.get(_IFLA_CAN_STATE, b""), 4)
     has_state = _IFLA_CAN_STATE in data and state < len(_STATES)
     counters = data.get(_IFLA_CAN_BERR_COUNTER, b"")
-    return CanLink(
+    return CanInterface(
         link_type == _ARPHRD_CAN,
         bool(flags & _IFF_UP),
         kind,

@@ -19,7 +19,7 @@ _LINES = {"CTS": 0x020, "DSR": 0x100, "DCD": 0x040, "RI": 0x080, "DTR": 0x002, "
 
 
 @dataclass(frozen=True, slots=True)
-class LineCounters:
+class UartCounters:
     """Counters since the driver was loaded: characters in both directions, and receive errors.
 
     `overrun`: the UART was not read in time; `buffer_overrun`: the kernel's buffer was full; `breaks`: the line was
@@ -34,10 +34,10 @@ class LineCounters:
     breaks: int = 0
     buffer_overrun: int = 0
 
-    def since(self, before: LineCounters) -> LineCounters:
+    def since(self, before: UartCounters) -> UartCounters:
         """Return the differences from `before`; counters wrap at 32 bits."""
-        return LineCounters(
-            *((getattr(self, f.name) - getattr(before, f.name)) & 0xFFFF_FFFF for f in fields(LineCounters))
+        return UartCounters(
+            *((getattr(self, f.name) - getattr(before, f.name)) & 0xFFFF_FFFF for f in fields(UartCounters))
         )
 
     @property
@@ -49,7 +49,7 @@ class LineCounters:
 class CountsErrors(Protocol):
     """A connection whose port may count errors."""
 
-    def counters(self) -> LineCounters | None:
+    def counters(self) -> UartCounters | None:
         """Return the port's counters, or None if it has none."""
         ...
 
@@ -58,14 +58,14 @@ class CountsErrors(Protocol):
         ...
 
 
-def unpack_counters(data: bytes) -> LineCounters:
+def unpack_counters(data: bytes) -> UartCounters:
     """Read the kernel's struct: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk, buf_overrun."""
     numbers = _INTS.unpack(data)
     rx, tx, frame, overrun, parity, breaks, buffer_overrun = (n & 0xFFFF_FFFF for n in numbers[4:11])
-    return LineCounters(rx, tx, frame, overrun, parity, breaks, buffer_overrun)
+    return UartCounters(rx, tx, frame, overrun, parity, breaks, buffer_overrun)
 
 
-def read_counters(descriptor: int) -> LineCounters | None:
+def read_counters(descriptor: int) -> UartCounters | None:
     """Return the driver's counters, or None if it has none."""
     answer = _ask(descriptor, TIOCGICOUNT, _INTS.size)
     return unpack_counters(answer) if answer is not None else None

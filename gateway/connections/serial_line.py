@@ -14,7 +14,7 @@ import os
 from contextlib import suppress
 from typing import cast
 
-from fieldtwin.gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
+from fieldtwin.gateway.connections.line_counters import UartCounters, read_control_lines, read_counters
 from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
 from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -94,7 +94,7 @@ class SerialConnection(ByteConnection):
             self._fail(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
 
-    def counters(self) -> LineCounters | None:
+    def counters(self) -> UartCounters | None:
         """Return the driver's counters, including errors, or None if it has none."""
         return read_counters(self._fd) if self._lost is None else None
 

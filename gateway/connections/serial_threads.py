@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.connections.line_counters import UartCounters
 from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
 from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -78,7 +78,7 @@ class ThreadedSerialConnection(ByteConnection):
         if len(self.inbound.data_stream) <= self.max_pending // 2:
             self._room.set()
 
-    def counters(self) -> LineCounters | None:
+    def counters(self) -> UartCounters | None:
         """Return None: these systems have no counters."""
         return None
 

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from fieldtwin.gateway.core.files.profile import DeviceProfile, Message, RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, MessageBlock, RegisterRange, Tag
 
 ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
 """Exceptions (AP 7) which show that a read covered a gap, and that it was too long."""
 
-Member = tuple[RegisterRange, Tag | Message]
+Member = tuple[RegisterRange, Tag | MessageBlock]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Read:
 
     range: RegisterRange
     tags: tuple[Tag, ...]
-    messages: tuple[Message, ...]
+    messages: tuple[MessageBlock, ...]
 
     @cached_property
     def places(self) -> tuple[tuple[Tag, slice], ...]:
@@ -138,7 +138,7 @@ def _read(profile: DeviceProfile, members: Sequence[Member]) -> Read:
     first = members[0][0]
     span = replace(first, count=max(at.end for at, _ in members) - first.address)
     tags = tuple(i for _, i in members if isinstance(i, Tag))
-    return Read(_paired(profile, span), tags, tuple(i for _, i in members if isinstance(i, Message)))
+    return Read(_paired(profile, span), tags, tuple(i for _, i in members if isinstance(i, MessageBlock)))
 
 
 def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:

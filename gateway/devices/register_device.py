@@ -49,7 +49,7 @@ class GroupReading:
 
 
 @dataclass
-class Progress:
+class WriteProgress:
     """The progress of writing several tags: the tags that were sent, and the tags that the device confirmed."""
 
     sent: set[str] = field(default_factory=set)
@@ -332,7 +332,7 @@ class RegisterDriver(DeviceDriver):
                     where=f"{self.config.where} {tag.registers}",
                 )
 
-    async def write_together(self, commands: Sequence[COMMAND], progress: Progress) -> None:
+    async def write_together(self, commands: Sequence[COMMAND], progress: WriteProgress) -> None:
         """Write the tags of `commands` and read each of them back.
 
         One request writes tags whose registers, or coils, are adjacent. Other tags are written one after another in their order.

@@ -130,7 +130,7 @@ class WritesStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RefusalStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A write that did not reach its device (`fieldtwin.gateway.runtime.outputs.refusals.Refusal`). Times are monotonic."""
+    """A write that did not reach its device (`fieldtwin.gateway.runtime.outputs.refusals.RefusedOutput`). Times are monotonic."""
 
     number: int
     tag: str

@@ -96,7 +96,7 @@ class ServeConfig:
     idle_s: float = 0.0
 
 
-class Writer(Protocol):
+class OutputWrites(Protocol):
     """The interface to the output writer, which carries out the clients' writes."""
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
@@ -133,7 +133,7 @@ class TagServer:
         self,
         config: ServeConfig,
         tags: TagTable,
-        writer: Writer,
+        writer: OutputWrites,
         clock: Clock,
         listen: Listen = TcpListener.open,
         audit: AuditLog | None = None,

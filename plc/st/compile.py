@@ -19,7 +19,7 @@ from fieldtwin.plc.st.assignments import Assignments
 from fieldtwin.plc.st.declarations import Declarations
 from fieldtwin.plc.st.located import without_addresses
 from fieldtwin.plc.st.parse import parse
-from fieldtwin.plc.st.scope import Environment, Parameter, Signature, Symbol, Writer, by_reference
+from fieldtwin.plc.st.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
 from fieldtwin.plc.st.statements import Statements
 
 MAX_CALLS = 64
@@ -61,7 +61,7 @@ def compile_text(text: str, path: str = "") -> CompiledUnit:
     return compile_unit(parse(text, path), path)
 
 
-def compile_unit(unit: t.Unit, path: str = "") -> CompiledUnit:
+def compile_unit(unit: t.SourceUnit, path: str = "") -> CompiledUnit:
     try:
         return _Unit(without_addresses(unit), path).compiled()
     except RecursionError as e:
@@ -69,9 +69,9 @@ def compile_unit(unit: t.Unit, path: str = "") -> CompiledUnit:
 
 
 class _Unit:
-    def __init__(self, unit: t.Unit, path: str) -> None:
+    def __init__(self, unit: t.SourceUnit, path: str) -> None:
         self.env = Environment(path)
-        self.out = Writer()
+        self.out = CodeWriter()
         self.unit = unit
         self._outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: its outputs, as attributes."""

@@ -11,7 +11,7 @@ from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import tree as t
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.expressions import Expressions
-from fieldtwin.plc.st.scope import Environment, Symbol, Writer
+from fieldtwin.plc.st.scope import CodeWriter, Environment, Symbol
 
 MAX_REPEATED = 100
 """The longest Python expression, in characters, that is repeated wherever it is needed."""
@@ -21,7 +21,7 @@ _STANDARD = ty.standard_blocks(BLOCKS)
 class Declarations:
     """The types of a unit. Each is resolved when it is first needed, so they may be declared in any order."""
 
-    def __init__(self, env: Environment, unit: t.Unit, out: Writer) -> None:
+    def __init__(self, env: Environment, unit: t.SourceUnit, out: CodeWriter) -> None:
         self.env = env
         self.out = out
         self.scope: dict[str, Symbol] = {}
@@ -71,7 +71,7 @@ class Declarations:
         return Symbol(v.name, kind, text, writable=False, constant=value.constant)
 
     def _expressions(self) -> Expressions:
-        compiler = Expressions(self.env, self.scope, Writer())
+        compiler = Expressions(self.env, self.scope, CodeWriter())
         compiler.only_constants = True
         return compiler
 

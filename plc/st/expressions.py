@@ -1,5 +1,5 @@
 """Compiles expressions to Python and checks their types. Code that has to run before an expression (calls with outputs)
-is written to the `Writer` first, in order."""
+is written to the `CodeWriter` first, in order."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from fieldtwin.plc.st.arguments import bind
 from fieldtwin.plc.st.literals import Malformed, constant
 from fieldtwin.plc.st.scope import (
     COMPARISONS,
+    CodeWriter,
     Environment,
     Parameter,
     Signature,
     Symbol,
     Value,
-    Writer,
     by_reference,
     wrapped,
 )
@@ -37,7 +37,7 @@ class Expressions:
     environment.
     """
 
-    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
+    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: CodeWriter, pou: str = "") -> None:
         self.env = env
         self.symbols = symbols
         self.out = out
@@ -332,7 +332,7 @@ class Expressions:
         if self.only_constants and symbol.constant is None:
             self.env.fail(ref.pos, f"{ref.name} is not a constant", expected="a constant expression")
         owner, _, own = symbol.code.rpartition(".")
-        reference = symbol.reference or (f"_v.Member({owner}, {own!r})" if owner else "")
+        reference = symbol.reference or (f"_v.MemberReference({owner}, {own!r})" if owner else "")
         value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference)
         for selector in ref.selectors:
             if isinstance(selector, t.Member):
@@ -357,13 +357,13 @@ class Expressions:
     def _member(self, value: Value, member: t.Member) -> Value:
         kind, name = value.type, member.name.lower()
         if isinstance(kind, ty.Struct) and name in kind.fields:
-            reference = f"_v.Member({value.code}, {f'm_{name}'!r})"
+            reference = f"_v.MemberReference({value.code}, {f'm_{name}'!r})"
             return Value(f"{value.code}.m_{name}", kind.fields[name][1], None, True, value.writable, reference)
         if isinstance(kind, ty.Block):
             for members, writable in ((kind.inputs, True), (kind.outputs, False)):
                 if name in members:
                     attribute = members[name][0] if kind.standard else f"v_{name}"
-                    reference = f"_v.Member({value.code}, {attribute!r})"
+                    reference = f"_v.MemberReference({value.code}, {attribute!r})"
                     return Value(f"{value.code}.{attribute}", members[name][1], None, True, writable, reference)
         known: list[str] = []
         if isinstance(kind, ty.Struct):

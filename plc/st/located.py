@@ -14,7 +14,7 @@ from fieldtwin.plc.st import tree as t
 _KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
 
 
-def without_addresses(unit: t.Unit) -> t.Unit:
+def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
     """Return `unit` with the located variables of its programs in the blocks where they belong, in their order."""
     return replace(unit, pous=tuple(_program(pou) if pou.kind == "PROGRAM" else pou for pou in unit.pous))
 

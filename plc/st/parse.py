@@ -30,7 +30,7 @@ _READABLE = {
 }  # fmt: skip
 
 
-def parse(text: str, path: str = "") -> t.Unit:
+def parse(text: str, path: str = "") -> t.SourceUnit:
     """Return the tree of `text`. Raises `FileInvalid` with line and column."""
     text = blanked(text, path)
     try:
@@ -107,9 +107,9 @@ class _Build(Transformer_NonRecursive[Token, Any]):
             raise _Bad(token, f"a name of more than {MAX_NAME} characters")
         return token
 
-    def start(self, meta: Meta, items: list[Any]) -> t.Unit:
+    def start(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
         types = tuple(one for item in items if isinstance(item, list) for one in item)
-        return t.Unit(
+        return t.SourceUnit(
             types,
             tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock)),
             tuple(i for i in items if isinstance(i, t.Pou)),

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.plc.program import Place, Program, Role, ScanInfo, Variable, message_input, message_output
+from fieldtwin.plc.program import Program, Role, ScanInfo, SourceLine, Variable, message_input, message_output
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.assignments import is_line, line_of
@@ -84,12 +84,12 @@ class StProgram(Program):
             if found.role == "output":
                 setattr(self.st_body, line_of(_attribute(found)), 0)
 
-    def place(self, name: str) -> Place | None:
+    def place(self, name: str) -> SourceLine | None:
         """Return the line that assigned the output; for an output with its initial value, the line of its
         declaration."""
         found = self.st_variables.get(name)
         line = getattr(self.st_body, line_of(_attribute(found)), 0) if found is not None else 0
-        return Place(self.source_path, line) if line else None
+        return SourceLine(self.source_path, line) if line else None
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)

@@ -18,7 +18,7 @@ class Cell:
         self.v = value
 
 
-class Member:
+class MemberReference:
     """A reference to an attribute: a variable of a program or block, a global variable, or a member of a structure."""
 
     __slots__ = ("_name", "_owner")

@@ -125,7 +125,7 @@ def wrapped(code: str, kind: ty.Elementary) -> str:
     return f"({code} & {kind.high})"
 
 
-class Writer:
+class CodeWriter:
     """The Python code being written: its lines, each with the line of the source."""
 
     def __init__(self) -> None:

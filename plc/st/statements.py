@@ -9,7 +9,7 @@ from fieldtwin.plc.st import tree as t
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.arguments import bind
 from fieldtwin.plc.st.expressions import Expressions
-from fieldtwin.plc.st.scope import Environment, Symbol, Value, Writer, wrapped
+from fieldtwin.plc.st.scope import CodeWriter, Environment, Symbol, Value, wrapped
 
 MAX_DEEP = 60
 """How deep statements may be nested."""
@@ -26,7 +26,7 @@ class Statements(Expressions):
 
     leave = "return"
 
-    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
+    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: CodeWriter, pou: str = "") -> None:
         super().__init__(env, symbols, out, pou)
         self._loops: list[t.Expr | None] = []  # the loops around the statement; for a REPEAT its condition
         self._continues: dict[int, int] = {}

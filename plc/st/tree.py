@@ -133,7 +133,7 @@ class Pou:
 
 
 @dataclass(frozen=True, slots=True)
-class Unit:
+class SourceUnit:
     """All declarations of one file."""
 
     types: tuple[TypeDecl, ...] = ()

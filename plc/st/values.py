@@ -17,9 +17,9 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Blame, FieldtwinError
-from fieldtwin.plc.st.references import Cell, Cut, Element, Member
+from fieldtwin.plc.st.references import Cell, Cut, Element, MemberReference
 
-__all__ = ["Cell", "Cut", "Element", "LogicError", "Member"]  # and all names that compiled code calls
+__all__ = ["Cell", "Cut", "Element", "LogicError", "MemberReference"]  # and all names that compiled code calls
 
 _FLOAT = struct.Struct("<f")
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)

@@ -12,21 +12,21 @@ from hypothesis import strategies as st
 from report_rig import MS, can, note, observatory
 
 from fieldtwin.capture.decoding.decoder import Decoder, exchanges
-from fieldtwin.capture.decoding.exchange import DecodedExchange, Span
+from fieldtwin.capture.decoding.exchange import DecodedExchange, TouchedSpan
 from fieldtwin.capture.decoding.sdo import SdoWatch, Transfer
 from fieldtwin.emulators.canopen.sdo_server import SdoServer
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, Send
+from fieldtwin.gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, SendFrame
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 
 
-def only(events: list[Event]) -> DecodedExchange:
+def only(events: list[TraceEvent]) -> DecodedExchange:
     (found,) = exchanges(observatory(), events)
     return found
 
 
-def texts(events: list[Event]) -> list[str]:
+def texts(events: list[TraceEvent]) -> list[str]:
     decoder = Decoder(observatory())
     return [decoder.decode(e).text for e in events]
 
@@ -36,7 +36,7 @@ def test_an_upload() -> None:
     assert texts(events) == ["inclinometer: SDO upload 1018h:04 serial", "inclinometer: 1018h:04 serial = 1005"]
     found = only(events)
     assert (found.device, found.unit, found.service, found.latency_ns) == ("inclinometer", 5, "SDO upload", 3 * MS)
-    assert found.spans == (Span("read", "object", 0x1018, 1, 4),)
+    assert found.spans == (TouchedSpan("read", "object", 0x1018, 1, 4),)
     assert (found.value, found.tags, found.ok) == (1005, {"serial": 1005}, True)
     assert str(found.spans[0]) == "1018h:04"
 
@@ -62,7 +62,7 @@ def test_a_tpdo_as_the_system_file_maps_it() -> None:
     assert found.text == "inclinometer: TPDO1 slope_long 4.14 deg, slope_lateral 0.53 deg"
 
 
-def write(t_ms: float, index: int, sub: int, value: int) -> list[Event]:
+def write(t_ms: float, index: int, sub: int, value: int) -> list[TraceEvent]:
     head = index.to_bytes(2, "little").hex() + f"{sub:02X}"
     command = "23" if sub else "2F"  # 4 bytes, or 1
     return [
@@ -121,8 +121,8 @@ def test_messages(frame: str, service: str, text: str, value: object) -> None:
 def test_frames_outside_canopen() -> None:
     odd = [can(0, "18DA00F1#01", ext=True), can(1, "000#", err=True), can(2, "705#", rtr=True), can(3, "6E1#00")]
     odd += [
-        note(4, Kind.FRAME, "can0", id=1 << 31, bytes="00", dir="sent"),
-        note(5, Kind.FRAME, "can0", id=1, bytes="zz"),
+        note(4, TraceKind.FRAME, "can0", id=1 << 31, bytes="00", dir="sent"),
+        note(5, TraceKind.FRAME, "can0", id=1, bytes="zz"),
     ]
     assert texts(odd)[:4] == [
         "18DA00F1#01: not CANopen (29-bit identifier)", "error frame", "asks for 705h", "6E1#00: not a CANopen identifier",
@@ -174,7 +174,7 @@ def listened(transfer: SdoTransfer, server: SdoServer) -> Transfer:
         for reply in server.request(request, 0):
             seen.append(watch.reply(reply, 0).done)
             step = transfer.feed(reply_frame(reply), 0)
-            if isinstance(step, Send):
+            if isinstance(step, SendFrame):
                 waiting.append(step.frame.data)
             if isinstance(step, Done) and step.last is not None:
                 waiting.append(step.last.data)
@@ -207,19 +207,19 @@ def test_transfers_of_every_kind_are_followed(size: int, blocks: bool) -> None:
 @given(st.lists(st.tuples(st.sampled_from([0x605, 0x585, 0x7E4, 0x7E5, 0x185, 0x85, 0x705]), st.binary(max_size=8))))
 @settings(max_examples=60)
 def test_any_frames_are_described(frames: list[tuple[int, bytes]]) -> None:
-    events = [note(t, Kind.FRAME, "can0", id=i, bytes=d.hex(), dir="sent") for t, (i, d) in enumerate(frames)]
+    events = [note(t, TraceKind.FRAME, "can0", id=i, bytes=d.hex(), dir="sent") for t, (i, d) in enumerate(frames)]
     assert all(texts(events))
     exchanges(observatory(), events)
 
 
 def test_invalid_frames_are_described_too() -> None:
     events = [
-        note(0, Kind.TAG, "ctd.pressure", value=12.5, quality="good", reason="none"),
-        note(0, Kind.TAG, "ctd.status", value=1, quality="bad", reason="timeout"),
-        note(0, Kind.STATE, "relay.state", value=1),
-        note(0, Kind.FAULT, "f1", name="drop", on=True, target="line1"),
-        note(0, Kind.STEP, "3", text="wait for ctd", verdict="passed"),
-        note(0, Kind.NOTE, "run", text="began"),
+        note(0, TraceKind.TAG, "ctd.pressure", value=12.5, quality="good", reason="none"),
+        note(0, TraceKind.TAG, "ctd.status", value=1, quality="bad", reason="timeout"),
+        note(0, TraceKind.STATE, "relay.state", value=1),
+        note(0, TraceKind.FAULT, "f1", name="drop", on=True, target="line1"),
+        note(0, TraceKind.STEP, "3", text="wait for ctd", verdict="passed"),
+        note(0, TraceKind.NOTE, "run", text="began"),
     ]
     assert texts(events) == [
         "ctd.pressure 12.5 dbar, good", "ctd.status 1 (sampling), bad: timeout", "relay.state = 1",

@@ -11,25 +11,25 @@ from hypothesis import strategies as st
 from report_rig import CTD_VALUES, MS, READ_CTD, adu, answer, ask, chunk, observatory
 
 from fieldtwin.capture.decoding.decoder import Decoder, exchanges
-from fieldtwin.capture.decoding.exchange import DecodedExchange, Span
-from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder, Unit
+from fieldtwin.capture.decoding.exchange import DecodedExchange, TouchedSpan
+from fieldtwin.capture.decoding.modbus_connection import KnownUnit, ModbusConnectionDecoder
 from fieldtwin.capture.decoding.modbus_frames import splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.modbus.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.results.trace import Event
+from fieldtwin.results.trace import TraceEvent
 
 METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"
 
 
-def only(events: list[Event]) -> DecodedExchange:
+def only(events: list[TraceEvent]) -> DecodedExchange:
     (found,) = exchanges(observatory(), events)
     return found
 
 
-def texts(events: list[Event]) -> list[str]:
+def texts(events: list[TraceEvent]) -> list[str]:
     decoder = Decoder(observatory())
     return [decoder.decode(e).text for e in events]
 
@@ -44,7 +44,7 @@ def test_a_read_as_text_and_values() -> None:
     found = only(events)
     assert (found.t_ns, found.end_ns, found.latency_ns) == (10 * MS, 25 * MS, 15 * MS)
     assert (found.bus, found.device, found.unit, found.function) == ("line1", "ctd", 1, 4)
-    assert found.spans == (Span("read", "input", 0, 10),)
+    assert found.spans == (TouchedSpan("read", "input", 0, 10),)
     assert (found.access, found.address, found.count, found.ok) == ("read", 0, 10, True)
     assert found.registers[6:] == (0, 7, 1, 4464)
     assert found.tags["temperature"] == 4.25
@@ -142,7 +142,7 @@ def test_a_header_that_cannot_be_right_is_noise() -> None:
 
 def test_an_echo_is_not_a_reply() -> None:
     wire = ModbusConnectionDecoder(
-        "line1", "rtu", {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))}, echo=True
+        "line1", "rtu", {1: KnownUnit("ctd", TagMap(observatory().devices["ctd"].profile))}, echo=True
     )
     asked = with_crc(bytes.fromhex("01 06 0001 0005"))  # a write's reply looks like its echo
     assert wire.feed(True, asked, 0)[1] == []
@@ -178,19 +178,19 @@ def test_ascii() -> None:
 @pytest.mark.parametrize(
     ("pdu", "spans"),
     [
-        ("01 0003 000A", [Span("read", "coil", 3, 10)]),
-        ("02 0003 000A", [Span("read", "discrete", 3, 10)]),
-        ("05 0007 FF00", [Span("write", "coil", 7)]),
-        ("0F 0007 0003 01 05", [Span("write", "coil", 7, 3)]),
-        ("16 0004 00F2 0025", [Span("write", "holding", 4)]),
-        ("17 0003 0006 000E 0001 02 00FF", [Span("read", "holding", 3, 6), Span("write", "holding", 14)]),
-        ("14 07 06 0004 0001 0002", [Span("read", "file", 1, 2, 4)]),
-        ("15 09 06 0004 0007 0001 06AF", [Span("write", "file", 7, 1, 4)]),
+        ("01 0003 000A", [TouchedSpan("read", "coil", 3, 10)]),
+        ("02 0003 000A", [TouchedSpan("read", "discrete", 3, 10)]),
+        ("05 0007 FF00", [TouchedSpan("write", "coil", 7)]),
+        ("0F 0007 0003 01 05", [TouchedSpan("write", "coil", 7, 3)]),
+        ("16 0004 00F2 0025", [TouchedSpan("write", "holding", 4)]),
+        ("17 0003 0006 000E 0001 02 00FF", [TouchedSpan("read", "holding", 3, 6), TouchedSpan("write", "holding", 14)]),
+        ("14 07 06 0004 0001 0002", [TouchedSpan("read", "file", 1, 2, 4)]),
+        ("15 09 06 0004 0007 0001 06AF", [TouchedSpan("write", "file", 7, 1, 4)]),
         ("08 0000 A537", []),
         ("2B 0E 01 00", []),
     ],
 )
-def test_the_addresses_of_requests(pdu: str, spans: list[Span]) -> None:
+def test_the_addresses_of_requests(pdu: str, spans: list[TouchedSpan]) -> None:
     asked = parse_request(bytes.fromhex(pdu))
     assert (list(asked.spans), asked.problem) == (spans, "")
 
@@ -217,7 +217,7 @@ CONVERSATION = [
 @settings(max_examples=25)
 def test_chunk_borders_mean_nothing(data: st.DataObject) -> None:
     """However replies are divided, the exchanges are the same except for the time of their last byte."""
-    cut: list[Event] = []
+    cut: list[TraceEvent] = []
     for event in CONVERSATION:
         raw = bytes.fromhex(event.data["bytes"])
         if event.data["dir"] == "sent":
@@ -235,7 +235,9 @@ def test_chunk_borders_mean_nothing(data: st.DataObject) -> None:
 )
 @settings(max_examples=60)
 def test_any_bytes_are_described_completely(framing: str, chunks: list[tuple[bool, bytes]]) -> None:
-    wire = ModbusConnectionDecoder("line1", framing, {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))})
+    wire = ModbusConnectionDecoder(
+        "line1", framing, {1: KnownUnit("ctd", TagMap(observatory().devices["ctd"].profile))}
+    )
     for t_ns, (sent, data) in enumerate(chunks):
         said, _ = wire.feed(sent, data, t_ns)
         assert all(said)
@@ -284,7 +286,7 @@ def test_an_answer_in_pieces_over_the_next_request_is_whole() -> None:
 
 
 def test_secrets_have_no_value_in_text() -> None:
-    wire = ModbusConnectionDecoder("line1", "rtu", {1: Unit("meter", TagMap(load_profile(METER)))})
+    wire = ModbusConnectionDecoder("line1", "rtu", {1: KnownUnit("meter", TagMap(load_profile(METER)))})
     words = wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 0)[0]
     assert words == ["meter: write registers 40015 (holding:14) x 2: password (secret)"]
     wire.feed(True, with_crc(bytes.fromhex("01 03 000F 0001")), 1)

@@ -20,8 +20,8 @@ from fieldtwin.capture.decoding.exchange import DecodedExchange as Decoded
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.scenarios.judging.expectation import wire_matches
 from fieldtwin.scenarios.language.form import Expect
-from fieldtwin.testing.handles import Device
-from fieldtwin.testing.runner import Runner
+from fieldtwin.testing.handles import DeviceHandle
+from fieldtwin.testing.runner import WorkerProcess
 from fieldtwin.testing.wire import Exchange
 
 READ = struct.pack(">BHH", 4, 0, 2)
@@ -29,13 +29,13 @@ PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def runner() -> Iterator[Runner]:
+def runner() -> Iterator[WorkerProcess]:
     with started_runner() as runner:
         yield runner
 
 
 @pytest.fixture
-def device(runner: Runner) -> Iterator[Device]:
+def device(runner: WorkerProcess) -> Iterator[DeviceHandle]:
     with emulated(runner, "eastron-sdm630", on="tcp", values={"voltage_l1": 230.5}) as device:
         yield device
 
@@ -43,7 +43,7 @@ def device(runner: Runner) -> Iterator[Device]:
 class Client:
     """A Modbus TCP client that sends and receives on request."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: DeviceHandle) -> None:
         self.unit = device.unit
         self.socket = socket.create_connection((device.host, device.port), PATIENCE_S)
 
@@ -66,7 +66,7 @@ class Client:
         self.receive()
 
 
-def seen(device: Device, **like: object) -> list[Exchange]:
+def seen(device: DeviceHandle, **like: object) -> list[Exchange]:
     """Return the traffic once there is any."""
     until = time.monotonic() + PATIENCE_S
     while not (found := device.wire.exchanges(**like)) and time.monotonic() < until:
@@ -74,7 +74,7 @@ def seen(device: Device, **like: object) -> list[Exchange]:
     return found
 
 
-def test_a_read_during_a_delayed_reply_shows_it_pending_and_changes_nothing(device: Device) -> None:
+def test_a_read_during_a_delayed_reply_shows_it_pending_and_changes_nothing(device: DeviceHandle) -> None:
     with Client(device) as client, device.fault("delay", by_ms=300):
         client.send(1)
         looks = [seen(device)[0].problem]
@@ -88,14 +88,14 @@ def test_a_read_during_a_delayed_reply_shows_it_pending_and_changes_nothing(devi
     assert whole.latency_ms >= 300
 
 
-def test_expect_waits_for_a_pending_reply(device: Device) -> None:
+def test_expect_waits_for_a_pending_reply(device: DeviceHandle) -> None:
     with Client(device) as client, device.fault("delay", by_ms=200):
         client.send(1)
         (whole,) = device.wire.expect(function=4, within_s=PATIENCE_S)
     assert whole.tags["voltage_l1"] == 230.5
 
 
-def test_a_request_has_no_reply_at_the_end_of_the_wait_or_of_the_connection(device: Device) -> None:
+def test_a_request_has_no_reply_at_the_end_of_the_wait_or_of_the_connection(device: DeviceHandle) -> None:
     with Client(device) as client, device.fault("silence"):
         client.send(1)
         assert seen(device)[0].problem == "pending"
@@ -104,7 +104,7 @@ def test_a_request_has_no_reply_at_the_end_of_the_wait_or_of_the_connection(devi
     assert [e.problem for e in seen(device, problem="no reply")] == ["no reply"]
 
 
-def test_a_stray_frame_is_shown_and_is_not_a_request(device: Device) -> None:
+def test_a_stray_frame_is_shown_and_is_not_a_request(device: DeviceHandle) -> None:
     with Client(device) as client, device.fault("duplicate"):
         client.ask(7)
         client.receive()
@@ -117,7 +117,7 @@ def test_a_stray_frame_is_shown_and_is_not_a_request(device: Device) -> None:
     assert len(device.wire.exchanges(strays=True)) == 2
 
 
-def test_exchanges_are_in_the_order_of_their_requests(device: Device) -> None:
+def test_exchanges_are_in_the_order_of_their_requests(device: DeviceHandle) -> None:
     with Client(device) as first, Client(device) as second:
         with device.fault("silence"):
             first.send(1)
@@ -129,7 +129,7 @@ def test_exchanges_are_in_the_order_of_their_requests(device: Device) -> None:
     assert [e.problem for e in device.wire.exchanges()] == ["no reply", "", ""]
 
 
-def test_exchanges_pending_before_clear_do_not_return(device: Device) -> None:
+def test_exchanges_pending_before_clear_do_not_return(device: DeviceHandle) -> None:
     with Client(device) as client, device.fault("delay", by_ms=200):
         client.send(1)
         seen(device)
@@ -140,7 +140,7 @@ def test_exchanges_pending_before_clear_do_not_return(device: Device) -> None:
     assert [e.transaction for e in device.wire.exchanges()] == [2]
 
 
-def test_expect_takes_bounds(device: Device) -> None:
+def test_expect_takes_bounds(device: DeviceHandle) -> None:
     with Client(device) as client:
         for transaction in (1, 2, 3):
             client.ask(transaction)
@@ -154,7 +154,7 @@ def test_expect_takes_bounds(device: Device) -> None:
         device.wire.expect(2, at_most=3)
 
 
-def test_an_asynchronous_driver_can_be_awaited_during_expect(device: Device) -> None:
+def test_an_asynchronous_driver_can_be_awaited_during_expect(device: DeviceHandle) -> None:
     async def drive() -> None:
         reader, writer = await asyncio.open_connection(device.host, device.port)
         writer.write(struct.pack(">HHHB", 1, 0, len(READ) + 1, device.unit) + READ)

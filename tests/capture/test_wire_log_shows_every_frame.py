@@ -18,35 +18,35 @@ from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.testing.handles import Device
-from fieldtwin.testing.runner import Runner
+from fieldtwin.testing.handles import DeviceHandle
+from fieldtwin.testing.runner import WorkerProcess
 
 READ = struct.pack(">BHH", 4, 0, 2)
 PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def runner() -> Iterator[Runner]:
-    runner = Runner()
+def runner() -> Iterator[WorkerProcess]:
+    runner = WorkerProcess()
     runner.call("hello")  # its threads begin before those of the first test are counted
     yield runner
     runner.close()
 
 
 @pytest.fixture
-def device(runner: Runner) -> Iterator[Device]:
+def device(runner: WorkerProcess) -> Iterator[DeviceHandle]:
     answer = runner.call("device", device="eastron-sdm630", on="tcp", values={"voltage_l1": 230.5})
-    yield Device(runner, answer["id"], "device", answer)
+    yield DeviceHandle(runner, answer["id"], "device", answer)
     runner.call("end", id=answer["id"])
 
 
-def _ask(device: Device) -> bytes:
+def _ask(device: DeviceHandle) -> bytes:
     with socket.create_connection((device.host, device.port), PATIENCE_S) as link:
         link.sendall(struct.pack(">HHHB", 1, 0, len(READ) + 1, device.unit) + READ)
         return link.recv(100)
 
 
-def test_a_reply_with_a_wrong_unit_id_is_a_stray_of_the_device(device: Device) -> None:
+def test_a_reply_with_a_wrong_unit_id_is_a_stray_of_the_device(device: DeviceHandle) -> None:
     with device.fault("wrong-unit", unit_id=99):
         got = _ask(device)
     assert got[6] == 99
@@ -56,7 +56,7 @@ def test_a_reply_with_a_wrong_unit_id_is_a_stray_of_the_device(device: Device) -
     assert device.wire.count() == 1
 
 
-def test_the_text_of_a_stray_explains_why_its_bytes_are_hidden(device: Device) -> None:
+def test_the_text_of_a_stray_explains_why_its_bytes_are_hidden(device: DeviceHandle) -> None:
     with device.fault("wrong-unit", unit_id=99):
         _ask(device)
     (stray,) = device.wire.expect(problem="stray", within_s=PATIENCE_S)
@@ -72,7 +72,7 @@ def test_the_text_of_a_stray_explains_why_its_bytes_are_hidden(device: Device) -
         ({"access": "writes"}, "no exchange has the access 'writes'; expected one of '', 'read', 'write'"),
     ],
 )
-def test_a_question_that_nothing_can_match_is_refused(device: Device, like: dict[str, object], says: str) -> None:
+def test_a_question_that_nothing_can_match_is_refused(device: DeviceHandle, like: dict[str, object], says: str) -> None:
     with pytest.raises(TypeError) as refused:
         device.wire.expect(times=0, within_s=0.0, **like)
     assert says in str(refused.value)
@@ -80,7 +80,7 @@ def test_a_question_that_nothing_can_match_is_refused(device: Device, like: dict
         device.wire.count(**like)
 
 
-def test_bounds_that_no_number_meets_are_refused(device: Device) -> None:
+def test_bounds_that_no_number_meets_are_refused(device: DeviceHandle) -> None:
     with pytest.raises(TypeError, match="at least 3 and at most 2 can never be met"):
         device.wire.expect(at_least=3, at_most=2, within_s=0.0)
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from test_cli import invoke as invoke_command
 
-from fieldtwin.emulators.faults.frames import Framing, Way, understood
+from fieldtwin.emulators.faults.frames import FrameDirection, Framing, understood
 from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.faults.schema import parse_fault
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.stated import parts_of
@@ -47,7 +47,7 @@ def meter() -> DeviceProfile:
 
 
 def test_function_11h_has_data_after_the_run_indicator() -> None:
-    unit = ModbusUnit(MapBank([Span("holding", 0, 1)]), **parts_of(meter()))
+    unit = ModbusUnit(MapBank([CellSpan("holding", 0, 1)]), **parts_of(meter()))
     assert unit.respond(b"\x11", 0) == bytes.fromhex("11 06 4D 54 FF 01 02 03")
     unit.running = False
     assert unit.respond(b"\x11", 0) == bytes.fromhex("11 06 4D 54 00 01 02 03")
@@ -60,7 +60,7 @@ def test_a_server_id_and_its_data_have_to_fit_one_reply() -> None:
 
 
 def test_one_device_answers_any_unit_id_on_tcp_and_echoes_it() -> None:
-    unit = ModbusUnit(MapBank([Span("holding", 0, 1)]))
+    unit = ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))
     request = bytes.fromhex("0001 0000 0006 63 03 0000 0001")
     assert MbapSlave({1: unit}).feed(request, 0) == [bytes.fromhex("0001 0000 0003 63 83 0A")]
     assert MbapSlave({1: unit}, any_unit=True).feed(request, 0) == [bytes.fromhex("0001 0000 0005 63 03 02 0000")]
@@ -75,7 +75,9 @@ def test_a_fault_strikes_by_the_number_of_registers_that_the_request_reads(count
     faults = wire_faults([{"name": "silence", "registers": count, "direction": "request"}], Framing.MBAP, 1, 0)
     for registers in (1, 39, 40, 41, 64, 65, 100, 125):
         request = bytes.fromhex("0001 0000 0006 01 03 0000") + registers.to_bytes(2)
-        assert (faults.decide(understood(Way.REQUEST, Framing.MBAP, request), 0) is not None) == (registers in struck)
+        assert (faults.decide(understood(FrameDirection.REQUEST, Framing.MBAP, request), 0) is not None) == (
+            registers in struck
+        )
 
 
 @pytest.mark.parametrize("count", [0, 2001, "5..4", "x", "..4", -1])

@@ -12,20 +12,20 @@ from click.testing import CliRunner
 from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virtually, unit
 
 from fieldtwin.cli.device.diff_command import command
-from fieldtwin.commissioning.access.reading import Target
+from fieldtwin.commissioning.access.reading import DeviceTarget
 from fieldtwin.commissioning.dump.diff import Leave, diff_dictionary, diff_dumps, diff_profile, spans
-from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]
 SDM = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")
-SPANS = [Span("input", 0, 80), Span("holding", 0, 30)]
+SPANS = [CellSpan("input", 0, 80), CellSpan("holding", 0, 30)]
 
 
 def floats(made: MapBank, table: str, values: dict[int, float]) -> None:
@@ -35,7 +35,7 @@ def floats(made: MapBank, table: str, values: dict[int, float]) -> None:
             made.poke(table, address + i, int.from_bytes(raw[2 * i : 2 * i + 2]))  # type: ignore[arg-type]
 
 
-def meter(holding: dict[int, float], spans: list[Span] | None = None) -> MapBank:
+def meter(holding: dict[int, float], spans: list[CellSpan] | None = None) -> MapBank:
     made = bank(spans or SPANS)
     floats(made, "input", {0: 230.0, 2: 231.0, 70: 50.0})
     floats(made, "holding", {2: 60.0, 10: 3.0, 18: 1.0, 20: 1.0} | holding)
@@ -45,7 +45,7 @@ def meter(holding: dict[int, float], spans: list[Span] | None = None) -> MapBank
 def dumped(made: MapBank, out: Path, **how: object) -> Dump:
     async def main() -> None:
         limits = {"read_registers": how.pop("limit")} if "limit" in how else {}
-        job = Job(Target(URL, 1, SDM if "spans" not in how else None), **how)  # type: ignore[arg-type]
+        job = DumpJob(DeviceTarget(URL, 1, SDM if "spans" not in how else None), **how)  # type: ignore[arg-type]
         await dump(job, out, words="", connector=Wired(unit(made, **limits)), clock=loop())
 
     run_virtually(main())
@@ -71,7 +71,7 @@ def test_two_dumps_by_tag_settings_and_tolerance(tmp_path: Path) -> None:
 def test_without_a_profile_it_is_registers_and_limits(tmp_path: Path) -> None:
     how = {"spans": register_spans(["input:0..79"]), "functions": False}
     one = dumped(meter({}), tmp_path / "a.jsonl", **how)
-    changed = meter({}, [Span("input", 0, 40), Span("input", 41, 39), Span("holding", 0, 30)])
+    changed = meter({}, [CellSpan("input", 0, 40), CellSpan("input", 41, 39), CellSpan("holding", 0, 30)])
     floats(changed, "input", {2: -5.5})
     other = dumped(changed, tmp_path / "b.jsonl", limit=16, **how)
     found = diff_dumps(one, other)
@@ -83,7 +83,7 @@ def test_without_a_profile_it_is_registers_and_limits(tmp_path: Path) -> None:
 def test_a_profile_that_contradicts_the_device(tmp_path: Path) -> None:
     good = dumped(meter({}), tmp_path / "good.jsonl")
     assert not diff_profile(good, SDM).found
-    bad = meter({10: 7.0, 2: 99.0}, [Span("input", 0, 30), Span("input", 52, 28), Span("holding", 0, 30)])
+    bad = meter({10: 7.0, 2: 99.0}, [CellSpan("input", 0, 30), CellSpan("input", 52, 28), CellSpan("holding", 0, 30)])
     found = diff_profile(dumped(bad, tmp_path / "bad.jsonl"), SDM).found
     kinds = {(d.kind, d.name) for d in found}
     assert ("out of range", "demand_period") in kinds
@@ -92,7 +92,7 @@ def test_a_profile_that_contradicts_the_device(tmp_path: Path) -> None:
 
 
 def test_limits_that_the_profile_states_and_the_device_does_not_keep(tmp_path: Path) -> None:
-    made = meter({}, [Span("input", 0, 36), Span("input", 44, 36), Span("holding", 0, 30)])
+    made = meter({}, [CellSpan("input", 0, 36), CellSpan("input", 44, 36), CellSpan("holding", 0, 30)])
     how = {"spans": register_spans(["input:0..79", "holding:0..29"]), "functions": False}
     found = diff_profile(dumped(made, tmp_path / "d.jsonl", limit=20, **how), SDM)
     kinds = {(d.kind, d.name) for d in found.found}
@@ -105,7 +105,7 @@ def test_a_node_against_its_data_sheet(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with can_bus(CanopenNode(parse_eds(RICH, "x"), 5, NodeContext())) as connector:
-            job = Job(Target(CAN_URL, 5, dictionary=sheet))
+            job = DumpJob(DeviceTarget(CAN_URL, 5, dictionary=sheet))
             await dump(job, tmp_path / "n.jsonl", words="", connector=connector, clock=loop())
 
     run_virtually(main())

@@ -12,16 +12,16 @@ from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.commissioning.access.reading import Target
+from fieldtwin.commissioning.access.reading import DeviceTarget
 from fieldtwin.commissioning.dump.coverage import NOT_ASKED, READABLE, REFUSED
-from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import LATENCY_LIMITS_NS, describe_latency, load_dump
 from fieldtwin.commissioning.dump.objects import ListedObjects
 from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
-from fieldtwin.commissioning.dump.sweep import Refused, Silent, Sweep, Taken
+from fieldtwin.commissioning.dump.sweep import RefusedRead, Silent, Sweep, Taken
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import RegisterRange, load_profile
 from fieldtwin.gateway.core.histogram import Histogram
@@ -41,7 +41,9 @@ def sweep(readable: set[int], limit: int, *, pairs: bool = False, end: int = 400
             cells = set(range(asked.address, asked.end))
             whole = not pairs or (asked.address % 2 == 0 and asked.count % 2 == 0)
             taken = cells <= readable and asked.count <= limit and whole
-            asked = asking.send(Taken(bytes(2 * asked.count)) if taken else Refused(3 if asked.count > limit else 2))
+            asked = asking.send(
+                Taken(bytes(2 * asked.count)) if taken else RefusedRead(3 if asked.count > limit else 2)
+            )
     except StopIteration:
         return made, requests
 
@@ -93,7 +95,7 @@ def test_the_fewest_requests_that_the_limits_allow() -> None:
 
 
 def test_a_table_without_its_function_or_in_silence_is_left_soon() -> None:
-    for outcome, most in ((Refused(1), 2), (Silent("no reply"), 10)):
+    for outcome, most in ((RefusedRead(1), 2), (Silent("no reply"), 10)):
         made = Sweep(RegisterRange("coil", 0, 65536))
         asking, requests = made.asking(), 1
         next(asking)
@@ -103,7 +105,7 @@ def test_a_table_without_its_function_or_in_silence_is_left_soon() -> None:
                 requests += 1
         assert requests <= most
         assert made.halted
-        assert ("refuses the function" in made.found.stopped) == isinstance(outcome, Refused)
+        assert ("refuses the function" in made.found.stopped) == isinstance(outcome, RefusedRead)
 
 
 def test_a_value_of_two_registers_that_may_not_be_cut_is_a_border_and_no_hole() -> None:
@@ -113,19 +115,19 @@ def test_a_value_of_two_registers_that_may_not_be_cut_is_a_border_and_no_hole() 
     try:  # registers 0 to 129; 124 and 125 are one value
         while True:
             cut = asked.address == 125 or asked.end == 125
-            asked = asking.send(Refused(2) if cut else Taken(bytes(2 * asked.count)))
+            asked = asking.send(RefusedRead(2) if cut else Taken(bytes(2 * asked.count)))
     except StopIteration:
         pass
     assert cells(made.found.readable) == set(range(130))
     assert made.found.borders == [124]
 
 
-MAP = [Span("holding", 0, 30), Span("holding", 40, 60), Span("input", 8, 16), Span("coil", 0, 20)]
+MAP = [CellSpan("holding", 0, 30), CellSpan("holding", 40, 60), CellSpan("input", 8, 16), CellSpan("coil", 0, 20)]
 
 
-def job(**how: object) -> Job:
-    target = Target(URL, 1)
-    return Job(target, register_spans(["holding:0..127", "input:0..63", "coil:0..63"]), **how)  # type: ignore[arg-type]
+def job(**how: object) -> DumpJob:
+    target = DeviceTarget(URL, 1)
+    return DumpJob(target, register_spans(["holding:0..127", "input:0..63", "coil:0..63"]), **how)  # type: ignore[arg-type]
 
 
 def wired(**how: object) -> Wired:
@@ -212,7 +214,7 @@ def test_a_different_job_an_existing_file_and_a_missing_device_are_refused(tmp_p
         with pytest.raises(FileInvalid, match="different device or range"):
             await dump(job(stride=1), out, words="", resume=True, connector=wired(), clock=loop())
         with pytest.raises(UsageError, match="broadcast"):
-            await dump(Job(Target("rtu:/dev/ttyS99", 0)), tmp_path / "n.jsonl", words="")
+            await dump(DumpJob(DeviceTarget("rtu:/dev/ttyS99", 0)), tmp_path / "n.jsonl", words="")
         deaf = wired(mute=lambda adu, before: True)
         with pytest.raises(Unreachable, match="nobody answers"):
             await dump(job(), tmp_path / "n.jsonl", words="", connector=deaf, clock=loop())
@@ -235,9 +237,9 @@ def test_a_lost_reply_is_asked_for_again_and_a_hole_is_not_invented(tmp_path: Pa
 def test_a_profile_is_dumped_by_its_tags_and_limits_and_secrets_stay_out(tmp_path: Path) -> None:
     async def main() -> None:
         sdm = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")
-        made = bank([Span("input", 0, 80), Span("holding", 0, 30)])
+        made = bank([CellSpan("input", 0, 80), CellSpan("holding", 0, 30)])
         wire = Wired(unit(made))
-        what = Job(Target(URL, 1, sdm), functions=False)
+        what = DumpJob(DeviceTarget(URL, 1, sdm), functions=False)
         await dump(what, tmp_path / "d.jsonl", words="", connector=wire, clock=loop())
         assert len(wire.requests) == estimate(what, 0).least_requests == len(frames(what))
         found = load_dump(tmp_path / "d.jsonl").passes[0].cells
@@ -253,9 +255,9 @@ def test_a_nodes_objects_by_its_data_sheet_and_by_sweeping(tmp_path: Path) -> No
         sheet = parse_dictionary(RICH, 5)
         async with can_bus(node) as connector:
             how = {"words": "", "connector": connector, "clock": loop()}
-            eds = Job(Target(CAN_URL, 5, dictionary=sheet), passes=2)
+            eds = DumpJob(DeviceTarget(CAN_URL, 5, dictionary=sheet), passes=2)
             await dump(eds, tmp_path / "eds.jsonl", **how)  # type: ignore[arg-type]
-            raw = Job(Target(CAN_URL, 5), objects=object_ranges(["1000..1020"]))
+            raw = DumpJob(DeviceTarget(CAN_URL, 5), objects=object_ranges(["1000..1020"]))
             await dump(raw, tmp_path / "raw.jsonl", **how)  # type: ignore[arg-type]
 
     run_virtually(main())

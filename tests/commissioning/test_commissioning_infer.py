@@ -19,15 +19,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.commissioning.access.address import tags_of
-from fieldtwin.commissioning.access.reading import Target, point_at
-from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.access.reading import DeviceTarget, point_at
+from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import load_dump
 from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.commissioning.infer.costs import NUMBERS, cost, orders_of
 from fieldtwin.commissioning.infer.draft import checked, draft_profile
 from fieldtwin.commissioning.infer.fields import Interpretation, Level, infer_run, run_of
 from fieldtwin.commissioning.infer.infer import Series, infer, series_of, without_repetitions
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import load_profile
 
@@ -260,7 +260,7 @@ def test_from_a_hidden_map_over_the_wire_to_a_profile_that_reads_it(tmp_path: Pa
     end = fields[-1].address + len(fields[-1].rows[0])
 
     async def main() -> None:
-        made = bank([Span("holding", 0, end)])
+        made = bank([CellSpan("holding", 0, end)])
         wire = Wired(unit(made, read_registers=20), latency_s=0.001)
 
         def live() -> None:
@@ -272,7 +272,9 @@ def test_from_a_hidden_map_over_the_wire_to_a_profile_that_reads_it(tmp_path: Pa
                 loop().call_at(10 * (now + 1), live)
 
         live()
-        job = Job(Target(URL, 1), register_spans([f"holding:0..{end - 1}"]), functions=False, passes=12, every_s=10.0)
+        job = DumpJob(
+            DeviceTarget(URL, 1), register_spans([f"holding:0..{end - 1}"]), functions=False, passes=12, every_s=10.0
+        )
         await dump(job, tmp_path / "d.jsonl", words="", connector=wire, clock=loop())
         dumps = [load_dump(tmp_path / "d.jsonl")]
         inference = infer(series_of(dumps))
@@ -284,7 +286,7 @@ def test_from_a_hidden_map_over_the_wire_to_a_profile_that_reads_it(tmp_path: Pa
         certain = [r for r in inference.readings if r.level is Level.CERTAIN]
         assert len(certain) >= 4
         assert text.count("# certain") == len(certain)
-        async with point_at(Target(URL, 1, profile), connector=wire, clock=loop()) as point:
+        async with point_at(DeviceTarget(URL, 1, profile), connector=wire, clock=loop()) as point:
             answers = await point.read(tags_of([], "modbus", profile=profile))
         for reading in certain:
             truth = next(f for f in fields if f.is_read_by(reading))

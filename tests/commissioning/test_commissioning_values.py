@@ -9,11 +9,11 @@ from canopen_slave_rig import RICH
 from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virtually, unit
 
 from fieldtwin.commissioning.access.address import RawForm, tags_of, with_care
-from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, row_of, target_of, text_of
+from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point, point_at, row_of, target_of, text_of
 from fieldtwin.commissioning.access.writing import before, carry_out, check_broadcast, plan_write, plan_writes, restore
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
 from fieldtwin.gateway.core.files.profile import load_profile
 
@@ -51,8 +51,8 @@ def test_an_invalid_address_is_refused_with_a_valid_example(item: str, protocol:
 
 def test_values_come_in_the_fewest_requests_and_a_hole_is_an_answer() -> None:
     async def main() -> None:
-        wire = Wired(unit(bank([Span("input", 0, 4), Span("input", 6, 2)], {"input": {0: FLOATS}})))
-        async with point_at(Target(URL, 1), connector=wire, clock=loop()) as point:
+        wire = Wired(unit(bank([CellSpan("input", 0, 4), CellSpan("input", 6, 2)], {"input": {0: FLOATS}})))
+        async with point_at(DeviceTarget(URL, 1), connector=wire, clock=loop()) as point:
             tags = tags_of(["input:0"], "modbus", RawForm("float32", count=4))
             answers = await point.read(tags)
             assert [answers[t.name].value.value for t in tags] == [230.5, 100.0, None, 0.0]
@@ -60,7 +60,7 @@ def test_values_come_in_the_fewest_requests_and_a_hole_is_an_answer() -> None:
             asked = len(wire.requests)
             await point.read(tags)
             assert len(wire.requests) - asked == 2  # a learned fact persists: the missing one is not asked again
-        assert [f.replace(" ", "")[-8:] for f in dry_point(Target(URL, 1)).read_frames(tags[:2])] == ["00000004"]
+        assert [f.replace(" ", "")[-8:] for f in dry_point(DeviceTarget(URL, 1)).read_frames(tags[:2])] == ["00000004"]
 
     run_virtually(main())
 
@@ -68,10 +68,10 @@ def test_values_come_in_the_fewest_requests_and_a_hole_is_an_answer() -> None:
 def test_a_profiles_limits_and_names_are_kept() -> None:
     async def main() -> None:
         made = bank(
-            [Span("input", 0, 80), Span("holding", 0, 30)], {"holding": {10: [0x4040, 0]}, "input": {0: FLOATS}}
+            [CellSpan("input", 0, 80), CellSpan("holding", 0, 30)], {"holding": {10: [0x4040, 0]}, "input": {0: FLOATS}}
         )
         wire = Wired(unit(made, functions=frozenset({3, 4, 16})))
-        target = Target(URL, 1, SDM)
+        target = DeviceTarget(URL, 1, SDM)
         async with point_at(target, connector=wire, clock=loop()) as point:
             tags = tags_of(["system_type", "voltage_l1"], "modbus", profile=SDM)
             answers = await point.read(tags)
@@ -109,17 +109,17 @@ def test_errors_that_need_no_device_are_reported_before_anything_is_sent() -> No
     with pytest.raises(NotAllowed, match="loses contact"):
         plan_write(with_care(tags_of(["holding:20"], "modbus")[0], SDM), "1")
     with pytest.raises(NotAllowed, match="broadcast to all units"):
-        check_broadcast(dry_point(Target("rtu:/dev/ttyS9", 0)), i_know=False)
-    check_broadcast(dry_point(Target(URL, 0)), i_know=False)  # on TCP unit 0 is the device itself
+        check_broadcast(dry_point(DeviceTarget("rtu:/dev/ttyS9", 0)), i_know=False)
+    check_broadcast(dry_point(DeviceTarget(URL, 0)), i_know=False)  # on TCP unit 0 is the device itself
     with pytest.raises(NotAllowed, match="stores parameters"):
         plan_write(tags_of(["1010h:01"], "canopen", RawForm("uint32"))[0], "0x65766173")
 
 
 def test_a_value_is_restored_and_one_that_is_not_held_is_reported() -> None:
     async def main() -> None:
-        made = bank([Span("holding", 0, 4), Span("coil", 0, 2)], {"holding": {1: [7]}})
+        made = bank([CellSpan("holding", 0, 4), CellSpan("coil", 0, 2)], {"holding": {1: [7]}})
         wire = Wired(unit(made))
-        async with point_at(Target(URL, 1), connector=wire, clock=loop()) as point:
+        async with point_at(DeviceTarget(URL, 1), connector=wire, clock=loop()) as point:
             for item, text, held in (("holding:1", "9", 7), ("coil:1", "on", 0)):
                 write = plan_write(tags_of([item], "modbus")[0], text)
                 done = await carry_out(point, write, await before(point, write))
@@ -137,8 +137,8 @@ def test_a_value_is_restored_and_one_that_is_not_held_is_reported() -> None:
 @pytest.mark.parametrize(("order", "words"), [("ABCD", [0x5075, 0x6D70, 0]), ("BADC", [0x7550, 0x706D, 0])])
 def test_text_is_written_too(order: str, words: list[int]) -> None:
     async def main() -> None:
-        made = bank([Span("holding", 0, 3)])
-        async with point_at(Target(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
+        made = bank([CellSpan("holding", 0, 3)])
+        async with point_at(DeviceTarget(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
             tag = tags_of(["holding:0"], "modbus", RawForm("string", order, registers=3))[0]
             write = plan_write(tag, "Pump")
             await carry_out(point, write, await before(point, write))
@@ -152,9 +152,9 @@ def test_text_is_written_too(order: str, words: list[int]) -> None:
 
 def test_a_device_that_acknowledges_and_forgets_fails_the_verification() -> None:
     async def main() -> None:
-        made = bank([Span("holding", 0, 1)])
+        made = bank([CellSpan("holding", 0, 1)])
         wire = Wired(unit(made))
-        async with point_at(Target(URL, 1), connector=wire, clock=loop()) as point:
+        async with point_at(DeviceTarget(URL, 1), connector=wire, clock=loop()) as point:
             write = plan_write(tags_of(["holding:0"], "modbus")[0], "5")
             old = await before(point, write)
             read, made.read = made.read, lambda *a: (0,)  # type: ignore[method-assign,assignment]
@@ -168,7 +168,10 @@ def test_a_device_that_acknowledges_and_forgets_fails_the_verification() -> None
 def test_objects_of_a_node_by_address_by_name_and_back() -> None:
     async def main() -> None:
         node = CanopenNode(parse_eds(RICH, "x"), 5, NodeContext())
-        async with can_bus(node) as connector, point_at(Target(CAN_URL, 5), connector=connector, clock=loop()) as point:
+        async with (
+            can_bus(node) as connector,
+            point_at(DeviceTarget(CAN_URL, 5), connector=connector, clock=loop()) as point,
+        ):
             tags = tags_of(["1008", "1005h:00", "2FFF"], "canopen")
             answers = await point.read(tags)
             assert answers["1008h:00"].value.value == "a node for tests"

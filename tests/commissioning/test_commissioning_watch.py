@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from fieldtwin.cli.device import dump_command, read_command, watch_command, write_command
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.plotting import check_plot, plot
-from fieldtwin.commissioning.access.point import Answer
-from fieldtwin.commissioning.access.reading import Target, point_at
+from fieldtwin.commissioning.access.point import PointValue
+from fieldtwin.commissioning.access.reading import DeviceTarget, point_at
 from fieldtwin.commissioning.access.watching import BLOCKS, MOST_SAMPLES, History, samples, sparkline
 from fieldtwin.commissioning.access.writing import before, plan_write
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 
@@ -37,8 +37,8 @@ def test_a_sparkline_has_a_character_a_value_and_its_ends_at_the_ends(values: li
 def test_a_history_is_bounded_and_remembers_its_extremes() -> None:
     history = History()
     for i in range(MOST_SAMPLES + 10):
-        history.add(i, Answer(TagValue(i, Quality.GOOD, Reason.NONE, 1, bytes([i % 256]))))
-    history.add(0, Answer(TagValue(None, Quality.BAD, Reason.TIMEOUT)))
+        history.add(i, PointValue(TagValue(i, Quality.GOOD, Reason.NONE, 1, bytes([i % 256]))))
+    history.add(0, PointValue(TagValue(None, Quality.BAD, Reason.TIMEOUT)))
     assert len(history.values) == MOST_SAMPLES
     assert (history.samples, history.bad, history.least) == (MOST_SAMPLES + 11, 1, 0)
     assert history.changes == MOST_SAMPLES + 9
@@ -47,9 +47,9 @@ def test_a_history_is_bounded_and_remembers_its_extremes() -> None:
 
 def test_samples_keep_their_pace_and_a_slow_round_is_not_made_up_for() -> None:
     async def main() -> None:
-        made = bank([Span("holding", 0, 4)])
+        made = bank([CellSpan("holding", 0, 4)])
         slow = Wired(unit(made), mute=lambda adu, before: before == 1)
-        async with point_at(Target(URL, 1, timeout_s=2.5), connector=slow, clock=loop()) as point:
+        async with point_at(DeviceTarget(URL, 1, timeout_s=2.5), connector=slow, clock=loop()) as point:
             tags = tags_of(["holding:0"], "modbus")
             got = [s async for s in samples(point, tags, loop(), 1.0, 4)]
         assert [round(s.t_s, 1) for s in got] == [0.0, 1.0, 3.5, 4.5]
@@ -72,7 +72,7 @@ def test_a_picture_has_a_curve_for_each_tag_with_numbers(tmp_path: Path) -> None
     tags = tags_of(["holding:0", "holding:1"], "modbus")
     histories = {t.name: History() for t in tags}
     for i in range(5):
-        histories["holding:0"].add(i, Answer(TagValue(i, Quality.GOOD, Reason.NONE, 1, b"x")))
+        histories["holding:0"].add(i, PointValue(TagValue(i, Quality.GOOD, Reason.NONE, 1, b"x")))
     assert plot(tmp_path / "p.png", "t", tags, histories) == 1
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     assert plot(tmp_path / "q.png", "t", tags[1:], histories) == 0
@@ -118,8 +118,8 @@ def test_a_restart_is_shown_by_a_dry_run() -> None:
 
 def test_a_written_value_is_restored_even_if_a_later_write_fails() -> None:
     async def main() -> None:
-        made = bank([Span("holding", 0, 2), Span("holding", 2, 1, "ro")], {"holding": {0: [1, 2, 3]}})
-        async with point_at(Target(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
+        made = bank([CellSpan("holding", 0, 2), CellSpan("holding", 2, 1, "ro")], {"holding": {0: [1, 2, 3]}})
+        async with point_at(DeviceTarget(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
             writes = [plan_write(tags_of([f"holding:{i}"], "modbus")[0], "9") for i in range(3)]
             old = [await before(point, w) for w in writes]
             with pytest.raises(ModbusExceptionReply):

@@ -20,7 +20,7 @@ from fieldtwin.cli.main import cli
 from fieldtwin.commissioning.dump.beyond import beyond_silence, other_lengths
 from fieldtwin.commissioning.dump.coverage import INVALID, NOT_ASKED, READABLE, REFUSED, SILENT, Coverage, describe
 from fieldtwin.commissioning.dump.file import load_dump
-from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Sweep, Taken
+from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, RefusedRead, Silent, Sweep, Taken
 from fieldtwin.gateway.core.files.profile import RegisterRange
 
 BLOCKS = (range(20), range(1000, 1032))
@@ -192,7 +192,7 @@ def ask(sweep: Sweep, answer: dict[str, object], *, limit: int = 125) -> dict[tu
             whole = all(at.address <= a - place and a - place + size <= at.end for (size, place), a in edges)
             if whole:
                 return Taken(bytes(2 * at.count), 1000)
-        return Silent("no reply", 1_000_000) if answer.get("else") == "silent" else Refused(2, 1000)
+        return Silent("no reply", 1_000_000) if answer.get("else") == "silent" else RefusedRead(2, 1000)
 
     for part in (sweep.asking(), beyond_silence(sweep), other_lengths(sweep)):
         try:
@@ -248,7 +248,7 @@ def test_reported_addresses_are_the_requested_ones(
         assert (state == READABLE) == any(isinstance(out, Taken) for out in outcomes)
         assert (state == NOT_ASKED) == (state != READABLE and not short)
         if state in (REFUSED, SILENT):
-            assert any(isinstance(out, Refused if state == REFUSED else Silent) for out in short)
+            assert any(isinstance(out, RefusedRead if state == REFUSED else Silent) for out in short)
     told = describe("holding", sweep.coverage, [(0, SPAN)])
     assert sum(n for key, n in told["counts"].items() if key != "unknown") == SPAN
     if other == "refuse" and not sweep.found.stopped:

@@ -13,7 +13,7 @@ from fieldtwin.cli.device.identify_command import command
 from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
 from fieldtwin.commissioning.identify.modbus import ModbusIdentity, identify_modbus
 from fieldtwin.commissioning.identify.sunspec import next_model
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitParts
 from fieldtwin.emulators.recorded_device import load_replay
@@ -71,7 +71,7 @@ def test_a_units_own_identification_is_certain_and_excludes_other_profiles(tmp_p
     thermo = load_profile(path)
 
     async def main() -> None:
-        spans = [Span("holding", 0, 4)]
+        spans = [CellSpan("holding", 0, 4)]
         said = UnitParts(identification=Identification({0: b"ACME", 1: b"T-1000", 2: b"2.1"}))
         same = await identify(ModbusUnit(bank(spans), **said), 1, [*SHIPPED, thermo])
         assert same.certain == "acme/thermo"
@@ -93,13 +93,13 @@ def test_sunspec_is_read_model_by_model() -> None:
     async def main() -> None:
         words = {40000: [0x5375, 0x6E53, 1, 66], 40070: [103, 50], 40108: [4], 40122: [0xFFFF, 0]}
         name = [int.from_bytes(b"Sunny\0"[i : i + 2], "big") for i in range(0, 6, 2)]
-        device = unit(bank([Span("holding", 40000, 200)], {"holding": {**words, 40004: name}}))
+        device = unit(bank([CellSpan("holding", 40000, 200)], {"holding": {**words, 40004: name}}))
         found = await identify(device, 1, SHIPPED)
         spec = found.clues.sunspec
         assert spec is not None
         assert (spec.base, spec.models, spec.manufacturer) == (40000, ((1, 40002, 66), (103, 40070, 50)), "Sunny")
         assert found.certain == "sunspec/inverter-103"
-        other = unit(bank([Span("holding", 40000, 200)], {"holding": {**words, 40070: [101, 50], 40004: name}}))
+        other = unit(bank([CellSpan("holding", 40000, 200)], {"holding": {**words, 40070: [101, 50], 40004: name}}))
         single_phase = await identify(other, 1, SHIPPED)
         assert levels(single_phase)["sunspec/inverter-103"] is Sureness.RULED_OUT
 
@@ -111,7 +111,7 @@ def test_sunspec_is_read_model_by_model() -> None:
 def test_any_registers_never_make_certain(pattern: list[int], zeros: bool) -> None:
     async def main() -> None:
         words = [0] * 65 if zeros else (pattern * 65)[:65]
-        spans = [Span(t, a, 0x1000) for t in ("holding", "input") for a in (0, 0x2000, 39936)]  # type: ignore[arg-type]
+        spans = [CellSpan(t, a, 0x1000) for t in ("holding", "input") for a in (0, 0x2000, 39936)]  # type: ignore[arg-type]
         values = {t: {a + i * 65: words for a in (0, 0x2000, 39936) for i in range(63)} for t in ("holding", "input")}
         found = await identify(unit(bank(spans, values)), 1, SHIPPED)
         sure = [c for c in found.candidates if c.sureness is Sureness.CERTAIN]
@@ -124,7 +124,7 @@ def test_any_registers_never_make_certain(pattern: list[int], zeros: bool) -> No
 
 def test_silence_is_reported_as_silence() -> None:
     async def main() -> None:
-        wire = Wired(unit(bank([Span("holding", 0, 1)])), 9)
+        wire = Wired(unit(bank([CellSpan("holding", 0, 1)])), 9)
         found = await identify_modbus(URL, 1, SHIPPED, connector=wire, clock=loop(), timeout_s=0.1)
         assert not found.answers
         assert found.summary.startswith("unit 1 does not answer")
@@ -155,7 +155,7 @@ def test_an_exception_that_takes_600_ms_is_an_answer() -> None:
     """Defect: `identify` waited 500 ms, so a device that refuses more slowly seemed not to answer."""
 
     async def main() -> None:
-        wire = Wired(unit(bank([Span("holding", 0, 4)]), functions=frozenset({3})), 1, latency_s=0.6)
+        wire = Wired(unit(bank([CellSpan("holding", 0, 4)]), functions=frozenset({3})), 1, latency_s=0.6)
         found = await identify_modbus(URL, 1, [], connector=wire, clock=loop())
         assert found.answers
         assert (found.clues.silence["11"], found.clues.silence["2B"]) == ("exception 01h", "exception 01h")

@@ -14,11 +14,11 @@ from test_scan_line import exchange, meter
 from uart_line import UartLine
 
 from fieldtwin.commissioning.scan.can_listener import BusHeard
-from fieldtwin.commissioning.scan.causes import Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
+from fieldtwin.commissioning.scan.causes import ScanProbe, SerialEvidence, can_causes, serial_causes, tcp_causes
 from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line, probe_of
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
 from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import LineCounters, unpack_counters
+from fieldtwin.gateway.connections.line_counters import UartCounters, unpack_counters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.core.errors import NotAllowed
 
@@ -90,7 +90,7 @@ def test_the_probe_sees_echo_and_answer_and_is_one_question() -> None:
     async def main() -> None:
         line = UartLine({1: meter()}, echo=True)
         report = await look(line, probe_unit=1)
-        assert report.probe == Probe(1, "whole", "good", 15)
+        assert report.probe == ScanProbe(1, "whole", "good", 15)
         assert len(line.sent) == 1
         assert dict(report.facts)["echo"].startswith("yes")
         nobody = UartLine({1: meter()}, echo=True)
@@ -141,19 +141,19 @@ def heard_of(data: bytes) -> Heard:
 @pytest.mark.parametrize(
     ("evidence", "first"),
     [
-        (SerialEvidence(N81, heard_of(b""), LineCounters(breaks=30, frame=30)), "A and B swapped"),
+        (SerialEvidence(N81, heard_of(b""), UartCounters(breaks=30, frame=30)), "A and B swapped"),
         (SerialEvidence(N81, heard_of(b"$GPGGA,123519,4807.038,N*47\r\n" * 5)), "another protocol"),
         (SerialEvidence(N81, heard_of(b"\x00\xf8\x80\x00\xe0\xff\x00\xf8" * 10)), "the baud rate"),
         (
-            SerialEvidence(N81, heard_of(bytes(range(0, 250, 3))), LineCounters(parity=40)),
+            SerialEvidence(N81, heard_of(bytes(range(0, 250, 3))), UartCounters(parity=40)),
             "the parity or the stop bits",
         ),
-        (SerialEvidence(N81, heard_of(bytes(range(0, 250, 3))), LineCounters(frame=40)), "the baud rate"),
-        (SerialEvidence(N81, heard_of(b""), None, probe=Probe(1, "damaged", "none", 8)), "termination or noise"),
-        (SerialEvidence(N81, heard_of(b""), None, probe=Probe(1, "none", "none")), "a different unit ID"),
+        (SerialEvidence(N81, heard_of(bytes(range(0, 250, 3))), UartCounters(frame=40)), "the baud rate"),
+        (SerialEvidence(N81, heard_of(b""), None, probe=ScanProbe(1, "damaged", "none", 8)), "termination or noise"),
+        (SerialEvidence(N81, heard_of(b""), None, probe=ScanProbe(1, "none", "none")), "a different unit ID"),
         (SerialEvidence(N81, heard_of(exchange(5, 1)[0] * 20)), "only the client is received"),
         (SerialEvidence(N81, heard_of(b"".join((*exchange(5, 1), b"\x00") * 10))), "direction control"),
-        (SerialEvidence(N81, heard_of(b"x"), LineCounters(overrun=3)), "the baud rate"),
+        (SerialEvidence(N81, heard_of(b"x"), UartCounters(overrun=3)), "the baud rate"),
     ],
 )
 def test_known_faults_come_first(evidence: SerialEvidence, first: str) -> None:
@@ -218,8 +218,8 @@ def test_the_kernels_counters_are_read_in_their_order() -> None:
     import struct
 
     counted = unpack_counters(struct.pack("@20i", *range(1, 12), *[0] * 9))
-    assert counted == LineCounters(rx=5, tx=6, frame=7, overrun=8, parity=9, breaks=10, buffer_overrun=11)
-    wrapped = LineCounters(rx=2).since(LineCounters(rx=0xFFFF_FFFF))
+    assert counted == UartCounters(rx=5, tx=6, frame=7, overrun=8, parity=9, breaks=10, buffer_overrun=11)
+    wrapped = UartCounters(rx=2).since(UartCounters(rx=0xFFFF_FFFF))
     assert wrapped.rx == 3
 
 
@@ -233,7 +233,7 @@ def test_an_echo_is_seen_before_an_answer(sent: bytes, rest: bytes) -> None:
 @given(st.binary(max_size=200), st.booleans())
 @settings(max_examples=60, deadline=None)
 def test_any_traffic_gives_a_ranked_list(data: bytes, counts: bool) -> None:
-    found = serial_causes(SerialEvidence(N81, heard_of(data), LineCounters() if counts else None))
+    found = serial_causes(SerialEvidence(N81, heard_of(data), UartCounters() if counts else None))
     weights = [c.weight for c in found]
     assert weights == sorted(weights, reverse=True)
     assert all(c.name and c.why for c in found)

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from uart_line import UartLine, levels, sampled
 
-from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import LIKELY, name_of
 from fieldtwin.commissioning.scan.traffic import LineListener
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -21,7 +21,7 @@ PORT = "rtu:/dev/ttyX"
 
 
 def meter(value: int = 7) -> ModbusUnit:
-    return unit(bank([Span("holding", 0, 20)], {"holding": {0: [value]}}))
+    return unit(bank([CellSpan("holding", 0, 20)], {"holding": {0: [value]}}))
 
 
 def exchange(number: int, value: int) -> tuple[bytes, bytes]:
@@ -31,7 +31,7 @@ def exchange(number: int, value: int) -> tuple[bytes, bytes]:
 
 
 async def scan(line: UartLine, url: str = PORT, **options: object) -> ModbusScan:
-    told: list[Progress] = []
+    told: list[PhaseProgress] = []
     made = ScanOptions(**options)  # type: ignore[arg-type]
     result = await ModbusScanner(url, made, connector=line, clock=loop(), on_progress=told.append).run()
     assert all(p.done_s <= p.total_s + 1e-6 for p in told)
@@ -165,7 +165,7 @@ def test_damaged_answers_are_asked_for_again_and_reported() -> None:
 
 def test_an_exception_proves_presence_and_an_echo_does_not() -> None:
     async def main() -> None:
-        line = UartLine({1: unit(bank([Span("input", 5, 1)]))}, echo=True)
+        line = UartLine({1: unit(bank([CellSpan("input", 5, 1)]))}, echo=True)
         found = await scan(line, f"{PORT}?baudrate=9600&frame=8N1", units=(1, 2), listen_s=0)
         assert [(f.answer.unit, f.answer.exception) for f in found.units] == [(1, 2)]
         assert found.echo
@@ -176,7 +176,7 @@ def test_an_exception_proves_presence_and_an_echo_does_not() -> None:
 def test_stopping_keeps_the_results() -> None:
     async def main() -> None:
         line = UartLine({n: meter() for n in range(1, 200)})
-        seen: list[Progress] = []
+        seen: list[PhaseProgress] = []
         scanner = ModbusScanner(
             f"{PORT}?baudrate=9600&frame=8N1",
             ScanOptions(listen_s=0),
@@ -251,7 +251,7 @@ def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:
     async def main() -> None:
         line = UartLine({40: meter()})
         url = f"{PORT}?baudrate=9600&frame=8N1"
-        told: list[Progress] = []
+        told: list[PhaseProgress] = []
         scanner = ModbusScanner(url, ScanOptions(listen_s=1), connector=line, clock=loop(), on_progress=told.append)
         line.chatter = (exchange(5, 1),)
         line.opened.append(SerialSettings())  # it does not begin when the port is opened

@@ -13,8 +13,8 @@ from modbus_virtual import VirtualWire
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import TCP_UNITS
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, likeness, spread_over
-from fieldtwin.commissioning.scan.sweep import Send, UnitAnswer, UnitSweep
-from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
+from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -138,7 +138,7 @@ def test_rtu_over_tcp_is_scanned_as_a_line_is() -> None:
 
 def test_a_real_server_of_ours_is_found() -> None:
     async def main() -> None:
-        device = unit(bank([Span("holding", 0, 4)]))
+        device = unit(bank([CellSpan("holding", 0, 4)]))
         host = Host(lambda u: device.respond(b"\x03\x00\x00\x00\x01", 0) if u == 5 else b"\x83\x0b")
         found = await scan(host, units=(4, 5, 6))
         assert [f.answer.unit for f in found.units] == [5]
@@ -153,7 +153,7 @@ def test_a_sweep_ends_for_any_input_and_finds_only_requested_units(chunks: list[
     sweep = UnitSweep(framing, units, timeout_ns=50_000_000)  # type: ignore[arg-type]
     now_ns, sends = 0, 0
     while (step := sweep.poll(now_ns)) is not None:
-        if isinstance(step, Send):
+        if isinstance(step, SendRequest):
             sends += 1
             if chunks:
                 sweep.feed(chunks.pop(), now_ns + 1000)

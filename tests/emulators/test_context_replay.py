@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.replay.counters import CounterSpan
-from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay, NeverRecorded
+from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded, ReplayedReply
 from fieldtwin.emulators.replay.situation import Situations
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.errors import UsageError
@@ -100,7 +100,7 @@ def test_tables_and_units_are_separate() -> None:
     )
     assert (words(replay, 0), words(replay, 0, 1, 3), words(replay, 0, unit=2)) == ((1,), (2,), (3,))
     assert replay.units == (1, 2)
-    assert replay.respond(3, read(0)) == Answer(None)
+    assert replay.respond(3, read(0)) == ReplayedReply(None)
 
 
 # -- what was written before --------------------------------------------------------------------------------------
@@ -287,7 +287,7 @@ def test_an_unrecorded_request_is_refused_or_not_answered(request_pdu: bytes) ->
     assert (answer[0], len(answer)) == (request_pdu[0] | 0x80, 2)
     assert refusing.counters.never_recorded == 1
     silent = ExchangeReplay([ok(read(0), reply(1))], never_recorded=NeverRecorded.SILENCE)
-    assert silent.respond(1, request_pdu) == Answer(None)
+    assert silent.respond(1, request_pdu) == ReplayedReply(None)
 
 
 @given(

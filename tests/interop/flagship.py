@@ -27,7 +27,7 @@ from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
@@ -193,7 +193,7 @@ class Script:
         async def request() -> None:
             await what()
 
-        bus.submit(Job(driver, request, done.set_result))
+        bus.submit(BusJob(driver, request, done.set_result))
         error = await done
         self.run.refused[name] = "" if error is None else f"{type(error).__name__}: {error.message}"
 

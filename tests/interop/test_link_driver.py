@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import SensorDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.site.system import load_system
@@ -63,7 +63,7 @@ async def sample_twice(port: Path) -> list[bytes]:
     async def command(period_s: int) -> None:
         done: asyncio.Future[FieldtwinError | None] = asyncio.get_running_loop().create_future()
         driver.consumer.observe(driver.command("sample_period_s", period_s))
-        line.submit(Job(driver, driver.send, done.set_result))
+        line.submit(BusJob(driver, driver.send, done.set_result))
         assert await done is None
 
     async with Nursery() as nursery:

@@ -21,7 +21,7 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -43,7 +43,9 @@ SPOKEN = [
 
 
 def make_unit() -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 200), Span("input", 0, 125), Span("coil", 0, 32), Span("discrete", 0, 16)])
+    bank = MapBank(
+        [CellSpan("holding", 0, 200), CellSpan("input", 0, 125), CellSpan("coil", 0, 32), CellSpan("discrete", 0, 16)]
+    )
     bank.poke("input", 0, *INPUTS)
     bank.poke("discrete", 0, *DISCRETE)
     return ModbusUnit(bank)

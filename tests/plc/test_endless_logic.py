@@ -19,7 +19,7 @@ from fieldtwin.plc.binding import image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
 from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
 from fieldtwin.plc.prove import Proof, prove
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.st.resource import MAX_STEPS
 from fieldtwin.plc.task import StopReason
 from fieldtwin.testing.worker.stepped_program import SteppedProgram
@@ -45,7 +45,7 @@ def test_a_loop_without_an_end_stops_the_plc_and_names_file_and_line(tmp_path: P
     image.writer(INPUTS).publish([], 0)
     now = [0]
     plc = PlcConfig("", layout.describe(), "", (config,), python_path=(str(tmp_path),), max_restarts=0)
-    runner = Runner(plc, image, lambda: now[0])  # no wall clock and no timer signal, as in virtual time
+    runner = TaskRunner(plc, image, lambda: now[0])  # no wall clock and no timer signal, as in virtual time
     runner.start()
     now[0] = runner.deadline_ns
     runner.run_once()

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import Bug
 from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.statemachine import STATE_CODES, encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
-from fieldtwin.plc.program import Place, ScanInfo
+from fieldtwin.plc.program import ScanInfo, SourceLine
 from fieldtwin.plc.relay import LOG_CAPACITY, QUEUE_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
 
 PERIODS = st.integers(-32768, 32767)
@@ -193,5 +193,5 @@ def test_log_entries_that_were_not_taken_in_time_are_counted() -> None:
 
 def test_the_line_of_an_imported_program_does_not_depend_on_where_it_is_installed() -> None:
     """Defect: the trace of a seed held an absolute path, so it was another one in another folder."""
-    place = str(Place(code=Relay.execute.__code__))
+    place = str(SourceLine(code=Relay.execute.__code__))
     assert re.fullmatch(r"fieldtwin/plc/relay\.py:[0-9]+", place)

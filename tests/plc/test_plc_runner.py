@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.task import StopReason
 
 MS = 1_000_000
@@ -73,7 +73,7 @@ class Rig:
             retain_path=str(folder / "retain"), **more,  # type: ignore[arg-type]
         )  # fmt: skip
         self.feed()
-        self.runner = Runner(self.config, image, lambda: self.now_ns)
+        self.runner = TaskRunner(self.config, image, lambda: self.now_ns)
         self.space = __import__(self.module)
         self.space.RAN.clear()
 
@@ -260,7 +260,7 @@ def test_a_program_reads_another_programs_variable(tmp_path: Path) -> None:
     image = layout.attach(memory)
     image.writer(INPUTS).publish([], 0)
     now = [0]
-    runner = Runner(PlcConfig("", layout.describe(), "", programs), image, lambda: now[0])
+    runner = TaskRunner(PlcConfig("", layout.describe(), "", programs), image, lambda: now[0])
     runner.start()
     for _ in range(3):
         now[0] = runner.deadline_ns

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.start import InputsMissing, StartPolicy
 from fieldtwin.plc.task import StopReason
 
@@ -111,7 +111,7 @@ class Rig:
         self.config = PlcConfig(
             "", layout.describe(), "", made, python_path=(str(folder),), tasks=tasks, retain_path=str(folder / "retain"), **more
         )  # fmt: skip
-        self.runner = Runner(self.config, self.image, lambda: self.now_ns)
+        self.runner = TaskRunner(self.config, self.image, lambda: self.now_ns)
         self.runner.start()
 
     def good(self, tag: str, value: Scalar, quality: Quality = Quality.GOOD) -> None:

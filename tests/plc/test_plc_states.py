@@ -16,7 +16,7 @@ from fieldtwin.plc.diagram import svg
 from fieldtwin.plc.program import ScanInfo, var_input, var_local, var_output
 from fieldtwin.plc.prove import Proof, machine_key, prove
 from fieldtwin.plc.relay import Relay
-from fieldtwin.plc.relay_proof import PROOF, Watched
+from fieldtwin.plc.relay_proof import PROOF, RelayWithHistory
 from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
 
 MS = 1_000_000
@@ -230,13 +230,13 @@ def test_the_relay_is_proved() -> None:
     assert prove(PROOF).proved
 
 
-class LogsTooMuch(Watched):
+class LogsTooMuch(RelayWithHistory):
     def execute(self, scan: ScanInfo) -> None:
         super().execute(scan)
         self.logged += 1
 
 
-class Forgets(Watched):
+class Forgets(RelayWithHistory):
     def execute(self, scan: ScanInfo) -> None:
         super().execute(scan)
         if len(self._outgoing.queue) == 2:
@@ -250,7 +250,7 @@ class Forgets(Watched):
         (Forgets, "every response leaves, waits or is"),
     ],
 )
-def test_a_wrong_relay_is_detected(broken: type[Watched], invariant: str) -> None:
+def test_a_wrong_relay_is_detected(broken: type[RelayWithHistory], invariant: str) -> None:
     result = prove(replace(PROOF, make=broken))
     assert result.broken.startswith(invariant)
     assert result.way

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.acts import Acts
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
 from fieldtwin.plc.tag_view import TagView, matches
 
@@ -52,7 +52,7 @@ class Rig:
         self.writer = self.image.writer(INPUTS)
         self.now_ns = 0
         config = PlcConfig("", layout.describe(), "", (program,), python_path=(str(folder),))
-        self.runner = Runner(config, self.image, lambda: self.now_ns)
+        self.runner = TaskRunner(config, self.image, lambda: self.now_ns)
         self.view = TagView(self.image, self.runner)
         self.runner.start()
 

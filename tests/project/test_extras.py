@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.capture.recordings.exporting import Column, _write_parquet
+from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
 from fieldtwin.commissioning.access.plotting import check_plot
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.store.knowledge import open_knowledge
@@ -41,7 +41,7 @@ def use_plot(folder: Path) -> None:
 
 
 def use_parquet(folder: Path) -> None:
-    _write_parquet(folder / "x.parquet", [Column("t", float)], iter([(1.0,)]))
+    _write_parquet(folder / "x.parquet", [TableColumn("t", float)], iter([(1.0,)]))
 
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {

@@ -18,7 +18,7 @@ from fieldtwin.reports.junit import render_junit, write_junit
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.reports.run.vcd import write_vcd
 from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 
 FAILED = CheckResult("4", "pressure <good>", Verdict.FAILED, 13_300 * MS, expected="good", got="bad", where="a.yaml:31")
 SKIPPED = CheckResult("5", "set a value", Verdict.SKIPPED, reason="target compose cannot set_value")
@@ -146,9 +146,10 @@ def test_a_run_as_waveforms(tmp_path: Path) -> None:
 
 def test_names_that_no_viewer_takes(tmp_path: Path) -> None:
     events = [
-        note(0, Kind.TAG, "a b.c-d", value=1, quality="good"), note(0, Kind.TAG, "a b.c+d", value=2, quality="good"),
-        note(1, Kind.TAG, "a b.c-d", value="off", quality="bad"), note(2, Kind.TAG, "ü.x", value=float("nan"), quality="bad"),
-        note(3, Kind.TAG, "ü.y", value=True, quality="uncertain"), note(4, Kind.TAG, "ü.z", value="", quality="good"),
+        note(0, TraceKind.TAG, "a b.c-d", value=1, quality="good"), note(0, TraceKind.TAG, "a b.c+d", value=2, quality="good"),
+        note(1, TraceKind.TAG, "a b.c-d", value="off", quality="bad"),
+        note(2, TraceKind.TAG, "ü.x", value=float("nan"), quality="bad"),
+        note(3, TraceKind.TAG, "ü.y", value=True, quality="uncertain"), note(4, TraceKind.TAG, "ü.z", value="", quality="good"),
     ]  # fmt: skip
     write_vcd(tmp_path / "a.vcd", events)
     found = read_vcd(tmp_path / "a.vcd")
@@ -161,7 +162,8 @@ def test_names_that_no_viewer_takes(tmp_path: Path) -> None:
 def test_a_text_does_not_meet_the_quality_of_another_tag(tmp_path: Path) -> None:
     """A tag may have the name under which the quality of another one stands."""
     events = [
-        note(1, Kind.TAG, "a.b", value=1.5, quality="good"), note(2, Kind.TAG, "a.b_quality", value="fine", quality="bad"),
+        note(1, TraceKind.TAG, "a.b", value=1.5, quality="good"),
+        note(2, TraceKind.TAG, "a.b_quality", value="fine", quality="bad"),
     ]  # fmt: skip
     write_vcd(tmp_path / "a.vcd", events)
     found = read_vcd(tmp_path / "a.vcd")
@@ -169,15 +171,15 @@ def test_a_text_does_not_meet_the_quality_of_another_tag(tmp_path: Path) -> None
     assert [word(v) for _, v in found["a.b_quality_2"]] == ["x", "fine"]
 
 
-KINDS = st.sampled_from(list(Kind))
+KINDS = st.sampled_from(list(TraceKind))
 VALUES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=60))
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**9), KINDS, st.text(max_size=6), VALUES), max_size=10))
 @settings(max_examples=40)
-def test_any_events_make_a_file_that_can_be_read(rows: list[tuple[int, Kind, str, object]]) -> None:
+def test_any_events_make_a_file_that_can_be_read(rows: list[tuple[int, TraceKind, str, object]]) -> None:
     events = [
-        Event(t, kind, where, {"value": value, "on": bool(value), "bytes": "00"}) for t, kind, where, value in rows
+        TraceEvent(t, kind, where, {"value": value, "on": bool(value), "bytes": "00"}) for t, kind, where, value in rows
     ]
     with TemporaryDirectory() as folder:
         write_vcd(Path(folder) / "a.vcd", events, observatory())

@@ -22,8 +22,8 @@ from fieldtwin.reports.run.html import BUDGET, render_html, write_html
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.reports.run.requirements import requirement_verdicts
 from fieldtwin.reports.run.window import LONGEST_NS, MOST_EXCHANGES, MOST_FRAMES, MOST_STEPS, Study
-from fieldtwin.results.model import CheckResult, Counts, Report, ScenarioResult, Verdict
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioResult, Verdict
+from fieldtwin.results.trace import TraceEvent, TraceKind
 
 EVIL = "<script>alert(1)</script>\" onload='x' & \u202e\x00"
 TRACE = run_trace(20)
@@ -125,9 +125,9 @@ def test_coverage_lists_missing_items() -> None:
 def test_names_out_of_files_stay_names() -> None:
     check = replace(FAILED, text=EVIL, got=EVIL, names=(EVIL,), number=EVIL, where=EVIL)
     events = [
-        *TRACE, note(13_000, Kind.TAG, f"ctd.{EVIL}", value=EVIL, quality=EVIL, reason=EVIL),
-        note(13_000, Kind.STATE, EVIL, value=EVIL), note(13_000, Kind.FAULT, EVIL, name=EVIL, on=True, target=EVIL),
-        note(13_000, Kind.FRAME, EVIL, bytes="00", dir=EVIL), note(13_000, Kind.FRAME, "can0", id=EVIL, bytes="00"),
+        *TRACE, note(13_000, TraceKind.TAG, f"ctd.{EVIL}", value=EVIL, quality=EVIL, reason=EVIL),
+        note(13_000, TraceKind.STATE, EVIL, value=EVIL), note(13_000, TraceKind.FAULT, EVIL, name=EVIL, on=True, target=EVIL),
+        note(13_000, TraceKind.FRAME, EVIL, bytes="00", dir=EVIL), note(13_000, TraceKind.FRAME, "can0", id=EVIL, bytes="00"),
     ]  # fmt: skip
     events.sort(key=lambda e: e.t_ns)
     evil = scenario(
@@ -173,7 +173,7 @@ def test_losses_of_a_full_trace_are_reported() -> None:
 
 def test_five_hundred_failures_are_listed_and_few_are_drawn() -> None:
     short = [e for e in TRACE if 12_000 * MS <= e.t_ns <= 13_600 * MS]
-    counts = Counts()
+    counts = AccessCounts()
     many = [scenario(seed=n, trace=short, counts=counts, name=f"{'long' * 60} {n}") for n in range(500)]
     html = render_html(report(*many))
     assert len(html) < BUDGET
@@ -184,11 +184,11 @@ def test_five_hundred_failures_are_listed_and_few_are_drawn() -> None:
 
 def test_many_events_give_a_small_file() -> None:
     """A window with the maximum content: each lane, mark and row is bounded."""
-    crowd: list[Event] = []
+    crowd: list[TraceEvent] = []
     for n in range(6000):
         at = 12_200 + n / 4
         crowd.append(can(at, "185#9E013500"))
-        crowd.append(note(at, Kind.TAG, f"ctd.t{n % 40}", value=n % 97 / 7, quality="good", reason="none"))
+        crowd.append(note(at, TraceKind.TAG, f"ctd.t{n % 40}", value=n % 97 / 7, quality="good", reason="none"))
     html = render_html(report(scenario(trace=crowd)))
     assert html.count("<svg") == 1
     assert len(html) < 700_000
@@ -213,7 +213,7 @@ def test_counts_of_a_listener_count_more_than_the_trace() -> None:
         ("relay.state", "STANDBY", "ACTIVE"): 1, ("relay.state", "ACTIVE", "OFF"): 1, ("relay.state", "OFF", "STANDBY"): 1,
     }  # fmt: skip
     assert counts.pairs == {("drop", "relay.state", "ACTIVE"): 1}
-    twice = Counts()
+    twice = AccessCounts()
     twice.add(counts)
     twice.add(counts)
     assert twice.problems["ctd", "no reply"] == 12
@@ -261,11 +261,11 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
 
 def test_a_thinned_drawing_still_reaches_the_failure() -> None:
     """However much happens in a window, its end is drawn, because the failure is there."""
-    crowd: list[Event] = []
+    crowd: list[TraceEvent] = []
     for n in range(5000):
         at = 12_200 + n / 5
         crowd.append(can(at, "185#9E013500"))
-        crowd.append(note(at, Kind.TAG, "ctd.pressure", value=n % 97 / 7, quality="bad" if n == 77 else "good"))
+        crowd.append(note(at, TraceKind.TAG, "ctd.pressure", value=n % 97 / 7, quality="bad" if n == 77 else "good"))
     (window,) = Study(report(), scenario(trace=crowd)).run([FAILED])[1]
     assert window.thinned == {"can0", "ctd.pressure"}
     for kept, most in ((window.exchanges, MOST_EXCHANGES), (window.tags["ctd.pressure"], MOST_STEPS)):
@@ -284,7 +284,7 @@ def test_secrets_are_not_in_the_page() -> None:
     profile = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml")
     system = replace(observatory(), devices={"meter": DeviceConfig("meter", profile, "line1", 1)})
     events = [ask(13_000, "10 000E 0002 04 447A0000"), answer(13_050, "10 000E 0002")]
-    events.append(note(13_060, Kind.TAG, "meter.password", value=1000.5, quality="good", reason="none"))
+    events.append(note(13_060, TraceKind.TAG, "meter.password", value=1000.5, quality="good", reason="none"))
     html = render_html(report(scenario(trace=events), system=system))
     assert "password (secret)" in html
     assert "1000.5" not in html

@@ -14,7 +14,7 @@ from support import eventually
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
@@ -40,7 +40,7 @@ WRITERS = Policy((AllowRule(functions=READ_FUNCTIONS | WRITE_FUNCTIONS),), allow
 
 
 def a_unit(first: int) -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 64), Span("coil", 0, 16)])
+    bank = MapBank([CellSpan("holding", 0, 64), CellSpan("coil", 0, 16)])
     bank.poke("holding", 0, *(first + i for i in range(64)))
     return ModbusUnit(bank, server_id=b"unit %d" % first)
 

@@ -11,7 +11,7 @@ from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.bus_runner import BusRunner
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
@@ -30,7 +30,7 @@ def loop() -> VirtualLoop:
     return running
 
 
-def bank(spans: Iterable[Span], words: dict[str, dict[int, Sequence[int]]] | None = None) -> MapBank:
+def bank(spans: Iterable[CellSpan], words: dict[str, dict[int, Sequence[int]]] | None = None) -> MapBank:
     """A bank with these values: table -> address -> words from there on."""
     made = MapBank(spans)
     for table, blocks in (words or {}).items():

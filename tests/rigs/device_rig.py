@@ -6,22 +6,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from fieldtwin.testing.handles import Device
-from fieldtwin.testing.runner import Runner
+from fieldtwin.testing.handles import DeviceHandle
+from fieldtwin.testing.runner import WorkerProcess
 
 
 @contextmanager
-def started_runner() -> Iterator[Runner]:
+def started_runner() -> Iterator[WorkerProcess]:
     """Yield a runner whose threads run already, so that the thread check of a test does not report them."""
-    runner = Runner()
+    runner = WorkerProcess()
     runner.call("hello")
     yield runner
     runner.close()
 
 
 @contextmanager
-def emulated(runner: Runner, profile: str, **asked: Any) -> Iterator[Device]:
+def emulated(runner: WorkerProcess, profile: str, **asked: Any) -> Iterator[DeviceHandle]:
     """Yield an emulated device of `profile`; `asked` has the other arguments of the runner's call `device`."""
     answer = runner.call("device", device=profile, **asked)
-    yield Device(runner, answer["id"], "device", answer)
+    yield DeviceHandle(runner, answer["id"], "device", answer)
     runner.call("end", id=answer["id"])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.run.template import ForeignParts
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.pack import TemplateExtras, collect, pack
 from fieldtwin.twin.template.package import open_package, unpack
 from fieldtwin.twin.template.template import Manifest
 
@@ -61,7 +61,7 @@ def with_python(path: Path, marker: Path) -> None:
     (path.parent / "site_logic.py").write_text(BLINKER.replace("Output, ", ""))
 
 
-def packed(system: Path, target: Path, extras: Extras = Extras()) -> Manifest:  # noqa: B008
+def packed(system: Path, target: Path, extras: TemplateExtras = TemplateExtras()) -> Manifest:  # noqa: B008
     loaded = load_system(str(system))
     return pack(loaded, collect(loaded, (), system.with_name(f"{system.stem}.prototype.yaml")), extras, "9.9", target)
 

@@ -17,7 +17,7 @@ from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.line import LineSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.connections.line_counters import UartCounters
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import EndpointBusy
@@ -99,7 +99,7 @@ class UartLine:
     damage: Callable[[int, bytes], bytes] = lambda n, reply: reply
     opened: list[SerialSettings] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
-    counters: LineCounters = LineCounters()  # noqa: RUF009  frozen
+    counters: UartCounters = UartCounters()  # noqa: RUF009  frozen
 
     def __post_init__(self) -> None:
         self._slave: LineSlave = (AsciiSlave if self.ascii else RtuSlave)(self.devices)
@@ -170,7 +170,7 @@ class _Port(VirtualWire):
 
 
 class _CountingPort(_Port):
-    def counters(self) -> LineCounters | None:
+    def counters(self) -> UartCounters | None:
         return self._line.counters
 
     def control_lines(self) -> dict[str, bool]:

@@ -7,17 +7,18 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.results.trace import Event, Kind, Trace, read_trace
+from fieldtwin.results.trace import Trace, TraceEvent, TraceKind, read_trace
 
 
-def some(count: int) -> list[Event]:
-    kinds = list(Kind)
+def some(count: int) -> list[TraceEvent]:
+    kinds = list(TraceKind)
     return [
-        Event(n * 1000, kinds[n % len(kinds)], f"w{n}", {"value": n / 3, "a": None, "Z": "ä"}) for n in range(count)
+        TraceEvent(n * 1000, kinds[n % len(kinds)], f"w{n}", {"value": n / 3, "a": None, "Z": "ä"})
+        for n in range(count)
     ]
 
 
-def line(event: Event) -> bytes:
+def line(event: TraceEvent) -> bytes:
     said = [event.t_ns, event.kind.value, event.where, event.data]
     text = json.dumps(said, separators=(",", ":"), ensure_ascii=False)
     assert text.endswith(',"a":null,"Z":"ä"}]')
@@ -66,11 +67,11 @@ def test_pending_events_are_in_the_sink_after_closing() -> None:
 
 def test_memory_is_bounded_whatever_an_event_holds() -> None:
     trace = Trace(5)
-    trace.note(0, Kind.NOTE, "a bug of ours", {"text": object()})
+    trace.note(0, TraceKind.NOTE, "a bug of ours", {"text": object()})
     for event in some(254):
         trace.note(*event)
     with pytest.raises(TypeError):
-        trace.note(0, Kind.NOTE, "the end of its block", {})
+        trace.note(0, TraceKind.NOTE, "the end of its block", {})
     for event in some(5000):  # reported once, and no block grows without bound afterwards
         trace.note(*event)
     assert len(trace.events) == 5
@@ -80,12 +81,12 @@ def test_memory_is_bounded_whatever_an_event_holds() -> None:
 def test_listeners_hear_their_kinds_in_the_order_of_asking() -> None:
     heard: list[tuple[str, Any]] = []
     trace = Trace()
-    trace.listen(lambda e: heard.append(("states", e.where)), Kind.STATE)
+    trace.listen(lambda e: heard.append(("states", e.where)), TraceKind.STATE)
     trace.listen(lambda e: heard.append(("all", e.where)))
-    trace.listen(lambda e: heard.append(("states and steps", e.where)), Kind.STEP, Kind.STATE)
-    trace.note(1, Kind.STATE, "a", {})
-    trace.note(2, Kind.FRAME, "b", {})
-    trace.note(3, Kind.STEP, "c", {})
+    trace.listen(lambda e: heard.append(("states and steps", e.where)), TraceKind.STEP, TraceKind.STATE)
+    trace.note(1, TraceKind.STATE, "a", {})
+    trace.note(2, TraceKind.FRAME, "b", {})
+    trace.note(3, TraceKind.STEP, "c", {})
     assert heard == [
         ("states", "a"), ("all", "a"), ("states and steps", "a"), ("all", "b"), ("all", "c"), ("states and steps", "c"),
     ]  # fmt: skip

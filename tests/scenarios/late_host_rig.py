@@ -8,7 +8,7 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.results.model import ScenarioResult
 from fieldtwin.results.trace import Trace
 from fieldtwin.run.benches.virtual_bench import VirtualBench
-from fieldtwin.scenarios.judging.runner import Runner
+from fieldtwin.scenarios.judging.runner import ScenarioRunner
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.prototype.file import load_prototype
 
@@ -25,7 +25,7 @@ def judged_on(bench_type: type[VirtualBench], folder: Path, text: str) -> Scenar
     async def main() -> ScenarioResult:
         prototype = load_prototype(scenario.system, None)
         async with bench_type(scenario.system, prototype, loop, folder, Trace()) as bench:
-            return await Runner(scenario, bench).run()
+            return await ScenarioRunner(scenario, bench).run()
 
     try:
         return loop.run_until_complete(main())

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 FILES = {
@@ -76,7 +76,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("target", ["virtual", "local"])
 def test_a_scenario_fails_and_names_file_line_and_exception(folder: Path, target: str) -> None:
-    result = run_scenario(load_scenario(folder / "low.scenario.yaml"), Target(target))
+    result = run_scenario(load_scenario(folder / "low.scenario.yaml"), ScenarioTarget(target))
     assert result.verdict is Verdict.ERROR, result
     assert "pond.py:Pond" in result.reason
     assert "in line 7: ValueError: no pond" in result.reason

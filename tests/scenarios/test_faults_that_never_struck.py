@@ -18,7 +18,7 @@ from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.reports.junit import write_junit
 from fieldtwin.reports.run.html import write_html
 from fieldtwin.results.model import Report, ScenarioResult, Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 GOOD = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 10s}\n"
@@ -32,7 +32,7 @@ def written(folder: Path, steps: str) -> Path:
 
 
 def run(folder: Path, steps: str, target: str = "virtual") -> ScenarioResult:
-    return run_scenario(load_scenario(written(folder, steps)), Target(target))
+    return run_scenario(load_scenario(written(folder, steps)), ScenarioTarget(target))
 
 
 def fault(said: str) -> str:

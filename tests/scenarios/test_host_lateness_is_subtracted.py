@@ -20,7 +20,7 @@ from fieldtwin.results.model import Report, ScenarioResult, Verdict
 from fieldtwin.run.benches.host_lateness import HostLateness
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.targets import scenario_targets
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.language.form import load_scenario
 
@@ -147,7 +147,7 @@ def test_only_inconclusive_attempts_are_repeated(
     path = tmp_path / "x.scenario.yaml"
     path.write_text(HEAD + "steps:\n  - pause: 1s\n")
     left = attempts_of(monkeypatch, ends)
-    result = run_scenario(load_scenario(path), Target(target), retries=retries)
+    result = run_scenario(load_scenario(path), ScenarioTarget(target), retries=retries)
     assert result.verdict is verdict
     assert result.attempts == attempts == len(ends) - len(left)
     assert result.earlier == ("step 1: too late",) * (attempts - 1)

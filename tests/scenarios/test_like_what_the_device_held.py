@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.judging.expectation import held_since
 from fieldtwin.scenarios.language.form import load_scenario
 
@@ -45,5 +45,5 @@ def test_a_sampling_sensor_equals_its_held_value_at_any_delay(tmp_path: Path, se
     path = tmp_path / "x.scenario.yaml"
     fault = f"fault: {{name: delay, device: ctd, by_ms: {by_ms}.0}}" if by_ms else "pause: 1s"
     path.write_text(SCENARIO.replace("SEED", str(seed)).replace("FAULT", fault))
-    result = run_scenario(load_scenario(path), Target())
+    result = run_scenario(load_scenario(path), ScenarioTarget())
     assert result.verdict is Verdict.PASSED, result.checks[-1]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 PROFILE = """device: own/heater
@@ -58,6 +58,6 @@ def test_an_output_that_is_refused_in_the_first_scan_is_detected(tmp_path: Path,
     (tmp_path / "heat.prototype.yaml").write_text(PROTOTYPE)
     (tmp_path / "ctl.st").write_text(PROGRAM.replace("SPEED", speed))
     (tmp_path / "warm.scenario.yaml").write_text(SCENARIO)
-    result = run_scenario(load_scenario(tmp_path / "warm.scenario.yaml"), Target("virtual"))
+    result = run_scenario(load_scenario(tmp_path / "warm.scenario.yaml"), ScenarioTarget("virtual"))
     assert result.verdict is verdict, result.reason
     assert ("heater.speed = 60 did not reach the device" in result.reason) is (verdict is Verdict.FAILED)

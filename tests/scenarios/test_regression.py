@@ -14,44 +14,44 @@ from hypothesis import strategies as st
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
-from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
+from fieldtwin.scenarios.regression.as_scenario import ScenarioOptions, as_scenario
 from fieldtwin.scenarios.regression.comparing import Allowed, RunComparison, compare
-from fieldtwin.scenarios.regression.run_history import Story, story_of
+from fieldtwin.scenarios.regression.run_history import RunHistory, run_history
 from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory")
 S = 1_000_000_000
 
 
-def tag(t_s: float, name: str, value: Any, quality: str = "good") -> Event:
-    return Event(round(t_s * S), Kind.TAG, name, {"value": value, "quality": quality, "reason": "none"})
+def tag(t_s: float, name: str, value: Any, quality: str = "good") -> TraceEvent:
+    return TraceEvent(round(t_s * S), TraceKind.TAG, name, {"value": value, "quality": quality, "reason": "none"})
 
 
-def state(t_s: float, name: str, value: Any) -> Event:
-    return Event(round(t_s * S), Kind.STATE, name, {"value": value})
+def state(t_s: float, name: str, value: Any) -> TraceEvent:
+    return TraceEvent(round(t_s * S), TraceKind.STATE, name, {"value": value})
 
 
-def asked(t_s: float, latency_s: float = 0.01, answered: bool = True) -> list[Event]:
+def asked(t_s: float, latency_s: float = 0.01, answered: bool = True) -> list[TraceEvent]:
     """The CTD is asked for its period (holding register 40002), and answers 0."""
     request, reply = "010300010001d5ca", "0103020000b844"
-    events = [Event(round(t_s * S), Kind.FRAME, "line1", {"dir": "sent", "bytes": request})]
+    events = [TraceEvent(round(t_s * S), TraceKind.FRAME, "line1", {"dir": "sent", "bytes": request})]
     if answered:
         at_ns = round((t_s + latency_s) * S)
-        events.append(Event(at_ns, Kind.FRAME, "line1", {"dir": "received", "bytes": reply}))
+        events.append(TraceEvent(at_ns, TraceKind.FRAME, "line1", {"dir": "received", "bytes": reply}))
     return events
 
 
 END = [tag(100.0, "modem.link_state", 1)]
 
 
-def told(events: Iterable[Event]) -> Story:
-    return story_of(SYSTEM, sorted([*events, *END], key=lambda e: e.t_ns))
+def told(events: Iterable[TraceEvent]) -> RunHistory:
+    return run_history(SYSTEM, sorted([*events, *END], key=lambda e: e.t_ns))
 
 
-def judge(old: list[Event], new: list[Event], allowed: Allowed | None = None) -> RunComparison:
+def judge(old: list[TraceEvent], new: list[TraceEvent], allowed: Allowed | None = None) -> RunComparison:
     return compare(told(old), told(new), allowed)
 
 
@@ -81,7 +81,7 @@ def test_irrelevant_times_and_bytes_are_not_a_difference() -> None:
         ([], [("field", "relay.state")]),
     ],
 )
-def test_states_are_the_same_in_the_same_order_and_in_time(new: list[Event], found: list[tuple[str, str]]) -> None:
+def test_states_are_the_same_in_the_same_order_and_in_time(new: list[TraceEvent], found: list[tuple[str, str]]) -> None:
     assert kinds(judge(RELAY, new)) == found
 
 
@@ -95,7 +95,7 @@ def test_states_are_the_same_in_the_same_order_and_in_time(new: list[Event], fou
         ([tag(5, "ctd.pressure", float("nan"))], "value"),
     ],
 )
-def test_values_and_qualities_are_the_same_all_the_time(new: list[Event], found: str) -> None:
+def test_values_and_qualities_are_the_same_all_the_time(new: list[TraceEvent], found: str) -> None:
     assert kinds(judge([tag(5, "ctd.pressure", 10.0)], new)) == [(found, "ctd.pressure")]
     assert kinds(judge(new, [tag(5, "ctd.pressure", 10.0)])) == [(found, "ctd.pressure")]
 
@@ -128,13 +128,13 @@ def test_requests_without_an_answer_are_new() -> None:
 
 
 def test_a_capture_has_values_and_latencies_but_no_states() -> None:
-    story = story_of(SYSTEM, asked(5))
+    story = run_history(SYSTEM, asked(5))
     assert [(c.value, c.quality) for c in story.tags["ctd.sample_period_s"]] == [(0, "")]
     assert story.latency_ns == {("ctd", "read holding registers"): [10_000_000]}
 
 
 def test_of_nothing_nothing_is_known() -> None:
-    assert not compare(Story(), Story()).same
+    assert not compare(RunHistory(), RunHistory()).same
 
 
 @given(
@@ -149,7 +149,7 @@ def test_a_run_is_the_same_as_itself(changes: list[tuple[int, float | None, str]
 
 def test_a_scenario_takes_something_to_expect() -> None:
     with pytest.raises(UsageError, match="this run has nothing to expect"):
-        as_scenario(SYSTEM, Story(), Wanted("x", "observatory"))
+        as_scenario(SYSTEM, RunHistory(), ScenarioOptions("x", "observatory"))
 
 
 def test_a_virtual_run_becomes_a_scenario_that_passes_and_sees_a_change(tmp_path: Path) -> None:
@@ -184,9 +184,9 @@ def test_a_virtual_run_becomes_a_scenario_that_passes_and_sees_a_change(tmp_path
 
 def test_runs_without_anything_in_common_are_not_the_same() -> None:
     """Defect: an empty trace was "the same" as any older one, with all fields of that counted as compared."""
-    old = story_of(SYSTEM, [*RELAY, *asked(5.0), tag(6.0, "ctd.pressure", 1.0)])
-    for new in ([], [Event(0, Kind.NOTE, "start", {"text": "x"})]):
-        verdict = compare(old, story_of(SYSTEM, new))
+    old = run_history(SYSTEM, [*RELAY, *asked(5.0), tag(6.0, "ctd.pressure", 1.0)])
+    for new in ([], [TraceEvent(0, TraceKind.NOTE, "start", {"text": "x"})]):
+        verdict = compare(old, run_history(SYSTEM, new))
         assert not verdict.same
         assert verdict.compared == 0
     assert (verdict.common_s, verdict.old_s) == (0.0, 50.0)

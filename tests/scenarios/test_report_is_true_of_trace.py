@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from fieldtwin.capture.decoding.decoder import exchanges
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
-from fieldtwin.results.trace import Event, Kind
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.results.trace import TraceEvent, TraceKind
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
@@ -91,13 +91,15 @@ RULES = st.lists(
 class Past:
     """Return the values known at each time, from the trace alone."""
 
-    def __init__(self, scenario: Scenario, trace: Sequence[Event]) -> None:
+    def __init__(self, scenario: Scenario, trace: Sequence[TraceEvent]) -> None:
         self.scenario = scenario
         self.trace = trace
 
-    def of(self, name: str, kinds: tuple[Kind, ...] = (Kind.TAG, Kind.STATE), until_s: float = 1e9) -> list[Event]:
+    def of(
+        self, name: str, kinds: tuple[TraceKind, ...] = (TraceKind.TAG, TraceKind.STATE), until_s: float = 1e9
+    ) -> list[TraceEvent]:
         device = name.partition(".")[0] in self.scenario.system.devices
-        kinds = tuple(kind for kind in kinds if kind is (Kind.TAG if device else Kind.STATE))
+        kinds = tuple(kind for kind in kinds if kind is (TraceKind.TAG if device else TraceKind.STATE))
         return [e for e in self.trace if e.kind in kinds and e.where == name and e.t_ns <= round(until_s * NS)]
 
     def look(self, at_s: float) -> Any:
@@ -170,12 +172,12 @@ def check_rule(past: Past, check: CheckResult) -> None:
 
 def check_step(past: Past, result: ScenarioResult, check: CheckResult) -> None:
     """A failed step was due: it began after the previous one, and the trace has its start and its verdict."""
-    marks = [e for e in past.trace if e.kind is Kind.STEP and e.where == check.number]
+    marks = [e for e in past.trace if e.kind is TraceKind.STEP and e.where == check.number]
     assert [e.t_ns for e in marks] == [check.since_ns, check.t_ns]
     assert marks[-1].data["verdict"] == check.verdict.value
     expect = past.scenario.form.steps[int(check.number) - 1].expect
     if check.verdict is Verdict.FAILED and expect is not None and expect.times is not None:
-        begun = [e.t_ns for e in past.trace if e.kind is Kind.STEP and "verdict" not in e.data]
+        begun = [e.t_ns for e in past.trace if e.kind is TraceKind.STEP and "verdict" not in e.data]
         words = ("send", "set", "fault", "clear")
         stimuli = [
             t for t, s in zip(begun, past.scenario.form.steps, strict=False) if any(getattr(s, w) for w in words)
@@ -263,7 +265,7 @@ def test_an_unreachable_probe_is_reported_with_its_endpoint_and_error(
         "probes:\n  far: {endpoint: 'tcp://127.0.0.1:1', registers: {running: {at: 40001}}}\n"
         "steps:\n  - wait: {until: 'far.running == 1', within: 2s}\n"
     )
-    result = run_scenario(load_scenario(written(tmp_path, text)), Target("local"))
+    result = run_scenario(load_scenario(written(tmp_path, text)), ScenarioTarget("local"))
     assert result.verdict in (Verdict.FAILED, Verdict.INCONCLUSIVE)
     got = result.checks[-1].got
     assert "the probe far at tcp://127.0.0.1:1: " in got

@@ -16,7 +16,7 @@ from tank_plant import DIVIDES_BY_ZERO, PLANT, PROTOTYPE, write_plant
 from fieldtwin.reports.junit import write_junit
 from fieldtwin.reports.run.html import write_html
 from fieldtwin.results.model import Report, ScenarioResult, Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 WELL = DIVIDES_BY_ZERO.replace("3 / zero > 3", "FALSE AND zero > level")
@@ -46,7 +46,7 @@ def plant(folder: Path, logic: str, steps: str, head: str = "") -> Path:
 
 
 def run(path: Path, target: str = "virtual") -> ScenarioResult:
-    return run_scenario(load_scenario(path), Target(target))
+    return run_scenario(load_scenario(path), ScenarioTarget(target))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n"
@@ -19,7 +19,7 @@ ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 
 def run(folder: Path, system: str, steps: str) -> ScenarioResult:
     path = folder / "x.scenario.yaml"
     path.write_text(f"scenario: a test\nsystem: {system}\nsteps:\n{steps}")
-    return run_scenario(load_scenario(path), Target())
+    return run_scenario(load_scenario(path), ScenarioTarget())
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_an_object_that_no_simulation_feeds_can_be_set_and_given_back(tmp_path: 
     path.write_text(
         f"scenario: a test\nsystem: observatory\nprototype: sea.prototype.yaml\njudge: run\nsteps:\n{steps}"
     )
-    result = run_scenario(load_scenario(path), Target())
+    result = run_scenario(load_scenario(path), ScenarioTarget())
     assert result.verdict is Verdict.PASSED, result.checks[-1]
 
 

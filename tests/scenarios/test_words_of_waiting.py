@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.site.system import load_system
 
@@ -58,7 +58,7 @@ def mooring(folder: Path, start: str = "", if_bad: str = "hold") -> Path:
 def judged(folder: Path, steps: str) -> tuple[Verdict, str, str, str]:
     path = folder / "x.scenario.yaml"
     path.write_text(f"scenario: x\nsystem: mooring.yaml\nsteps:\n{steps}")
-    result = run_scenario(load_scenario(path), Target())
+    result = run_scenario(load_scenario(path), ScenarioTarget())
     check = next(check for check in result.checks if check.verdict is result.verdict)
     return result.verdict, check.expected, check.got, result.reason
 

@@ -15,12 +15,12 @@ from msgspec import structs
 from statuses import changed
 from test_service_metrics import busy_gateway, plc_status, seen
 
-from fieldtwin.service.events import Event, Priority, changes
+from fieldtwin.service.events import Priority, ServiceEvent, changes
 from fieldtwin.service.journal import EventLog, datagram
 from fieldtwin.service.notify import Notifier
 
 
-def names(events: list[Event]) -> list[str]:
+def names(events: list[ServiceEvent]) -> list[str]:
     return [event.name for event in events]
 
 
@@ -70,7 +70,7 @@ def test_a_process_that_ended_is_an_error() -> None:
     ]
 
 
-EVENT = Event(Priority.WARNING, "device_offline", "ctd: no reply", {"device": "ctd", "error": "two\nlines"})
+EVENT = ServiceEvent(Priority.WARNING, "device_offline", "ctd: no reply", {"device": "ctd", "error": "two\nlines"})
 
 
 def test_json_lines() -> None:

@@ -20,7 +20,7 @@ from fieldtwin.gateway.runtime.buses.bus import latency_status
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
-from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
+from fieldtwin.service.metrics import MOST_DEVICES, RunState, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
@@ -95,8 +95,8 @@ def plc_status() -> PlcStatus:
     return PlcStatus(**task, tasks=tasks, restarts=3, forces=forces, counters={"messages_missed": 2})
 
 
-def seen(**changed: Any) -> Snapshot:
-    whole = Snapshot("observatory", "plant", 12.5, busy_gateway(), plc_status(), {"gateway": True, "plc": True}, 0.1)
+def seen(**changed: Any) -> RunState:
+    whole = RunState("observatory", "plant", 12.5, busy_gateway(), plc_status(), {"gateway": True, "plc": True}, 0.1)
     return replace(whole, **changed)
 
 

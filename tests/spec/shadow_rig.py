@@ -6,12 +6,12 @@ from fieldtwin.gateway.core.statemachine import delta
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.twin.model.status import encode_status
-from fieldtwin.twin.model.variables import Variable
+from fieldtwin.twin.model.variables import ModelVariable
 
 DECLARED = (
-    Variable("ctd.pressure", "real", "dbar", (0.0, 100.0)),
-    Variable("ctd.sample_count", "int"),
-    Variable("ctd.sample", "message"),
+    ModelVariable("ctd.pressure", "real", "dbar", (0.0, 100.0)),
+    ModelVariable("ctd.sample_count", "int"),
+    ModelVariable("ctd.sample", "message"),
 )
 NOW_MS = 1_790_000_000_000
 

@@ -39,9 +39,9 @@ from fieldtwin.run.what_if.fork import Fork, answer
 from fieldtwin.run.what_if.last_known import of_period
 from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
-from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.execute import CommandLimits
 from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus
-from fieldtwin.twin.model.mape.plan import Rule, RulePlanner
+from fieldtwin.twin.model.mape.plan import PlanRule, RulePlanner
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd
 from fieldtwin.twin.model.twin import DigitalTwin
@@ -203,7 +203,7 @@ def test_prose_4_a_wire_capture_towards_the_plant_holds_no_command(
 class Twins:
     """A digital twin by rules, and the periods that it commands."""
 
-    def __init__(self, *rules: Rule, bounds: Bounds = Bounds()) -> None:  # noqa: B008
+    def __init__(self, *rules: PlanRule, bounds: CommandLimits = CommandLimits()) -> None:  # noqa: B008
         self.receiving = ReceivingEnd("from the plant")
         self.twin = DigitalTwin(self.receiving, Hands(), RulePlanner(rules), declared=DECLARED, bounds=bounds)
         self._sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
@@ -237,7 +237,7 @@ def test_prose_5_it_reuses_the_physical_twins_event_handlers_and_message_types()
 
 
 def test_prose_6_the_stages_run_one_after_another_and_each_has_the_knowledge(monkeypatch: pytest.MonkeyPatch) -> None:
-    twins = Twins(Rule("outside", "", 1))
+    twins = Twins(PlanRule("outside", "", 1))
     twin, order = twins.twin, []
     for stage, name in (
         (twin.monitor, "handle_state"),
@@ -257,7 +257,7 @@ def test_prose_6_the_stages_run_one_after_another_and_each_has_the_knowledge(mon
 
 
 def test_prose_7_what_the_model_does_not_accept_is_not_sent_and_no_user_steps_in() -> None:
-    twins = Twins(Rule("outside", "", 1), Rule("inside", "", 30), bounds=Bounds(10, 60))
+    twins = Twins(PlanRule("outside", "", 1), PlanRule("inside", "", 30), bounds=CommandLimits(10, 60))
     assert twins.give(status(20), value(150.0)) == []
     assert twins.twin.digital_model.period_s == 20
     assert [e.value for e in twins.twin.execute.collect()] == ["a period of 1 s; allowed are 10 to 60 s"]

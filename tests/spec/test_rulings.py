@@ -25,11 +25,11 @@ from fieldtwin.gateway.core.values import COMMAND, Quality, Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.runtime.gateway import make_driver
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd
-from fieldtwin.twin.model.variables import Variable
+from fieldtwin.twin.model.variables import ModelVariable
 from fieldtwin.twin.plant.declared import declared_variables
 from fieldtwin.twin.plant.physical import plc_lost_ms
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
@@ -123,7 +123,7 @@ class Watched:
         self.shadow = DigitalShadow(self._receiving, plant.clock, declared=declared_variables(system))
         self.found: list[str] = []
 
-    def __getitem__(self, name: str) -> Variable:
+    def __getitem__(self, name: str) -> ModelVariable:
         return self.shadow.digital_model.variables[name]
 
     def period_in_device(self) -> int:
@@ -181,7 +181,7 @@ def test_PhysicalTwin_of_which_the_controller_is_dead_has_safe_outputs_and_the_m
 
     async def main(watched: Watched) -> None:
         if how == "it hangs":
-            monkeypatch.setattr(Runner, "deadline_ns", property(lambda runner: 2 * watched.plant.loop.now_ns))
+            monkeypatch.setattr(TaskRunner, "deadline_ns", property(lambda runner: 2 * watched.plant.loop.now_ns))
         else:
             (plc,) = [task for task in asyncio.all_tasks() if task.get_name() == "PLC"]
             plc.cancel()

@@ -12,7 +12,7 @@ from spec_rig import CLOCK, Rig, copy_systems, observatory, rig
 from support import run
 
 from fieldtwin.emulators.emulator import EmulatedCommunication, SensorEmulator
-from fieldtwin.emulators.link import Link
+from fieldtwin.emulators.link import EmulatedLink
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.connection import PROTOCOL
 from fieldtwin.gateway.core.device import Communication
@@ -106,7 +106,7 @@ def test_EmulatedCommunication_goes_both_ways_through_an_EmulatedConnection(tmp_
         system, prototype = observatory()
         prototype = prototype.with_listen(system, "line1", Endpoint.parse("tcp://127.0.0.1:0"))
         async with rig(tmp_path / "a", prototype) as far_side:
-            link = Link(Endpoint("pty", path=str(tmp_path / "port")), far_side.field.listening["line1"])
+            link = EmulatedLink(Endpoint("pty", path=str(tmp_path / "port")), far_side.field.listening["line1"])
             await link.open()
             serving = asyncio.create_task(link.serve())
             try:

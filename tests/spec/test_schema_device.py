@@ -11,7 +11,7 @@ from spec_rig import CLOCK, observatory, rig
 from support import run
 
 from fieldtwin.emulators.emulator import Emulator, SensorEmulator, TransmitterEmulator, UnitEmulator, emulator_kind
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.device import Device, End, Sensor, Transmitter, wire
@@ -29,7 +29,7 @@ NO_COMMAND = bytes.fromhex("04 1000 0001")
 
 def ctd_device() -> tuple[SensorEmulator, End[bytes], ModbusUnit]:
     """The ctd over plain registers, the driver's end of its wire, and the unit that serves it."""
-    bank = MapBank([Span("input", 0, 10), Span("holding", 0, 2), Span("holding", 100, 4)])
+    bank = MapBank([CellSpan("input", 0, 10), CellSpan("holding", 0, 2), CellSpan("holding", 100, 4)])
     unit = ModbusUnit(bank)
     end, drivers_end = wire(RS232Connection)
     return SensorEmulator(end, CTD, (), unit.respond), drivers_end, unit

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import STATE_CODES, delta
 from fieldtwin.gateway.core.values import DATA, STATUS, Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus, Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding, SeenMeasurement, SeenStatus
 from fieldtwin.twin.model.mape.monitor import Monitor
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.shadow import DigitalShadow
@@ -33,7 +33,7 @@ class Rig:
         self.receiving = ReceivingEnd("from the plant")
         self.shadow = DigitalShadow(self.receiving, self.clock, declared=DECLARED, stale_after_ms=30_000)
 
-    def give(self, *events: Event) -> list[Verdict]:
+    def give(self, *events: Event) -> list[AnalysisFinding]:
         for event in events:
             self.receiving.observe("plant:1", event)
         self.shadow.step()
@@ -229,8 +229,8 @@ def test_DigitalShadow_holds_each_declared_variable_with_quality_and_time_as_it_
 def test_DigitalShadow_has_its_variables_kept_up_before_a_verdict_on_them_is_reached() -> None:
     rig, seen = Rig(), []
 
-    class Looks(Consumer[Verdict]):
-        def observe(self, item: Verdict) -> None:
+    class Looks(Consumer[AnalysisFinding]):
+        def observe(self, item: AnalysisFinding) -> None:
             seen.append((item.finding, rig.shadow.digital_model.variables["ctd.pressure"].value))
 
     rig.shadow.analyze.emitter.subscribe(Looks(rig.shadow.analyze.emitter.event))

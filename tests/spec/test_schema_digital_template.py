@@ -16,7 +16,7 @@ from fieldtwin.twin.plant.physical import EmbeddedControlSystem
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.check import examine, put_together
-from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.pack import TemplateExtras, collect, pack
 from fieldtwin.twin.template.package import FolderPackage
 from fieldtwin.twin.template.template import (
     DOCUMENTS,
@@ -37,7 +37,7 @@ def template(tmp_path: Path) -> DigitalTemplate:
     for kind in DOCUMENTS:
         documents[kind] = (tmp_path / f"{kind}.txt",)
         documents[kind][0].write_text(f"a {kind}")
-    pack(system, collect(system, (), prototype.path), Extras(documents), "1.0", tmp_path / "T")
+    pack(system, collect(system, (), prototype.path), TemplateExtras(documents), "1.0", tmp_path / "T")
     package = FolderPackage(tmp_path / "T")
     package.verify()
     return put_together(package.manifest, examine(package.path, package.manifest), package.path, CLOCK)

@@ -13,9 +13,9 @@ from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import decode_period, delta, encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA, Quality, Reason
 from fieldtwin.gateway.store.event import Kind
-from fieldtwin.twin.model.mape.execute import Bounds, Execute
+from fieldtwin.twin.model.mape.execute import CommandLimits, Execute
 from fieldtwin.twin.model.mape.messages import verdict
-from fieldtwin.twin.model.mape.plan import Plan, Planner, Rule, RulePlanner
+from fieldtwin.twin.model.mape.plan import Plan, Planner, PlanRule, RulePlanner
 from fieldtwin.twin.model.mape.what_if import Question
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.shadow import DigitalShadow
@@ -24,7 +24,7 @@ from fieldtwin.twin.model.twin import DigitalTwin
 from fieldtwin.twin.thread.thread import Operator
 
 PERIODS = st.integers(-32768, 32767)
-RULES = (Rule("outside", "ctd.pressure", 1), Rule("inside", "ctd.pressure", 10), Rule("bad", "", -1))
+RULES = (PlanRule("outside", "ctd.pressure", 1), PlanRule("inside", "ctd.pressure", 10), PlanRule("bad", "", -1))
 
 
 class Always:
@@ -58,9 +58,9 @@ class Rig:
     def __init__(
         self,
         *,
-        bounds: Bounds = Bounds(),  # noqa: B008
+        bounds: CommandLimits = CommandLimits(),  # noqa: B008
         what_if: Prototype | None = None,
-        rules: tuple[Rule, ...] = RULES,
+        rules: tuple[PlanRule, ...] = RULES,
         planner: Planner | None = None,
     ) -> None:
         self.clock = Hands()
@@ -108,7 +108,7 @@ def test_Plan_is_rules_over_the_analysis_of_which_the_first_that_fits_decides() 
     assert rig.give(value(150.0)) == [1]
     assert rig.give(value(151.0)) == [], "what is known already is no news"
     assert rig.give(value(50.0)) == [10]
-    planner = RulePlanner((Rule("stale", "", 5),))
+    planner = RulePlanner((PlanRule("stale", "", 5),))
     assert planner.plan(DATA(b"no verdict"), DigitalModel()) is None
 
 
@@ -121,7 +121,7 @@ def test_Plan_does_nothing_about_history() -> None:
 
 def test_Plan_does_something_about_history_as_soon_as_it_is_the_present_too() -> None:
     """An outage of the thread for an hour: a finding that began in it and persists is planned for, and one that ended in it."""
-    rig = Rig(rules=(*RULES, Rule("stale", "", 0), Rule("fresh", "", 10)))
+    rig = Rig(rules=(*RULES, PlanRule("stale", "", 0), PlanRule("fresh", "", 10)))
     hour_ago = NOW_MS - 3_600_000
     assert rig.give(status(60, t_ms=hour_ago), value(200.0, hour_ago)) == []
     assert rig.give(value(201.0)) == [1], "outside, still"
@@ -155,7 +155,7 @@ def test_Execute_asks_the_model_first_and_emits_the_command_if_and_only_if_it_ac
     """Ruling 9, and prose, row 7: no user intervenes."""
     model = DigitalModel()
     model.process_event(encode_period(before))
-    execute = Execute(model, Hands(), bounds=Bounds(0, 3600))
+    execute = Execute(model, Hands(), bounds=CommandLimits(0, 3600))
     emitted: Consumer[COMMAND] = Consumer(execute.transmitter.event)
     execute.transmitter.subscribe(emitted)
     execute.plans.observe(encode_period(x))
@@ -173,7 +173,7 @@ def test_Execute_asks_the_model_first_and_emits_the_command_if_and_only_if_it_ac
     ("command", "why"), [(COMMAND(b"\0"), "expected 2 bytes"), (encode_period(9999), "allowed are -1 to 3600 s")]
 )
 def test_Execute_keeps_a_refusal_with_its_reason(command: COMMAND, why: str) -> None:
-    execute = Execute(DigitalModel(), Hands(), bounds=Bounds(-1, 3600))
+    execute = Execute(DigitalModel(), Hands(), bounds=CommandLimits(-1, 3600))
     execute.plans.observe(command)
     execute.execute()
     (refusal,) = execute.collect()
@@ -183,7 +183,7 @@ def test_Execute_keeps_a_refusal_with_its_reason(command: COMMAND, why: str) -> 
 
 def test_Execute_is_bounded_in_rate() -> None:
     clock = Hands()
-    execute = Execute(DigitalModel(), clock, bounds=Bounds(per_minute=2))
+    execute = Execute(DigitalModel(), clock, bounds=CommandLimits(per_minute=2))
     for n in range(3):
         execute.plans.observe(encode_period(n))
     execute.execute()
@@ -210,7 +210,7 @@ def test_Execute_asks_a_prototype_when_it_was_told_to_and_sends_nothing_without_
 
 
 def test_Execute_asks_the_model_before_the_prototype() -> None:
-    rig = Rig(bounds=Bounds(5, 60), what_if=(prototype := Prototype()))
+    rig = Rig(bounds=CommandLimits(5, 60), what_if=(prototype := Prototype()))
     assert rig.give(value(150.0)) == []
     assert prototype.asked == []
     assert [e.value for e in rig.twin.execute.collect()] == ["a period of 1 s; allowed are 5 to 60 s"]
@@ -218,7 +218,7 @@ def test_Execute_asks_the_model_before_the_prototype() -> None:
 
 def test_Plan_says_what_is_asked_and_of_which_commands_nothing_is() -> None:
     own = Question(60.0, finally_=("relay.state == 'STANDBY'",))
-    rules = (Rule("bad", "", 0, ask=False), Rule("outside", "", 1, ask=own), Rule("inside", "", 10))
+    rules = (PlanRule("bad", "", 0, ask=False), PlanRule("outside", "", 1, ask=own), PlanRule("inside", "", 10))
     rig = Rig(what_if=(prototype := Prototype()), rules=rules)
     prototype.says = ""
     bad = value(None, quality=Quality.BAD, reason=Reason.TIMEOUT)

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.statemachine import (
 from fieldtwin.gateway.core.values import COMMAND, Quality, Reason, Scalar
 from fieldtwin.run.processes.states import expected_states
 from fieldtwin.twin.model.model import DigitalModel
-from fieldtwin.twin.model.variables import Variable, Variables
+from fieldtwin.twin.model.variables import ModelVariable, Variables
 from fieldtwin.twin.plant.declared import declared_variables
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.template.template import describe_model
@@ -92,7 +92,7 @@ def test_DigitalModel_contains_one_state_machine_and_the_declared_variables_and_
     assert set(vars(model.state_machine)) == {"state", "period_s"}
     assert type(model.variables) is Variables
     assert Variables.__slots__ == ("_held", "undeclared")
-    assert {type(variable) for variable in model.variables.values()} == {Variable}
+    assert {type(variable) for variable in model.variables.values()} == {ModelVariable}
     for variable in model.variables.values():
         for field in dataclasses.fields(variable):
             assert isinstance(getattr(variable, field.name), Scalar | tuple | None)
@@ -132,7 +132,7 @@ def test_DigitalModel_variables_change_by_events_alone_and_the_last_counts(
     told: list[tuple[str, int | None, Quality]],
 ) -> None:
     """The state does not depend on the variables, nor the variables on the state."""
-    model, other = (DigitalModel([Variable("a.x", "int"), Variable("a.y", "int")]) for _ in range(2))
+    model, other = (DigitalModel([ModelVariable("a.x", "int"), ModelVariable("a.y", "int")]) for _ in range(2))
     model.process_event(encode_period(3))
     for t_ms, (name, value, quality) in enumerate(told, 1):
         assert model.variables.changed(name, value, quality, Reason.NONE, t_ms) is (name != "b.z")

@@ -19,7 +19,7 @@ from support import eventually, run
 from fieldtwin.cli.main import main
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -32,7 +32,7 @@ LINE = "baudrate=115200&frame=8N1"
 @asynccontextmanager
 async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
     """Units 1 and 2 with holding registers 100... and 200..., on a virtual serial port."""
-    banks = {n: MapBank([Span("holding", 0, 64), Span("coil", 0, 16)]) for n in (1, 2)}
+    banks = {n: MapBank([CellSpan("holding", 0, 64), CellSpan("coil", 0, 16)]) for n in (1, 2)}
     for number, bank in banks.items():
         bank.poke("holding", 0, *(100 * number + i for i in range(64)))
     plant = Endpoint.parse(f"rtu:{tmp_path / 'line'}?{LINE}")

@@ -17,7 +17,7 @@ from support import run
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.serial_line import SerialConnection
@@ -119,7 +119,7 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
 def test_a_master_on_a_line_reaches_tcp_units_of_a_plant(tmp_path: Path) -> None:
     async def main() -> None:
         clock = WallClock()
-        bank = MapBank([Span("holding", 0, 300)])
+        bank = MapBank([CellSpan("holding", 0, 300)])
         device = await SocketListener.open(
             Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({7: ModbusUnit(bank)}), clock)
         )

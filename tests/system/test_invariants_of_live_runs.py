@@ -15,7 +15,7 @@ import pytest
 from well_site import write_program, write_site
 
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 pytestmark = pytest.mark.long
@@ -58,7 +58,7 @@ def test_a_live_run_whose_invariants_hold_reports_it(folder: Path) -> None:
 @pytest.mark.parametrize(("limit", "verdict"), [("10", Verdict.FAILED), ("50", Verdict.PASSED)])
 def test_a_scenario_on_the_target_local_checks_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
     write_program(folder, limit)
-    result = run_scenario(load_scenario(folder / "well.scenario.yaml"), Target("local"))
+    result = run_scenario(load_scenario(folder / "well.scenario.yaml"), ScenarioTarget("local"))
     assert result.verdict is verdict, result.reason
     if verdict is Verdict.FAILED:
         assert result.reason.startswith("invariant never 1: ")

@@ -8,7 +8,7 @@ import pytest
 from procs import free_port
 
 from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.scenarios.language.form import load_scenario
 
 SCENARIO = """
@@ -24,7 +24,7 @@ steps:
 def judged(folder: Path, where: str) -> ScenarioResult:
     path = folder / "x.scenario.yaml"
     path.write_text(SCENARIO)
-    return run_scenario(load_scenario(path), Target("local", can=where))
+    return run_scenario(load_scenario(path), ScenarioTarget("local", can=where))
 
 
 @pytest.mark.long
@@ -44,6 +44,6 @@ def test_a_kernel_without_the_interface_is_an_error_and_nothing_takes_its_place(
 def test_a_network_has_no_bus_of_that_name(tmp_path: Path) -> None:
     path = tmp_path / "n.scenario.yaml"
     path.write_text("scenario: still water\nsystem: ocean_network\nsteps:\n  - pause: 1s\n")
-    result = run_scenario(load_scenario(path), Target("local", can="socketcan/vcan0"))
+    result = run_scenario(load_scenario(path), ScenarioTarget("local", can="socketcan/vcan0"))
     assert result.verdict is Verdict.SKIPPED
     assert "--can" in result.reason

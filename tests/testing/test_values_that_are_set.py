@@ -11,24 +11,24 @@ from collections.abc import Iterator
 import pytest
 from device_rig import emulated, started_runner
 
-from fieldtwin.testing.handles import Device
+from fieldtwin.testing.handles import DeviceHandle
 from fieldtwin.testing.outcome import ScenarioOutcome
-from fieldtwin.testing.runner import FieldtwinRefused, Runner
+from fieldtwin.testing.runner import FieldtwinRefused, WorkerProcess
 
 
 @pytest.fixture(scope="module")
-def runner() -> Iterator[Runner]:
+def runner() -> Iterator[WorkerProcess]:
     with started_runner() as runner:
         yield runner
 
 
 @pytest.fixture
-def device(runner: Runner) -> Iterator[Device]:
+def device(runner: WorkerProcess) -> Iterator[DeviceHandle]:
     with emulated(runner, "inclinometer-cia410", unit=9) as device:
         yield device
 
 
-def test_a_value_beyond_the_range_of_its_object_is_refused(device: Device) -> None:
+def test_a_value_beyond_the_range_of_its_object_is_refused(device: DeviceHandle) -> None:
     device.set("slope_long", 1.5)
     with pytest.raises(FieldtwinRefused, match=r"device.slope_long cannot hold 1e\+09; expected -.* to .*int16"):
         device.set("slope_long", 1e9)
@@ -40,7 +40,7 @@ def test_a_value_beyond_the_range_of_its_object_is_refused(device: Device) -> No
         pass
 
 
-def test_held_gives_the_value_that_was_just_set(device: Device) -> None:
+def test_held_gives_the_value_that_was_just_set(device: DeviceHandle) -> None:
     for value in (1.5, -2.25, 3.0):
         device.set("slope_long", value)
         assert device.held("slope_long") == pytest.approx(value)

@@ -18,7 +18,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.listeners import TcpListener
@@ -72,7 +72,7 @@ async def client(pki: Pki, name: str, port: int, issued_by: Pki | None = None) -
 @asynccontextmanager
 async def bridge(pki: Pki, folder: Path, rules: tuple[AllowRule, ...]) -> AsyncIterator[tuple[Bridge, MapBank]]:
     """A bridge with TLS that leads to a unit on TCP."""
-    bank = MapBank([Span("holding", 0, 16)])
+    bank = MapBank([CellSpan("holding", 0, 16)])
     bank.poke("holding", 0, 7)
     device = await SocketListener.open(
         Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({1: ModbusUnit(bank)}), CLOCK)

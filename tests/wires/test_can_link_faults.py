@@ -12,7 +12,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.can_link import CanLink, node_of
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.frames import FrameDirection, Framing
 from fieldtwin.emulators.faults.on_link import check_can_link, wire_faults
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
@@ -57,7 +57,7 @@ def test_frames_without_a_fault_pass_in_both_directions_in_order() -> None:
             for frame in (BEAT, ANSWER, OTHER):
                 await node.send(frame)
             assert await heard(master, 2) == [ANSWER, OTHER]
-            assert link.passed == {Way.REQUEST: 1, Way.REPLY: 2}
+            assert link.passed == {FrameDirection.REQUEST: 1, FrameDirection.REPLY: 2}
 
     run(main())
 
@@ -81,7 +81,7 @@ def test_a_request_is_lost_on_its_way_to_the_node() -> None:
             assert await heard(node, 1) == [ASK]
             await node.send(ANSWER)
             assert await heard(master, 1) == [ANSWER]
-            assert link.passed[Way.REQUEST] == 1
+            assert link.passed[FrameDirection.REQUEST] == 1
 
     run(main())
 
@@ -100,7 +100,7 @@ def test_a_fault_that_sends_speaks_for_the_node_that_it_names() -> None:
     async def main() -> None:
         async with strangers({"name": "boot-storm", "unit": 9, "count": 3, "every_ms": 1}) as (master, _, link):
             assert await heard(master, 3) == [CanFrame(0x709, b"\0")] * 3
-            assert link.passed[Way.REPLY] == 3
+            assert link.passed[FrameDirection.REPLY] == 3
 
     run(main())
 

@@ -25,7 +25,7 @@ from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.emulators.endpoints.link_ends import TtyEnd
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -143,7 +143,7 @@ def test_a_bridge_reads_through_an_adapter_that_echoes(tmp_path: Path, monkeypat
     async def main() -> None:
         target = Endpoint.parse(f"rtu:{tmp_path / 'line'}?baudrate=115200&frame=8N1")
         end = await PtyEnd.open(tmp_path / "line", target, None)
-        bank = MapBank([Span("holding", 0, 8)])
+        bank = MapBank([CellSpan("holding", 0, 8)])
         bank.poke("holding", 0, 7, 8)
         unit = RtuSlave({1: ModbusUnit(bank)})
 

@@ -13,7 +13,7 @@ from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modb
 from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
@@ -26,7 +26,7 @@ from fieldtwin.gateway.wallclock import WallClock
 def test_a_request_is_in_the_log_when_the_reply_arrives(tmp_path: Path) -> None:
     async def main() -> None:
         gone = asyncio.Event()
-        bank = MapBank([Span("holding", 0, 10)])
+        bank = MapBank([CellSpan("holding", 0, 10)])
         bank.poke("holding", 2, 7)
 
         async def serve(connection: ByteConnection) -> None:

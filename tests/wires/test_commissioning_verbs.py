@@ -18,10 +18,10 @@ from support import eventually, run
 from test_modbus_servers import COUNT, INPUTS, libmodbus, null_modem, sim_device
 
 from fieldtwin.commissioning.access.address import RawForm, tags_of
-from fieldtwin.commissioning.access.reading import Target, point_at
+from fieldtwin.commissioning.access.reading import DeviceTarget, point_at
 from fieldtwin.commissioning.access.watching import samples
 from fieldtwin.commissioning.access.writing import before, carry_out, plan_write, restore
-from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import load_dump
 from fieldtwin.commissioning.dump.session import dump, log_path, object_ranges, register_spans
 from fieldtwin.emulators.canopen.dictionary import parse_eds
@@ -32,7 +32,7 @@ from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
@@ -70,7 +70,7 @@ async def pymodbus_rtu_over_tcp(_: Path) -> AsyncIterator[str]:
 
 
 def our_unit() -> ModbusUnit:
-    made = MapBank([Span("input", 0, COUNT), Span("holding", 0, COUNT), Span("discrete", 0, COUNT)])
+    made = MapBank([CellSpan("input", 0, COUNT), CellSpan("holding", 0, COUNT), CellSpan("discrete", 0, COUNT)])
     for i, word in enumerate(INPUTS):
         made.poke("input", i, word)
         made.poke("discrete", i, int(i % 3 == 0))
@@ -94,13 +94,13 @@ async def our_pty(folder: Path) -> AsyncIterator[str]:
 def test_a_unit_is_dumped_read_written_and_put_back(opened: Opened, tmp_path: Path) -> None:
     async def main() -> None:
         async with opened(tmp_path) as url:
-            target = Target(url, 1, timeout_s=2.0)
+            target = DeviceTarget(url, 1, timeout_s=2.0)
             # libmodbus sleeps half a second before it refuses, and its RTU server ends at an unknown function.
             polite = opened in (libmodbus_tcp, libmodbus_pty)
             spans = register_spans(
                 [f"input:0..{COUNT - 1 if polite else COUNT + 9}", "holding:0..59", "discrete:0..63"]
             )
-            await dump(Job(target, spans, functions=not polite), tmp_path / "d.jsonl", words="w")
+            await dump(DumpJob(target, spans, functions=not polite), tmp_path / "d.jsonl", words="w")
             found = load_dump(tmp_path / "d.jsonl")
             values = found.passes[0].cells
             assert [int.from_bytes(values[("input", i)]) for i in range(COUNT)] == INPUTS
@@ -128,8 +128,8 @@ def test_a_node_on_the_software_bus(tmp_path: Path) -> None:
             serve_node(end, CanopenNode(parse_eds(SHEET, "x"), 7, NodeContext()), WallClock())
         )
         try:
-            target = Target(str(bus.bound), 7)
-            await dump(Job(target, objects=object_ranges(["1000..1008", "2000"])), tmp_path / "n.jsonl", words="w")
+            target = DeviceTarget(str(bus.bound), 7)
+            await dump(DumpJob(target, objects=object_ranges(["1000..1008", "2000"])), tmp_path / "n.jsonl", words="w")
             cells = load_dump(tmp_path / "n.jsonl").passes[0].cells
             assert cells == {(0x1000, 0): bytes.fromhex("9a010200"), (0x2000, 0): bytes.fromhex("0000c03f")}
             tags = tags_of(["2000h:00"], "canopen", RawForm("float32"))

@@ -19,7 +19,7 @@ from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -40,7 +40,7 @@ async def fieldtwin(*words: str) -> tuple[int, dict[str, Any], str]:
 
 
 def slave() -> RtuSlave:
-    return RtuSlave({5: ModbusUnit(MapBank([Span("holding", 0, 8)]))})
+    return RtuSlave({5: ModbusUnit(MapBank([CellSpan("holding", 0, 8)]))})
 
 
 async def answer_at(end: PtyEnd, speed: int) -> None:

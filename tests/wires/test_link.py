@@ -17,7 +17,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.endpoints.link_ends import MAX_PENDING, TcpEnd, TtyEnd
-from fieldtwin.emulators.link import EmulatedConnection, Link, LinkOptions, run_link
+from fieldtwin.emulators.link import EmulatedConnection, EmulatedLink, LinkOptions, run_link
 from fieldtwin.gateway.core.connection import PROTOCOL, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
@@ -90,9 +90,11 @@ async def receive(sock: socket.socket, size: int) -> bytes:
 
 
 @contextlib.asynccontextmanager
-async def running(near: Endpoint, far: Endpoint, options: LinkOptions = QUICK) -> AsyncIterator[tuple[Link, list[str]]]:
+async def running(
+    near: Endpoint, far: Endpoint, options: LinkOptions = QUICK
+) -> AsyncIterator[tuple[EmulatedLink, list[str]]]:
     events: list[str] = []
-    ready: asyncio.Future[Link] = asyncio.get_running_loop().create_future()
+    ready: asyncio.Future[EmulatedLink] = asyncio.get_running_loop().create_future()
     task = asyncio.create_task(run_link(near, far, options, on_event=events.append, on_ready=ready.set_result))
     await asyncio.wait((task, ready), return_when=asyncio.FIRST_COMPLETED)
     if task.done():

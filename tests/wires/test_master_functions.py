@@ -16,7 +16,7 @@ from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
@@ -46,7 +46,7 @@ SCHEMES = ["rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls"]
 
 
 def make_unit() -> tuple[ModbusUnit, MapBank, FifoQueues]:
-    bank = MapBank([Span(table, 0, 200) for table in ("coil", "discrete", "input", "holding")])
+    bank = MapBank([CellSpan(table, 0, 200) for table in ("coil", "discrete", "input", "holding")])
     fifos = FifoQueues([0x04DE])
     unit = ModbusUnit(
         bank, server_id=b"\x11\xff", identification=Identification(NAMES), files=FileRecords({4: 20}), fifos=fifos

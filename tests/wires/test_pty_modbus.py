@@ -16,7 +16,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
@@ -31,7 +31,9 @@ READ_REPLY = with_crc(bytes.fromhex("01 03 04 007B 01C8"))
 
 
 def make_unit() -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 100), Span("input", 0, 10), Span("coil", 0, 16), Span("discrete", 0, 16)])
+    bank = MapBank(
+        [CellSpan("holding", 0, 100), CellSpan("input", 0, 10), CellSpan("coil", 0, 16), CellSpan("discrete", 0, 16)]
+    )
     bank.poke("holding", 0, 123, 456)
     bank.poke("input", 2, 789)
     bank.poke("coil", 3, 1)

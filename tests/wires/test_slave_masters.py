@@ -24,7 +24,7 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
@@ -75,7 +75,7 @@ print("done")
 
 
 def make_unit() -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 120), Span("coil", 0, 8)])
+    bank = MapBank([CellSpan("holding", 0, 120), CellSpan("coil", 0, 8)])
     bank.poke("holding", 0, 123, 456)
     files = FileRecords({4: 20})
     files.poke(4, 1, 7, 8)

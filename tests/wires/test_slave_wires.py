@@ -21,7 +21,7 @@ from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.emulators.endpoints.tls_server import client_role
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.line import ServedFrame
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
@@ -40,7 +40,7 @@ needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="open
 
 
 def make_unit() -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 16)])
+    bank = MapBank([CellSpan("holding", 0, 16)])
     bank.poke("holding", 0, 7)
     return ModbusUnit(bank)
 

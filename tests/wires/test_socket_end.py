@@ -11,7 +11,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
@@ -214,7 +214,7 @@ def test_a_failure_of_ours_is_reported_and_ends_only_that_client() -> None:
 
 
 def test_modbus_pipelined_in_order_and_visible_to_the_tap() -> None:
-    bank = MapBank([Span("holding", 0, 4)])
+    bank = MapBank([CellSpan("holding", 0, 4)])
     bank.poke("holding", 0, 7)
     unit = ModbusUnit(bank)
     told: list[tuple[Direction, bytes]] = []
@@ -247,7 +247,7 @@ def test_modbus_pipelined_in_order_and_visible_to_the_tap() -> None:
 
 
 def units() -> dict[int, ModbusUnit]:
-    bank = MapBank([Span("holding", 0, 125)])
+    bank = MapBank([CellSpan("holding", 0, 125)])
     bank.poke("holding", 0, 7)
     return {1: ModbusUnit(bank)}
 

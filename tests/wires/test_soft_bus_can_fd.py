@@ -8,7 +8,7 @@ import can
 import pytest
 from support import run
 
-from fieldtwin.emulators.endpoints.bus_hello import Hello, unpack_hello
+from fieldtwin.emulators.endpoints.bus_hello import BusHello, unpack_hello
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
@@ -92,7 +92,9 @@ def test_the_data_bit_rate_is_checked() -> None:
 def test_an_older_bus_refuses_can_fd_with_a_clear_error() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert unpack_hello(await reader.readexactly(RECORD_SIZE)) is not None
-        writer.write(Hello(500_000, status=2, window=1).pack())  # as version 1 answers a version that it does not know
+        writer.write(
+            BusHello(500_000, status=2, window=1).pack()
+        )  # as version 1 answers a version that it does not know
         writer.close()
 
     async def main() -> None:

@@ -17,7 +17,7 @@ import canopen
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_hello import Hello, unpack_hello
+from fieldtwin.emulators.endpoints.bus_hello import BusHello, unpack_hello
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record
@@ -151,7 +151,7 @@ def test_error_frames_and_records_cut_anywhere() -> None:
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert unpack_hello(await reader.readexactly(RECORD_SIZE)) is not None
-        for byte in Hello(125_000, window=1).pack() + b"".join(pack_record(f) for f in frames):
+        for byte in BusHello(125_000, window=1).pack() + b"".join(pack_record(f) for f in frames):
             writer.write(bytes([byte]))
             await writer.drain()
             await asyncio.sleep(0)

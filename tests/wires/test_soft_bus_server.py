@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_hello import FD_VERSION, VERSION, Hello, Status, unpack_hello
+from fieldtwin.emulators.endpoints.bus_hello import FD_VERSION, VERSION, BusHello, Status, unpack_hello
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
@@ -183,7 +183,7 @@ def test_a_client_that_floods_without_waiting_is_read_no_faster_than_the_bus_sen
         async with bus(paced=False, queue_frames=8) as server:
             hear = server.attach()
             reader, writer = await asyncio.open_connection(*server.bound.address)
-            writer.write(Hello(0).pack())
+            writer.write(BusHello(0).pack())
             writer.write(b"".join(pack_record(CanFrame(0x100, i.to_bytes(2))) for i in range(3000)))
             writer.write_eof()  # and it leaves at once: everything still goes out
             for i in range(3000):
@@ -204,7 +204,7 @@ def test_a_slow_receiver_overruns_alone_and_blocks_no_other() -> None:
             slow = socket.socket()
             slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             slow.connect(server.bound.address)
-            slow.sendall(Hello(0).pack())
+            slow.sendall(BusHello(0).pack())
             await eventually(lambda: len(server.bus_stats()["nodes"]) == 1)
             # A bus that keeps 16 frames for a client gives its sender a window to match.
             a, b = server.attach(), server.attach()
@@ -330,7 +330,7 @@ def test_refusals(opener) -> None:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("opener", [SoftBusConnection.open, open_can_end])
 @pytest.mark.parametrize(
-    "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", Hello(125_000, status=2, version=9).pack()]
+    "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", BusHello(125_000, status=2, version=9).pack()]
 )
 def test_a_different_program_listens_there(opener, answer: bytes) -> None:  # type: ignore[no-untyped-def]
     async def main() -> None:
@@ -352,9 +352,9 @@ def test_a_different_program_listens_there(opener, answer: bytes) -> None:  # ty
 BAD_HELLOS = [
     b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
     pack_record(CanFrame(1)),
-    Hello(0).pack() + pack_record(CanFrame(1), confirmed=True),
-    Hello(0).pack() + pack_record(CanFrame(0x20, bytes(8), error=True)),
-    Hello(0).pack() + b"\xff" * RECORD_SIZE,
+    BusHello(0).pack() + pack_record(CanFrame(1), confirmed=True),
+    BusHello(0).pack() + pack_record(CanFrame(0x20, bytes(8), error=True)),
+    BusHello(0).pack() + b"\xff" * RECORD_SIZE,
 ]
 
 
@@ -380,7 +380,7 @@ def test_a_different_version_gets_our_version() -> None:
     async def main() -> None:
         async with bus() as server:
             reader, writer = await asyncio.open_connection(*server.bound.address)
-            writer.write(Hello(125_000, version=FD_VERSION + 1).pack())
+            writer.write(BusHello(125_000, version=FD_VERSION + 1).pack())
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
             assert answer is not None
             assert (answer.status, answer.version) == (Status.UNKNOWN_VERSION, VERSION)
@@ -407,7 +407,7 @@ def test_closing_does_not_wait_for_a_client_that_never_reads() -> None:
     async def main() -> None:
         async with bus(paced=False) as server:
             deaf = socket.create_connection(server.bound.address)
-            deaf.sendall(Hello(0).pack())
+            deaf.sendall(BusHello(0).pack())
             a = server.attach()
             await eventually(lambda: len(server.bus_stats()["nodes"]) == 2)
             for _ in range(2000):

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from fieldtwin.gateway.core.statemachine import STATE, EventStateMachine
 from fieldtwin.gateway.core.values import COMMAND
-from fieldtwin.twin.model.variables import Variable, Variables
+from fieldtwin.twin.model.variables import ModelVariable, Variables
 
 
 class DigitalModel:
@@ -22,7 +22,7 @@ class DigitalModel:
 
     __slots__ = ("state_machine", "variables")
 
-    def __init__(self, declared: Iterable[Variable] = ()) -> None:
+    def __init__(self, declared: Iterable[ModelVariable] = ()) -> None:
         self.state_machine = EventStateMachine()
         self.variables = Variables(declared)
 

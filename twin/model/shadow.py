@@ -13,12 +13,12 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.store.event import Event
 from fieldtwin.twin.model.mape.analyze import Analyze
-from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.mape.monitor import Monitor
 from fieldtwin.twin.model.mape.upkeep import Upkeep
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from fieldtwin.twin.model.variables import Variable
+from fieldtwin.twin.model.variables import ModelVariable
 
 VERDICTS = 1000
 
@@ -31,7 +31,7 @@ class DigitalShadow:
     """
 
     def __init__(
-        self, receiving: ReceivingEnd, clock: Clock, *, declared: Iterable[Variable], stale_after_ms: int = 30_000
+        self, receiving: ReceivingEnd, clock: Clock, *, declared: Iterable[ModelVariable], stale_after_ms: int = 30_000
     ) -> None:
         self.digital_model = DigitalModel(declared)
         self.receiving = receiving
@@ -41,7 +41,7 @@ class DigitalShadow:
         self.monitor.emitter.subscribe(self.upkeep.measured)
         self.monitor.emitter.subscribe(self.analyze.consumer)
         self.analyze.emitter.subscribe(self.upkeep.analyzed)
-        self.verdicts: Consumer[Verdict] = Consumer(self.analyze.emitter.event, VERDICTS)
+        self.verdicts: Consumer[AnalysisFinding] = Consumer(self.analyze.emitter.event, VERDICTS)
         self.analyze.emitter.subscribe(self.verdicts)
         self._clock = clock
 

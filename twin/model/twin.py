@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from fieldtwin.gateway.core.clock import Clock
-from fieldtwin.twin.model.mape.execute import Bounds, Execute
+from fieldtwin.twin.model.mape.execute import CommandLimits, Execute
 from fieldtwin.twin.model.mape.plan import Plan, Planner
 from fieldtwin.twin.model.mape.what_if import Question, WhatIf
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from fieldtwin.twin.model.variables import Variable
+from fieldtwin.twin.model.variables import ModelVariable
 
 
 class DigitalTwin(DigitalShadow):
@@ -30,8 +30,8 @@ class DigitalTwin(DigitalShadow):
         clock: Clock,
         planner: Planner,
         *,
-        declared: Iterable[Variable],
-        bounds: Bounds,
+        declared: Iterable[ModelVariable],
+        bounds: CommandLimits,
         stale_after_ms: int = 30_000,
         what_if: WhatIf | None = None,
         question: Question | None = None,

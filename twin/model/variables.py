@@ -19,7 +19,7 @@ Limits = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class ModelVariable:
     """A variable: its declaration (`name`, `kind`, `unit`, `limits`) and its last reported value.
 
     `t_ms` is the time (UTC) that the plant gives for the value; 0 if the plant has never reported the variable. When the
@@ -62,7 +62,7 @@ class Variable:
         return {"value": value, **unit, **known}
 
 
-class Variables(Mapping[str, Variable]):
+class Variables(Mapping[str, ModelVariable]):
     """The variables of one model, by name, in the order of their declaration. Two models never share a variable.
 
     `undeclared` counts reports about names that the model does not declare. It is not part of the model.
@@ -70,11 +70,11 @@ class Variables(Mapping[str, Variable]):
 
     __slots__ = ("_held", "undeclared")
 
-    def __init__(self, declared: Iterable[Variable] = ()) -> None:
+    def __init__(self, declared: Iterable[ModelVariable] = ()) -> None:
         self._held = {variable.name: variable for variable in declared}
         self.undeclared = 0
 
-    def __getitem__(self, name: str) -> Variable:
+    def __getitem__(self, name: str) -> ModelVariable:
         return self._held[name]
 
     def __iter__(self) -> Iterator[str]:

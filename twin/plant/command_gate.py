@@ -12,7 +12,7 @@ from __future__ import annotations
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.twin.model.mape.execute import Bounds, CommandCheck
+from fieldtwin.twin.model.mape.execute import CommandCheck, CommandLimits
 from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
 
 OLD_MS = 10 * 60_000
@@ -27,7 +27,9 @@ class CommandGate(PTDigitalThreadProcess):
     The outcome of each command is shared with the twin.
     """
 
-    def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0) -> None:
+    def __init__(
+        self, *, remote: bool, bounds: CommandLimits, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0
+    ) -> None:
         """Create the gate. `since_ms` is the time when the plant's own log began (UTC).
 
         An earlier command is refused, because the plant may already have obeyed it.
@@ -40,7 +42,7 @@ class CommandGate(PTDigitalThreadProcess):
         self._since_ms = since_ms
         self._last: dict[str, int] = {}
 
-    def restate(self, *, remote: bool, bounds: Bounds) -> None:
+    def restate(self, *, remote: bool, bounds: CommandLimits) -> None:
         """Set a new switch position and new limits, which may change while the plant runs."""
         self._remote = remote
         self._check.restate(bounds)

@@ -16,7 +16,7 @@ from msgspec.structs import asdict
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.runtime.outputs.refusals import Refusal, Refusals
+from fieldtwin.gateway.runtime.outputs.refusals import Refusals, RefusedOutput
 
 ANSWER_S = 1.0
 """Seconds within which the PLC must answer."""
@@ -33,14 +33,14 @@ class RefusalPlaces:
         self._journal = journal
         self._socket = socket
         self._tell = tell
-        self._waiting: deque[Refusal] = deque()
+        self._waiting: deque[RefusedOutput] = deque()
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._idle.set()
         self._client: ControlClient | None = None
         journal.looks_up = True
         journal.on_new = self._on_new
 
-    def _on_new(self, entry: Refusal) -> None:
+    def _on_new(self, entry: RefusedOutput) -> None:
         if entry.known or len(self._waiting) >= MOST_WAITING:
             self._complete(entry, "", "")
         else:
@@ -48,7 +48,7 @@ class RefusalPlaces:
             self._idle.clear()
             self._wake.set()
 
-    def _complete(self, entry: Refusal, program: str, place: str) -> None:
+    def _complete(self, entry: RefusedOutput, program: str, place: str) -> None:
         self._journal.placed(entry.number, program, place)
         if self._tell is not None:
             self._tell(asdict(entry.status()))
@@ -69,7 +69,7 @@ class RefusalPlaces:
             if self._client is not None:
                 await self._client.aclose()
 
-    async def _origin(self, entry: Refusal) -> tuple[str, str]:
+    async def _origin(self, entry: RefusedOutput) -> tuple[str, str]:
         try:
             async with asyncio.timeout(ANSWER_S):
                 if self._client is None:

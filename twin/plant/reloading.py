@@ -36,7 +36,7 @@ NOTHING = object()
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ConfigChange:
     """One changed value: its file and place, its keys, the old and new text, and whether it can be applied at run time."""
 
     where: str
@@ -49,7 +49,7 @@ class Change:
         return f"{self.what}: {self.old} -> {self.new}" if self.old or self.new else self.what
 
 
-def compare(old: System, new: System) -> list[Change]:
+def compare(old: System, new: System) -> list[ConfigChange]:
     """Return the changes in `new`: first the system file, in the order of its keys, then profiles, then the files that
     they name.
     """
@@ -106,8 +106,8 @@ def _is_secret(system: System, at: Loc) -> bool:
     return tag is not None and tag.secret
 
 
-def _of_profiles(old: System, new: System) -> list[Change]:
-    found: dict[tuple[str, str], Change] = {}
+def _of_profiles(old: System, new: System) -> list[ConfigChange]:
+    found: dict[tuple[str, str], ConfigChange] = {}
     for name, device in new.devices.items():
         if name not in old.devices:
             continue
@@ -130,7 +130,7 @@ def _is_live_in_profile(before: DeviceProfile, after: DeviceProfile, at: Loc) ->
     return at[2] not in SCALING or before.tags[tag].is_integer == after.tags[tag].is_integer
 
 
-def _unexplained(old: System, new: System) -> list[Change]:
+def _unexplained(old: System, new: System) -> list[ConfigChange]:
     """Return differences that no changeable key explains: a DCF or an EDS that the files name, a profile's messages."""
     found = []
     for name, device in new.devices.items():
@@ -151,10 +151,10 @@ def _fixed(device: DeviceConfig) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def _change(file: YamlFile, at: Loc, old: Any, new: Any, *, live: bool, secret: bool = False) -> Change:
+def _change(file: YamlFile, at: Loc, old: Any, new: Any, *, live: bool, secret: bool = False) -> ConfigChange:
     spot: FileInvalid = file.error(at, "")
     texts = ("(secret)", "(secret)") if secret else (_text(old), _text(new))
-    return Change(f"{spot.path}:{spot.line}:{spot.column}", ".".join(map(str, at)), *texts, live)
+    return ConfigChange(f"{spot.path}:{spot.line}:{spot.column}", ".".join(map(str, at)), *texts, live)
 
 
 def _text(value: Any) -> str:

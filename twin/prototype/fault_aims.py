@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.emulators.faults.fault import Aim, Kind
+from fieldtwin.emulators.faults.fault import Aim, InjectionPoint
 from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
 from fieldtwin.emulators.faults.values.value_ranges import check_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
@@ -18,7 +18,7 @@ from fieldtwin.twin.site.system import System
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class FaultTarget:
     """The target of a fault.
 
     Empty `units` stand for all units of the bus; `addresses` None and empty `functions` also stand for all.
@@ -32,7 +32,7 @@ class Target:
     counts: range | None = None
 
 
-def target(system: System, spec: FaultSpec) -> Target:
+def target(system: System, spec: FaultSpec) -> FaultTarget:
     """Resolve the aim of `spec`.
 
     Raises `WrongAim` for a name that the system does not have, with the nearest one, and for a fault that does not
@@ -45,23 +45,23 @@ def target(system: System, spec: FaultSpec) -> Target:
         if not aim.device:
             raise WrongAim("register", "a register needs a device", expected="device: NAME")
         tag = tag_of(system, aim.device, aim.register_, "register")
-    if kind is Kind.VALUE and tag is not None and tag.is_text:
+    if kind is InjectionPoint.VALUE and tag is not None and tag.is_text:
         raise WrongAim("register", f"{aim.device}.{tag.name} is not a number", expected="a tag that is one")
     if aim.device:
         check_fault(spec.make(), aim.register_, system.devices[aim.device].profile.tags.values(), aim.device)
     is_can = system.buses[bus].endpoint.is_can
-    if kind is not Kind.VALUE and is_can != (kind is Kind.CAN):
+    if kind is not InjectionPoint.VALUE and is_can != (kind is InjectionPoint.CAN):
         raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", got=f"bus {bus!r}")
     units = (aim.unit,) if aim.unit is not None else (system.devices[aim.device].address,) if aim.device else ()
-    if kind is Kind.CAN and tag is not None and tag.object is not None:
-        return Target(bus, units, aim.model_copy(update={"index": tag.object[0]}))
-    if kind is not Kind.BYTES:
-        return Target(bus, units, aim)
+    if kind is InjectionPoint.CAN and tag is not None and tag.object is not None:
+        return FaultTarget(bus, units, aim.model_copy(update={"index": tag.object[0]}))
+    if kind is not InjectionPoint.BYTES:
+        return FaultTarget(bus, units, aim)
     if tag is not None:
         at = tag.registers
-        return Target(bus, units, aim, range(at.address, at.end), FUNCTIONS_OF[at.table], counted(aim.registers))
+        return FaultTarget(bus, units, aim, range(at.address, at.end), FUNCTIONS_OF[at.table], counted(aim.registers))
     addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
-    return Target(bus, units, aim, addresses, functions, counted(aim.registers))
+    return FaultTarget(bus, units, aim, addresses, functions, counted(aim.registers))
 
 
 def tag_of(system: System, device: str, tag: str, key: str = "") -> Tag:

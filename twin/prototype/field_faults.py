@@ -16,12 +16,12 @@ from fieldtwin.emulators.endpoints.faulty_can import bus_rule
 from fieldtwin.emulators.faults.can_fault import BusFault
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
-from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.emulators.faults.frames import FrameDirection
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.values.set_value import Form, SetValue
 from fieldtwin.emulators.faults.values.value_ranges import check_value
 from fieldtwin.emulators.host import framing_of
-from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.emulators.wires.can_faults import ErrorRule
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.prototype.fault_aims import tag_of, target
@@ -45,9 +45,9 @@ class FieldFaults:
         self._clock = clock
         self._buses = {name: WireFaults(framing_of(bus.endpoint)) for name, bus in system.buses.items()}
         self._distortions: dict[str, Distortions] = {}
-        self._rules: dict[str, tuple[str, Rule]] = {}
-        self._disturb: dict[str, Callable[[Rule], None]] = {}
-        self._undisturb: dict[str, Callable[[Rule], None]] = {}
+        self._rules: dict[str, tuple[str, ErrorRule]] = {}
+        self._disturb: dict[str, Callable[[ErrorRule], None]] = {}
+        self._undisturb: dict[str, Callable[[ErrorRule], None]] = {}
         self._active: dict[str, tuple[FaultSpec, Active, str]] = {}
         self._set: dict[tuple[str, str], float] = {}
         self.history = FaultHistory()
@@ -62,7 +62,7 @@ class FieldFaults:
         """Register the distortions through which the values of `device` can be changed."""
         self._distortions[device] = distortions
 
-    def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
+    def on_wire(self, bus: str, disturb: Callable[[ErrorRule], None], undisturb: Callable[[ErrorRule], None]) -> None:
         """Register a modelled CAN bus, on which bus errors can be injected."""
         self._disturb[bus], self._undisturb[bus] = disturb, undisturb
 
@@ -188,5 +188,7 @@ class FieldFaults:
         ]
 
 
-def _watcher(bus: str, told: Callable[[str, object, bool, bytes], None]) -> Callable[[object, Way, bytes], None]:
-    return lambda end, way, data: told(bus, end, way is Way.REPLY, data)
+def _watcher(
+    bus: str, told: Callable[[str, object, bool, bytes], None]
+) -> Callable[[object, FrameDirection, bytes], None]:
+    return lambda end, way, data: told(bus, end, way is FrameDirection.REPLY, data)

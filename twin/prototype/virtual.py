@@ -24,11 +24,11 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway
-from fieldtwin.gateway.runtime.outputs.refusals import Refusal
+from fieldtwin.gateway.runtime.outputs.refusals import RefusedOutput
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
-from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.publishing import TagChange
 from fieldtwin.plc.realtime import VIRTUAL_STUCK_MS, alarm_if_free
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 from fieldtwin.plc.task import run_on_clock
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
 from fieldtwin.twin.plant.physical import plc_config
@@ -61,8 +61,8 @@ class VirtualPrototype(AsyncResource):
         *,
         seed: int | None = None,
         taps: Sequence[Tap] = (),
-        on_change: Callable[[Change], None] | None = None,
-        on_refusal: Callable[[Refusal], None] | None = None,
+        on_change: Callable[[TagChange], None] | None = None,
+        on_refusal: Callable[[RefusedOutput], None] | None = None,
         prepare: Callable[[VirtualPrototype], None] | None = None,
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
@@ -75,7 +75,7 @@ class VirtualPrototype(AsyncResource):
         self.twin = DigitalTwinPrototype(system, self.prototype, self.clock)
         self.field: FieldSimulator = self.twin.field(Path("virtual"), self.net, water)
         self.gateway: Gateway
-        self.plc: Runner
+        self.plc: TaskRunner
         self.image: Image
         """The process image, for observers."""
         self.mapping: dict[Endpoint, Endpoint] = {}
@@ -122,7 +122,7 @@ class VirtualPrototype(AsyncResource):
         alarm = alarm_if_free(max(VIRTUAL_STUCK_MS, config.stuck_ms))
         if alarm is not None:
             self._stack.callback(alarm.close)
-        self.plc = Runner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change)
+        self.plc = TaskRunner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change)
         self._stack.callback(self.plc.close)
         self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:
@@ -136,7 +136,7 @@ class VirtualPrototype(AsyncResource):
         self._nursery.start(self.gateway.run(), "gateway")
         self._nursery.start(self._flush(log), "store")
 
-    def _refused(self, entry: Refusal) -> None:
+    def _refused(self, entry: RefusedOutput) -> None:
         if entry.by == "plc" and entry.tag in self.plc.outputs.last():
             value = entry.first if isinstance(entry.first, int | float) else None
             entry.program, entry.place = self.plc.origin(entry.tag, value)

@@ -17,20 +17,20 @@ Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
-class Strict(BaseModel):
+class SiteModel(BaseModel):
     """Base class: unknown keys are refused, and values are not coerced."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class SyncForm(Strict):
+class SyncForm(SiteModel):
     """The SYNC producer of a CANopen bus (CiA 301: objects 1006h and 1019h of the master)."""
 
     period_ms: Milliseconds
     counter: int = Field(default=0, ge=0, le=240, description="highest value of the counter, 2 to 240; 0: no counter")
 
 
-class BusForm(Strict):
+class BusForm(SiteModel):
     """A bus or serial line, and the endpoint at which the plant opens it."""
 
     url: str
@@ -58,7 +58,7 @@ class BusForm(Strict):
     sdo_transfer_ms: Milliseconds = Field(default=600_000, description="CANopen: limit of a whole SDO transfer")
 
 
-class PollForm(Strict):
+class PollForm(SiteModel):
     """How often a poll group is read, and its phase within the period.
 
     By default groups with the same period are spread over it.
@@ -68,7 +68,7 @@ class PollForm(Strict):
     phase_ms: int | None = Field(default=None, ge=0, lt=3_600_000)
 
 
-class HeartbeatForm(Strict):
+class HeartbeatForm(SiteModel):
     """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in the master).
 
     Without `producer_ms` the node keeps its own time.
@@ -78,14 +78,14 @@ class HeartbeatForm(Strict):
     consumer_ms: Milliseconds
 
 
-class TpdoForm(Strict):
+class TpdoForm(SiteModel):
     """The tags that a TPDO of the node carries, and how often it is sent."""
 
     map: list[Name] = Field(min_length=1, max_length=8)
     event_ms: Milliseconds
 
 
-class RpdoForm(Strict):
+class RpdoForm(SiteModel):
     """The tags that an RPDO of the node carries, and when the node applies them: at once, or at the next SYNC."""
 
     map: list[Name] = Field(min_length=1, max_length=8)
@@ -93,7 +93,7 @@ class RpdoForm(Strict):
     event_ms: Milliseconds | None = Field(default=None, description="period in which it is sent without a change, ms")
 
 
-class IdentityForm(Strict):
+class IdentityForm(SiteModel):
     """The values that a CANopen node must hold in 1000h and 1018h (CiA 302: objects 1F84h to 1F88h of the master)."""
 
     device_type: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
@@ -103,7 +103,7 @@ class IdentityForm(Strict):
     serial: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
 
 
-class DeviceForm(Strict):
+class DeviceForm(SiteModel):
     """A device of the system."""
 
     profile: str
@@ -145,7 +145,7 @@ class DeviceForm(Strict):
     start: bool = False
 
 
-class WatchdogForm(Strict):
+class WatchdogForm(SiteModel):
     """The limits of the PLC's watchdog: the delay of a late scan, the consecutive overruns before a stop, the time after which a
     scan that does not end is aborted, and the number of restarts of the programs after that.
     """
@@ -157,14 +157,14 @@ class WatchdogForm(Strict):
     restarts: int = Field(default=3, ge=0, le=100, description="restarts in a row; 0: stay stopped")
 
 
-class InputForm(Strict):
+class InputForm(SiteModel):
     """The source of a program's input, and the value that the program sees while that source is bad."""
 
     tag: TagName
     if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
-class StartForm(Strict):
+class StartForm(SiteModel):
     """The start of a program: how long it waits until each input has been good once, and the action after that time."""
 
     timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
@@ -174,7 +174,7 @@ class StartForm(Strict):
     )
 
 
-class ProgramForm(Strict):
+class ProgramForm(SiteModel):
     """A program of the PLC: its source, and the tags to which its variables are bound."""
 
     source: str
@@ -184,7 +184,7 @@ class ProgramForm(Strict):
     outputs: dict[Name, TagName] = {}
 
 
-class TaskForm(Strict):
+class TaskForm(SiteModel):
     """A task (IEC 61131-3): runs every `interval_ms`, or once at each rising edge of the tag `single`.
 
     Priority 0 is the highest.
@@ -202,7 +202,7 @@ class TaskForm(Strict):
         return self
 
 
-class PlcForm(Strict):
+class PlcForm(SiteModel):
     """The soft PLC: its cycle, tasks and programs."""
 
     cycle_ms: Milliseconds = 10
@@ -215,7 +215,7 @@ class PlcForm(Strict):
     programs: dict[Name, ProgramForm] = Field(default={}, description="none: another controller commands, or nobody")
 
 
-class ServedTagForm(Strict):
+class ServedTagForm(SiteModel):
     """The place at which a tag is served: exactly one of the four tables, at a PDU address.
 
     `type` is the type of the served value. A quality register holds 0 for good quality.
@@ -231,7 +231,7 @@ class ServedTagForm(Strict):
     write: bool = Field(default=False, description="clients may write it if the plant allows writes")
 
 
-class ServeForm(Strict):
+class ServeForm(SiteModel):
     """The process image as Modbus TCP registers, for HMIs and other controllers."""
 
     url: str
@@ -251,7 +251,7 @@ class ServeForm(Strict):
     )
 
 
-class AllowForm(Strict):
+class AllowForm(SiteModel):
     """The requests that clients of some networks may send. Units and addresses are numbers, or ranges such as 0..99."""
 
     networks: list[str] = Field(default=["127.0.0.0/8", "::1/128"], alias="from", min_length=1)
@@ -261,7 +261,7 @@ class AllowForm(Strict):
     roles: list[str] | None = Field(default=None, description="TLS: the roles that it is for; default: every client")
 
 
-class BridgeForm(Strict):
+class BridgeForm(SiteModel):
     """A bridge: lets Modbus TCP clients, or the client on a serial line (`url`), reach units of the system's buses."""
 
     url: str
@@ -280,7 +280,7 @@ class BridgeForm(Strict):
     )
 
 
-class CommandsForm(Strict):
+class CommandsForm(SiteModel):
     """The commands that a digital twin may send over a thread while `remote` is set to remote."""
 
     period_s: list[int] = Field(
@@ -295,7 +295,7 @@ class CommandsForm(Strict):
         return self
 
 
-class FollowsForm(Strict):
+class FollowsForm(SiteModel):
     """Each time that `after` becomes true, `then` must become true `within` a time, such as 2s."""
 
     after: str
@@ -303,7 +303,7 @@ class FollowsForm(Strict):
     within: str
 
 
-class InvariantsForm(Strict):
+class InvariantsForm(SiteModel):
     """Conditions that must hold in every run, scenario and campaign of this system: expressions as in scenarios."""
 
     always: list[str] = Field(default=[], max_length=200)
@@ -315,7 +315,7 @@ NONE_STATED = InvariantsForm()
 """The invariants of a system that states none."""
 
 
-class SystemForm(Strict):
+class SystemForm(SiteModel):
     """A plant. The physical twin and its prototype read the same file, byte for byte."""
 
     fieldtwin: Literal[1]
@@ -332,14 +332,14 @@ class SystemForm(Strict):
     )
 
 
-class BusMappingForm(Strict):
+class BusMappingForm(SiteModel):
     """Where the emulators of a bus of the plant listen."""
 
     listen: str
     pace: bool = True
 
 
-class FarLinkForm(Strict):
+class FarLinkForm(SiteModel):
     """The acoustic link between the two modems.
 
     The modems recover from losses by `loss`; nothing recovers from `lost`, `repeated` and `overtakes`.
@@ -355,7 +355,7 @@ class FarLinkForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class BusyForm(Strict):
+class BusyForm(SiteModel):
     """After every `every` accepted requests, a Modbus device answers with exception 06 (busy) for `for_ms` milliseconds."""
 
     every: int = Field(ge=1)
@@ -370,7 +370,7 @@ def _as_text(formula: object) -> object:
 Formula = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | int | float | bool)]
 
 
-class SimulationForm(Strict):
+class SimulationForm(SiteModel):
     """Values that are computed step by step: by formulas, or by a Python class."""
 
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
@@ -384,7 +384,7 @@ class SimulationForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class EmulatedForm(Strict):
+class EmulatedForm(SiteModel):
     """The data source of an emulated device: a recording (time-keyed signals), a simulation, or a model."""
 
     recording: str | None = None
@@ -413,7 +413,7 @@ class EmulatedForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class PrototypeForm(Strict):
+class PrototypeForm(SiteModel):
     """Which devices are emulated, from which data source, and at which endpoint. The plant never opens this file."""
 
     prototype_of: str

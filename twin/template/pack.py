@@ -203,14 +203,14 @@ def _imports(path: Path) -> Iterator[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Extras:
+class TemplateExtras:
     """Files in a template that its system does not name: documents by kind, and the wheel of the control software."""
 
     documents: Mapping[DocumentKind, tuple[Path, ...]] = field(default_factory=dict)
     wheel: Path | None = None
 
 
-def pack(system: System, collected: Collected, extras: Extras, version: str, target: Path) -> Manifest:
+def pack(system: System, collected: Collected, extras: TemplateExtras, version: str, target: Path) -> Manifest:
     """Write the template: a zip if `target` ends in ``.zip``, else a folder. `version` is that of the control software.
 
     Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, and `Unreachable` if the disk

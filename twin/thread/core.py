@@ -1,6 +1,6 @@
 """Store and forward between two twins: at least once on the link, exactly once in the log, in any order of frames.
 
-Sans-IO. `Outgoing` sends one log; `Incoming` receives logs. Both are given the received frames, what is stored, and the
+Sans-IO. `OutgoingLog` sends one log; `IncomingLogs` receives logs. Both are given the received frames, what is stored, and the
 time, and return what to send, load and store. An ACK confirms only what is in the receiver's store. Either side may
 therefore die at any instant, and as soon as frames arrive again the two logs become equal.
 
@@ -69,7 +69,7 @@ class _Rto:
         self.now_ns = min(max(wanted_ns, RTO_MIN_NS), RTO_MAX_NS)
 
 
-class Outgoing:
+class OutgoingLog:
     """One log that is being sent.
 
     `first` and `last` are the span of the store. When `wanted` asks for events, the caller passes them to `load`.
@@ -357,14 +357,14 @@ class Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class Open:
-    """The effect "look up in the store which events it has of this origin", after which the caller calls `Incoming.opened`."""
+    """The effect "look up in the store which events it has of this origin"; then the caller calls `IncomingLogs.opened`."""
 
     origin: str
 
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """The effect "store these events", after which the caller calls `Incoming.kept`."""
+    """The effect "store these events", after which the caller calls `IncomingLogs.kept`."""
 
     origin: str
     events: tuple[Event, ...]
@@ -373,7 +373,7 @@ class Keep:
 
 @dataclass(frozen=True, slots=True)
 class NoteLost:
-    """The effect "record that these events will never arrive", after which the caller calls `Incoming.noted`."""
+    """The effect "record that these events will never arrive", after which the caller calls `IncomingLogs.noted`."""
 
     origin: str
     first: int
@@ -404,7 +404,7 @@ class _Stream:
             self.through = max(self.through, self.ranges.pop(0)[1])
 
 
-class Incoming:
+class IncomingLogs:
     """The receiver of the logs of other sides.
 
     `knows` returns whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`, so that one ACK confirms many frames.

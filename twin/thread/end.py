@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
 from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
-from fieldtwin.twin.thread.core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread.core import Effect, IncomingLogs, Keep, NoteLost, Open, OutgoingLog
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
 from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
 from fieldtwin.twin.thread.status import ThreadStatus
@@ -51,8 +51,8 @@ class ThreadEnd:
         on_events: OnEvents | None = None,
         insists: bool = True,
     ) -> None:
-        self.out: Outgoing | None = None
-        self.into = Incoming(self._knows, 0)
+        self.out: OutgoingLog | None = None
+        self.into = IncomingLogs(self._knows, 0)
         self.connected = False
         self.links = 0
         self.trouble = ""
@@ -106,7 +106,7 @@ class ThreadEnd:
         """Keep the thread up. Raises `FieldtwinError` only if the store cannot be read at the start, and `Unwelcome`."""
         if self._origin:
             first, last = await self._store.span(self._origin)
-            self.out = Outgoing(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
+            self.out = OutgoingLog(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
         retry_ns, opened_ns = FIRST_RETRY_NS, 0
         while True:
             try:
@@ -156,7 +156,7 @@ class ThreadEnd:
             else:
                 await self._wait(now_ns)
 
-    async def _load(self, out: Outgoing, first: int, count: int) -> None:
+    async def _load(self, out: OutgoingLog, first: int, count: int) -> None:
         try:
             out.load(first, await self._store.read(out.origin, first, count))
             self._refused_by_store = ""

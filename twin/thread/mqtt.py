@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable
 from fieldtwin.gateway.store.event import Event
 from fieldtwin.twin.thread.frames import Frame
 from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
-from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication, Message
+from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication, MqttMessage
 from fieldtwin.twin.thread.sparkplug_payloads import MAX_PAYLOAD
 
 KEEPALIVE_S = 15
@@ -126,7 +126,7 @@ class MqttLink(Link):
         for message in self.side.hello():
             await self._publish(message)
 
-    async def _publish(self, message: Message) -> None:
+    async def _publish(self, message: MqttMessage) -> None:
         try:
             await self._client.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
         except aiomqtt.MqttError as e:

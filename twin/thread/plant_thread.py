@@ -36,7 +36,7 @@ from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
-from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.execute import CommandLimits
 from fieldtwin.twin.model.status import encode_status
 from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
 from fieldtwin.twin.plant.child_main import child_main
@@ -200,7 +200,7 @@ class PlantThread:
             carrier, self._place = await plant_carrier(c.place, system, clock, connector)
             stack.push_async_callback(carrier.aclose)
             least_s, most_s = system.commands.period_s
-            bounds = Bounds(least_s, most_s, system.commands.per_minute)
+            bounds = CommandLimits(least_s, most_s, system.commands.per_minute)
             self._gate = CommandGate(
                 remote=system.remote == "remote", bounds=bounds, clock=clock, since_ms=await self._since(store, origin)
             )
@@ -253,7 +253,7 @@ class PlantThread:
         """
         now = await client.call("gate")
         least_s, most_s = now["period_s"]
-        self._gate.restate(remote=now["remote"], bounds=Bounds(least_s, most_s, now["per_minute"]))
+        self._gate.restate(remote=now["remote"], bounds=CommandLimits(least_s, most_s, now["per_minute"]))
         command = self._gate.admit(origin, event)
         if command is None:
             self._process.tell_again()

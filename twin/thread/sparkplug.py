@@ -27,8 +27,8 @@ from fieldtwin.twin.thread.frames import Ask, Data, Frame, FrameCodec, Hello, Sc
 from fieldtwin.twin.thread.sparkplug_payloads import (
     BAD_QUALITY,
     GOOD_QUALITY,
-    DataType,
     Metric,
+    MetricType,
     Payload,
     decode_payload,
     encode_payload,
@@ -39,7 +39,7 @@ from fieldtwin.twin.thread.sparkplug_payloads import (
 
 SEQUENCE, TAG, FRAME = "fieldtwin/sequence", "fieldtwin/tag", "fieldtwin/frame"
 OURS = (SEQUENCE, TAG, FRAME)
-OUR_TYPES = {SEQUENCE: DataType.INT64, TAG: DataType.BYTES, FRAME: DataType.BYTES}
+OUR_TYPES = {SEQUENCE: MetricType.INT64, TAG: MetricType.BYTES, FRAME: MetricType.BYTES}
 REBIRTH = "Node Control/Rebirth"
 BD_SEQ = "bdSeq"
 JUDGED = "fieldtwin"
@@ -50,17 +50,17 @@ MAX_EVENTS = 250
 MAX_BYTES = 60_000
 
 
-def types_of(system: System) -> dict[str, DataType]:
+def types_of(system: System) -> dict[str, MetricType]:
     """Return the type with which each tag is announced."""
 
-    def kind(tag: Tag) -> DataType:
-        return DataType.STRING if tag.is_text else DataType.INT64 if tag.is_integer else DataType.DOUBLE
+    def kind(tag: Tag) -> MetricType:
+        return MetricType.STRING if tag.is_text else MetricType.INT64 if tag.is_integer else MetricType.DOUBLE
 
     return {f"{d.name}.{t.name}": kind(t) for d in system.devices.values() for t in d.profile.tags.values()}
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class MqttMessage:
     """A message to publish: `retain` for the state of a host, `qos` as Sparkplug requires."""
 
     topic: str
@@ -69,9 +69,9 @@ class Message:
     retain: bool = False
 
 
-def metric_of(event: Event, now_ms: int, types: Mapping[str, DataType], aliases: Mapping[str, int]) -> Metric:
+def metric_of(event: Event, now_ms: int, types: Mapping[str, MetricType], aliases: Mapping[str, int]) -> Metric:
     """Return an event as a metric. The metric contains its type only if it differs from the announced one."""
-    announced = types.get(event.name, DataType.DOUBLE)
+    announced = types.get(event.name, MetricType.DOUBLE)
     needed = announced if event.value is None else type_of(event.value)
     alias = aliases.get(event.name)
     properties: tuple[tuple[str, int], ...] = ()
@@ -89,14 +89,14 @@ def metric_of(event: Event, now_ms: int, types: Mapping[str, DataType], aliases:
     )
 
 
-def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Mapping[str, DataType]) -> Event:
+def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Mapping[str, MetricType]) -> Event:
     """Return the original event, unchanged. Raises `Desync` for an alias that no birth announced."""
     name = metric.name or names.get(-1 if metric.alias is None else metric.alias, "")
     if not name:
         raise Desync("a metric without a name", expected="an alias of the last birth", got=str(metric.alias))
     judged = dict(metric.properties).get(JUDGED, 0)
     value = metric.value
-    if (metric.datatype or types.get(name)) in (DataType.FLOAT, DataType.DOUBLE) and isinstance(value, int):
+    if (metric.datatype or types.get(name)) in (MetricType.FLOAT, MetricType.DOUBLE) and isinstance(value, int):
         value = float(value)
     return Event(sequence, metric.t_ms, judged >> 16 & 7, name, value, judged >> 8 & 7, judged & 31)
 
@@ -129,10 +129,10 @@ class _Side:
 
     def _control(self, frame: Frame, now_ms: int, alias: int | None) -> Metric:
         (data,) = self._codec.encode(frame)
-        return Metric("" if alias is not None else FRAME, alias, now_ms, DataType.BYTES, data)
+        return Metric("" if alias is not None else FRAME, alias, now_ms, MetricType.BYTES, data)
 
     def _data_frame(
-        self, metrics: Sequence[Metric], names: Mapping[int, str], types: Mapping[str, DataType]
+        self, metrics: Sequence[Metric], names: Mapping[int, str], types: Mapping[str, MetricType]
     ) -> Frame | None:
         """Return the frame in a message; None if it does not belong to a thread."""
         ours = {
@@ -164,7 +164,7 @@ class EdgeNode(_Side):
         node: str,
         host: str,
         schema: Schema,
-        types: Mapping[str, DataType],
+        types: Mapping[str, MetricType],
         bd_seq: int,
         began_ms: int = 0,
     ) -> None:
@@ -172,7 +172,7 @@ class EdgeNode(_Side):
         self.subscriptions = (topic(group, "NCMD", node), state_topic(host))
         self._group, self._node, self._state = group, node, state_topic(host)
         self._types = {
-            **dict.fromkeys(schema.names, DataType.DOUBLE),
+            **dict.fromkeys(schema.names, MetricType.DOUBLE),
             **{n: t for n, t in types.items() if n in schema.names},
             **OUR_TYPES,
         }
@@ -182,18 +182,20 @@ class EdgeNode(_Side):
         self._seq = 0
         self._tag = b""
 
-    def will(self) -> Message:
+    def will(self) -> MqttMessage:
         """Return the NDEATH, which the broker publishes if this side is lost; this side publishes it before it leaves
         by itself.
         """
-        bd = Metric(BD_SEQ, None, self._began_ms, DataType.INT64, self._bd_seq)
-        return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1)
+        bd = Metric(BD_SEQ, None, self._began_ms, MetricType.INT64, self._bd_seq)
+        return MqttMessage(
+            topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1
+        )
 
-    def hello(self) -> list[Message]:
+    def hello(self) -> list[MqttMessage]:
         """Return the messages to publish when the link is established: none, because the birth follows with the HELLO."""
         return []
 
-    def messages(self, frame: Frame, now_ms: int) -> list[Message]:
+    def messages(self, frame: Frame, now_ms: int) -> list[MqttMessage]:
         if isinstance(frame, Hello):
             self._tag = frame.tag
             self._seq = 0
@@ -209,8 +211,8 @@ class EdgeNode(_Side):
 
     def _birth(self, hello: Hello, now_ms: int) -> tuple[Metric, ...]:
         first = (
-            Metric(BD_SEQ, None, now_ms, DataType.INT64, self._bd_seq),
-            Metric(REBIRTH, None, now_ms, DataType.BOOLEAN, 0),
+            Metric(BD_SEQ, None, now_ms, MetricType.INT64, self._bd_seq),
+            Metric(REBIRTH, None, now_ms, MetricType.BOOLEAN, 0),
         )
         tags = tuple(
             Metric(name, alias, now_ms, self._types[name], None)
@@ -221,9 +223,9 @@ class EdgeNode(_Side):
         values: dict[str, Value] = {SEQUENCE: hello.last, TAG: hello.tag, FRAME: frame}
         return first + tags + tuple(Metric(n, self._aliases[n], now_ms, OUR_TYPES[n], values[n]) for n in OURS)
 
-    def _publish(self, kind: str, metrics: tuple[Metric, ...], now_ms: int) -> Message:
+    def _publish(self, kind: str, metrics: tuple[Metric, ...], now_ms: int) -> MqttMessage:
         seq, self._seq = self._seq, (self._seq + 1) & 0xFF
-        return Message(topic(self._group, kind, self._node), encode_payload(Payload(now_ms, metrics, seq)))
+        return MqttMessage(topic(self._group, kind, self._node), encode_payload(Payload(now_ms, metrics, seq)))
 
     def frame(self, where: str, data: bytes) -> Frame | None:
         """Return the frame in a message: a frame of the host's thread, or an ASK after a rebirth or when the host comes
@@ -255,36 +257,36 @@ class HostApplication(_Side):
         self._group, self._node, self._state = group, node, state_topic(host)
         self._began_ms = began_ms
         self._names: dict[int, str] = {}
-        self._types: dict[str, DataType] = {}
+        self._types: dict[str, MetricType] = {}
         self._seq = -1
         self._bd_seq: int | None = None
         self._tag = b""
 
-    def _says(self, online: bool) -> Message:
+    def _says(self, online: bool) -> MqttMessage:
         state = {"online": online, "timestamp": self._began_ms}
-        return Message(self._state, json.dumps(state, separators=(",", ":")).encode(), qos=1, retain=True)
+        return MqttMessage(self._state, json.dumps(state, separators=(",", ":")).encode(), qos=1, retain=True)
 
-    def will(self) -> Message:
+    def will(self) -> MqttMessage:
         """Return the message that the broker publishes if this side is lost."""
         return self._says(online=False)
 
-    def hello(self) -> list[Message]:
+    def hello(self) -> list[MqttMessage]:
         """Return the messages to publish when the link is established: that this host is online, and a request for a rebirth."""
         return [self._says(online=True), self._rebirth(self._began_ms)]
 
-    def _rebirth(self, now_ms: int) -> Message:
-        return self._publish((Metric(REBIRTH, None, now_ms, DataType.BOOLEAN, 1),), now_ms)
+    def _rebirth(self, now_ms: int) -> MqttMessage:
+        return self._publish((Metric(REBIRTH, None, now_ms, MetricType.BOOLEAN, 1),), now_ms)
 
-    def _publish(self, metrics: tuple[Metric, ...], now_ms: int) -> Message:
-        return Message(topic(self._group, "NCMD", self._node), encode_payload(Payload(now_ms, metrics)))
+    def _publish(self, metrics: tuple[Metric, ...], now_ms: int) -> MqttMessage:
+        return MqttMessage(topic(self._group, "NCMD", self._node), encode_payload(Payload(now_ms, metrics)))
 
-    def messages(self, frame: Frame, now_ms: int) -> list[Message]:
+    def messages(self, frame: Frame, now_ms: int) -> list[MqttMessage]:
         if isinstance(frame, Ask):
             return [self._rebirth(now_ms)]
         if isinstance(frame, Data):
             head = (
-                Metric(TAG, None, now_ms, DataType.BYTES, frame.tag),
-                Metric(SEQUENCE, None, now_ms, DataType.INT64, frame.events[0].sequence),
+                Metric(TAG, None, now_ms, MetricType.BYTES, frame.tag),
+                Metric(SEQUENCE, None, now_ms, MetricType.INT64, frame.events[0].sequence),
             )
             return [self._publish(head + tuple(metric_of(e, now_ms, {}, {}) for e in frame.events), now_ms)]
         return [self._publish((self._control(frame, now_ms, None),), now_ms)]
@@ -310,6 +312,6 @@ class HostApplication(_Side):
         bd_seq, frame = by_name.get(BD_SEQ), by_name.get(FRAME)
         self._bd_seq = bd_seq if isinstance(bd_seq, int) else None
         self._names = {m.alias: m.name for m in payload.metrics if m.alias is not None}
-        known = DataType._value2member_map_
-        self._types = {m.name: DataType(m.datatype) for m in payload.metrics if m.datatype in known}
+        known = MetricType._value2member_map_
+        self._types = {m.name: MetricType(m.datatype) for m in payload.metrics if m.datatype in known}
         return self._codec.decode(frame) if isinstance(frame, bytes) else None

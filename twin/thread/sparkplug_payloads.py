@@ -21,7 +21,7 @@ GOOD_QUALITY, BAD_QUALITY = 192, 0
 """Property `Quality` (6.4.18)."""
 
 
-class DataType(IntEnum):
+class MetricType(IntEnum):
     """Types of metrics (6.4.16) that a thread sends; it also reads the other integer types."""
 
     INT8, INT16, INT32, INT64 = 1, 2, 3, 4
@@ -30,7 +30,7 @@ class DataType(IntEnum):
     BYTES = 17
 
 
-_SIGNED = {DataType.INT8: 32, DataType.INT16: 32, DataType.INT32: 32, DataType.INT64: 64}
+_SIGNED = {MetricType.INT8: 32, MetricType.INT16: 32, MetricType.INT32: 32, MetricType.INT64: 64}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +72,13 @@ def state_topic(host: str) -> str:
     return f"{NAMESPACE}/STATE/{host}"
 
 
-def type_of(value: Value) -> DataType:
+def type_of(value: Value) -> MetricType:
     """Return the type that holds a value exactly."""
     if isinstance(value, int):
-        return DataType.INT64
+        return MetricType.INT64
     if isinstance(value, float):
-        return DataType.DOUBLE
-    return DataType.BYTES if isinstance(value, bytes) else DataType.STRING
+        return MetricType.DOUBLE
+    return MetricType.BYTES if isinstance(value, bytes) else MetricType.STRING
 
 
 # -- writing: field number << 3 | wire type (0 varint, 1 64 bits, 2 length and bytes, 5 32 bits) -----------------------------
@@ -106,7 +106,7 @@ def _properties(properties: tuple[tuple[str, int], ...]) -> bytes:
     if not properties:
         return b""
     keys = b"".join(_bytes(1, name.encode()) for name, _ in properties)
-    values = b"".join(_bytes(2, _number(1, DataType.INT32) + _number(3, value)) for _, value in properties)
+    values = b"".join(_bytes(2, _number(1, MetricType.INT32) + _number(3, value)) for _, value in properties)
     return _bytes(9, keys + values)
 
 
@@ -120,7 +120,7 @@ def encode_metric(metric: Metric) -> bytes:
         out += _number(4, metric.datatype)
     if metric.historical:
         out += _number(5, 1)
-    if metric.datatype == DataType.BOOLEAN and metric.value is not None:
+    if metric.datatype == MetricType.BOOLEAN and metric.value is not None:
         return out + _properties(metric.properties) + _number(14, int(bool(metric.value)))
     return out + _properties(metric.properties) + _value(metric.value)
 
@@ -216,7 +216,7 @@ def _decode_metric(data: bytes) -> Metric:
             properties = _decode_properties(_raw(content))
         elif 10 <= number <= 16:
             value = _decode_value(number, content)
-    bits = _SIGNED.get(DataType(datatype)) if datatype in DataType._value2member_map_ else 64
+    bits = _SIGNED.get(MetricType(datatype)) if datatype in MetricType._value2member_map_ else 64
     if bits and isinstance(value, int) and value >> (bits - 1) == 1:
         value -= 1 << bits
     return Metric(name, alias, t_ms, datatype, None if null else value, historical, properties)

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fieldtwin.emulators.faults.can_fault import SYNC, CanFault, CanPiece
 from fieldtwin.emulators.faults.fault import Parameters
-from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.emulators.faults.frames import FrameDirection
 from fieldtwin.gateway.core.canframe import CanFrame
 
 
@@ -20,7 +20,7 @@ class SyncJitter(CanFault):
     name = "sync-jitter"
     summary = "the node receives SYNC up to `most_ms` late"
     form = Form
-    ways = frozenset((Way.REQUEST,))
+    ways = frozenset((FrameDirection.REQUEST,))
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == SYNC

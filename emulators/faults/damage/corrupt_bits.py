@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -24,7 +24,7 @@ class CorruptBits(WireFault):
     )
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         bits = self.parameters.bits
         if self.parameters.fits and frame.pdu:
             return passed(remade(frame, pdu=frame.pdu[:1] + _turned(frame.pdu[1:], bits, random)))

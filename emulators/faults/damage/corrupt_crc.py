@@ -5,14 +5,14 @@ from __future__ import annotations
 from random import Random
 
 from fieldtwin.emulators.faults.fault import FaultEffect, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 
 
 class CorruptCrc(WireFault):
     name = "corrupt-crc"
     summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; no effect over TCP, which has none"
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         data = frame.data
         if frame.framing is Framing.RTU and data:
             return passed(data[:-1] + bytes((data[-1] ^ 0x5A,)))

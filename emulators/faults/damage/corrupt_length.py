@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -23,7 +23,7 @@ class CorruptLength(WireFault):
     )
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         by = self.parameters.by
         if frame.framing is Framing.MBAP:
             length = (int.from_bytes(frame.data[4:6]) + by) & 0xFFFF

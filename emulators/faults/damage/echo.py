@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 
 class Echo(WireFault):
     name = "echo"
     summary = "the sender receives its own frame before the reply"
-    ways = frozenset((Way.REQUEST,))
+    ways = frozenset((FrameDirection.REQUEST,))
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
-        return FaultEffect((Piece(frame.data, back=True), Piece(frame.data)))
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+        return FaultEffect((DelayedBytes(frame.data, back=True), DelayedBytes(frame.data)))

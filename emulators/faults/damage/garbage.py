@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import HEX, FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -20,5 +20,5 @@ class Garbage(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), follow the frame immediately"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(frame.data + (bytes.fromhex(self.parameters.data) or random.randbytes(self.parameters.count)))

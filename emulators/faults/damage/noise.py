@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import HEX, FaultEffect, Parameters, Piece, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import HEX, DelayedBytes, FaultEffect, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -21,9 +21,9 @@ class Noise(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), precede the frame by `lead_ms`"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         p = self.parameters
         before = bytes.fromhex(p.data) or random.randbytes(p.count)
         if not p.lead_ms:
             return passed(before + frame.data)
-        return FaultEffect((Piece(before), Piece(frame.data, p.lead_ms / 1000)))
+        return FaultEffect((DelayedBytes(before), DelayedBytes(frame.data, p.lead_ms / 1000)))

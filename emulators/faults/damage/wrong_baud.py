@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import LOST, FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -19,7 +19,7 @@ class WrongBaud(WireFault):
     summary = "each byte arrives as different bytes, or not at all, as with a baud rate that is wrong by `factor`"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         heard = bytearray()
         credit = 0.0
         for byte in frame.data:

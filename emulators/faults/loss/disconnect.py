@@ -5,7 +5,7 @@ from __future__ import annotations
 from random import Random
 
 from fieldtwin.emulators.faults.fault import LOST, FaultEffect, Hang, WireFault
-from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 
 class Disconnect(WireFault):
@@ -13,10 +13,10 @@ class Disconnect(WireFault):
     summary = (
         "connections are closed at once and new ones refused until the fault ends; a serial line is dead meanwhile"
     )
-    ways = frozenset(Way)
+    ways = frozenset(FrameDirection)
     refuses = True
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST
 
     def appears(self) -> Hang:

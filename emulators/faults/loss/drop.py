@@ -5,13 +5,13 @@ from __future__ import annotations
 from random import Random
 
 from fieldtwin.emulators.faults.fault import LOST, FaultEffect, WireFault
-from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 
 class Drop(WireFault):
     name = "drop"
     summary = "the frame is lost"
-    ways = frozenset(Way)
+    ways = frozenset(FrameDirection)
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST

@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -20,6 +20,6 @@ class Duplicate(WireFault):
     summary = "the frame arrives again, `after_ms` later"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
-        again = Piece(frame.data, self.parameters.after_ms / 1000)
-        return FaultEffect((Piece(frame.data), *[again] * self.parameters.times))
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+        again = DelayedBytes(frame.data, self.parameters.after_ms / 1000)
+        return FaultEffect((DelayedBytes(frame.data), *[again] * self.parameters.times))

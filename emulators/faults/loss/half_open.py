@@ -5,12 +5,12 @@ from __future__ import annotations
 from random import Random
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Hang, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class HalfOpen(WireFault):
     name = "half-open"
     summary = "from this frame on, the connection silently carries no data"
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect(hang=Hang.HALF_OPEN)

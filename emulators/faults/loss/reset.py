@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Hang, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Hang, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -19,5 +19,5 @@ class Reset(WireFault):
     summary = "the connection is reset after the first `at` bytes of the frame"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
-        return FaultEffect((Piece(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+        return FaultEffect((DelayedBytes(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from random import Random
 
 from fieldtwin.emulators.faults.fault import LOST, FaultEffect, WireFault
-from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 
 class Silence(WireFault):
     name = "silence"
     summary = "the device never answers: its requests do not reach it"
-    ways = frozenset((Way.REQUEST,))
+    ways = frozenset((FrameDirection.REQUEST,))
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST

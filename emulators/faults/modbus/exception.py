@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 CODES = {
@@ -35,7 +35,7 @@ class ExceptionReply(WireFault):
     form = Form
     codes = CODES
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if not frame.pdu:
             return passed(frame.data)
         return passed(remade(frame, pdu=bytes((frame.pdu[0] | 0x80, self.parameters.code))))

@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 _BITS = frozenset((1, 2))
@@ -26,7 +26,7 @@ class FewerRegisters(WireFault):
     )
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         pdu = frame.pdu
         width = 1 if frame.function in _BITS else 2 if frame.function in _REGISTERS else 0
         if not width or pdu[0] & 0x80 or len(pdu) < 2 + width:

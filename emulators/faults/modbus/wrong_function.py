@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -20,7 +20,7 @@ class WrongFunction(WireFault):
     summary = "the frame carries function `code` (with a correct check sum)"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if not frame.pdu:
             return passed(frame.data)
         return passed(remade(frame, pdu=bytes((self.parameters.code,)) + frame.pdu[1:]))

@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 
 
 class Form(Parameters):
@@ -24,7 +24,7 @@ class WrongTransaction(WireFault):
     )
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if frame.framing is not Framing.MBAP or len(frame.data) < 4:
             return passed(frame.data)
         p = self.parameters

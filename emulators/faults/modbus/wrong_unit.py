@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.frames import FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -20,5 +20,5 @@ class WrongUnit(WireFault):
     summary = "the frame carries unit ID `unit_id` (with a correct check sum)"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(remade(frame, unit=self.parameters.unit_id))

@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -19,5 +19,5 @@ class Delay(WireFault):
     summary = "the frame arrives `by_ms` later, and delays the frames after it"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
-        return FaultEffect((Piece(frame.data, self.parameters.by_ms / 1000),))
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+        return FaultEffect((DelayedBytes(frame.data, self.parameters.by_ms / 1000),))

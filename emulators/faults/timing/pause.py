@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -20,6 +20,8 @@ class Pause(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         half = len(frame.data) // 2
-        return FaultEffect((Piece(frame.data[:half]), Piece(frame.data[half:], self.parameters.pause_ms / 1000)))
+        return FaultEffect(
+            (DelayedBytes(frame.data[:half]), DelayedBytes(frame.data[half:], self.parameters.pause_ms / 1000))
+        )

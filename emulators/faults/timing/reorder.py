@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -21,18 +21,18 @@ class Reorder(WireFault):
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)
-        self._held: Frame | None = None
+        self._held: FaultFrame | None = None
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         before, self._held = self._held, None
         if before is not None:
-            return FaultEffect((Piece(frame.data, overtake=True), Piece(before.data, overtake=True)))
+            return FaultEffect((DelayedBytes(frame.data, overtake=True), DelayedBytes(before.data, overtake=True)))
         self._held = frame
         return FaultEffect(
-            (Piece(frame.data, self.parameters.most_ms / 1000, overtake=True, gone=lambda: self._went(frame)),)
+            (DelayedBytes(frame.data, self.parameters.most_ms / 1000, overtake=True, gone=lambda: self._went(frame)),)
         )
 
-    def _went(self, frame: Frame) -> bool:
+    def _went(self, frame: FaultFrame) -> bool:
         """Return whether the held frame has already been sent after a later frame. If not, its time is over: release it."""
         if self._held is not frame:
             return True

@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
-from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Parameters, WireFault
+from fieldtwin.emulators.faults.frames import FaultFrame
 
 
 class Form(Parameters):
@@ -22,9 +22,9 @@ class Split(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         p, left, cut = self.parameters, frame.data, list[bytes]()
         while len(left) > p.at and len(cut) < p.times:
             cut.append(left[: p.at])
             left = left[p.at :]
-        return FaultEffect(tuple(Piece(data, n * p.pause_ms / 1000) for n, data in enumerate([*cut, left])))
+        return FaultEffect(tuple(DelayedBytes(data, n * p.pause_ms / 1000) for n, data in enumerate([*cut, left])))

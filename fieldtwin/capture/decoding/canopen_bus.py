@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, Span
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, TouchedSpan
 from fieldtwin.capture.decoding.lss import LssWatch
 from fieldtwin.capture.decoding.node_map import NodeMap, Pdo
 from fieldtwin.capture.decoding.sdo import SdoWatch, Seen, Transfer
@@ -92,7 +92,7 @@ class CanopenBusDecoder:
         text: str,
         data: bytes,
         *,
-        spans: tuple[Span, ...] = (),
+        spans: tuple[TouchedSpan, ...] = (),
         tags: dict[str, Scalar | None] | None = None,
         value: Scalar | None = None,
         problem: str = "",
@@ -107,7 +107,7 @@ class CanopenBusDecoder:
     def _device(self, node: int) -> str:
         return self._nodes[node].name if node in self._nodes else ""
 
-    def _secrets(self, node: int, spans: tuple[Span, ...]) -> frozenset[str]:
+    def _secrets(self, node: int, spans: tuple[TouchedSpan, ...]) -> frozenset[str]:
         return self._nodes[node].tags.secrets(spans) if node in self._nodes else frozenset()
 
     def _called(self, node: int) -> str:
@@ -144,7 +144,7 @@ class CanopenBusDecoder:
         try:
             values = pdo.mapping.unpack(data)
         except FieldtwinError:
-            mapped = [Span("read", "object", e.index, 1, e.subindex) for e in pdo.mapping.entries]
+            mapped = [TouchedSpan("read", "object", e.index, 1, e.subindex) for e in pdo.mapping.entries]
             said = SECRET if node.tags.secrets(mapped) else data.hex(" ")
             text = f"{head} {said}, {pdo.mapping.length} bytes were mapped"
             return self._message(t_ns, pdo.node, pdo.name, text, data, problem="malformed")
@@ -152,7 +152,7 @@ class CanopenBusDecoder:
         tags: dict[str, Scalar | None] = {}
         others, spans = [], []
         for entry, raw in zip(pdo.mapping.entries, values, strict=True):
-            spans.append(Span("read" if access == "read" else "write", "object", entry.index, 1, entry.subindex))
+            spans.append(TouchedSpan("read" if access == "read" else "write", "object", entry.index, 1, entry.subindex))
             found, value = node.value(entry.index, entry.subindex, raw, t_ns)
             tags |= found
             if not found and node.tags.secrets(spans[-1:]):
@@ -237,7 +237,7 @@ class CanopenBusDecoder:
         if known is None:
             return {}, data.hex()
         if not data:
-            named = known.tags.names(Span("read", "object", transfer.index, 1, transfer.subindex))
+            named = known.tags.names(TouchedSpan("read", "object", transfer.index, 1, transfer.subindex))
             return dict.fromkeys(named), None
         return known.value(transfer.index, transfer.subindex, data, t_ns)
 
@@ -245,5 +245,5 @@ class CanopenBusDecoder:
         self._pdos = {cob: pdo for node in self._nodes.values() for cob, pdo in node.pdos.items()}
 
 
-def _span(transfer: Transfer) -> Span:
-    return Span("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex)
+def _span(transfer: Transfer) -> TouchedSpan:
+    return TouchedSpan("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex)

@@ -15,7 +15,7 @@ from typing import Any
 
 from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
 from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
-from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder, Unit
+from fieldtwin.capture.decoding.modbus_connection import KnownUnit, ModbusConnectionDecoder
 from fieldtwin.capture.decoding.tags import TagMap, show_value
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.results.trace import Event, Kind, refusal_text
+from fieldtwin.results.trace import TraceEvent, TraceKind, refusal_text
 from fieldtwin.twin.site.system import System
 
 
@@ -44,12 +44,12 @@ class Decoder:
         self._canopen: dict[str, CanopenBusDecoder] = {}
         self._maps: dict[str, TagMap] = {}
 
-    def decode(self, event: Event) -> Decoded:
+    def decode(self, event: TraceEvent) -> Decoded:
         """Describe an event in words.
 
         Every event of a trace has a description; an unknown bus's bytes are shown unchanged.
         """
-        if event.kind is not Kind.FRAME:
+        if event.kind is not TraceKind.FRAME:
             return Decoded(self._words(event), dict(event.data))
         text, done = self._frame(event)
         fields: dict[str, Any] = {"bus": event.where, **event.data}
@@ -57,9 +57,9 @@ class Decoder:
             fields |= done[-1].describe()
         return Decoded(text, fields, tuple(done))
 
-    def feed(self, event: Event) -> list[DecodedExchange]:
+    def feed(self, event: TraceEvent) -> list[DecodedExchange]:
         """Return the exchanges that an event ended: by an answer, by the next request, or as a message."""
-        return self._frame(event)[1] if event.kind is Kind.FRAME else []
+        return self._frame(event)[1] if event.kind is TraceKind.FRAME else []
 
     def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: requests that still wait have no answer."""
@@ -71,7 +71,7 @@ class Decoder:
         wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.pending()), key=lambda e: e.t_ns)
 
-    def _frame(self, event: Event) -> tuple[str, list[DecodedExchange]]:
+    def _frame(self, event: TraceEvent) -> tuple[str, list[DecodedExchange]]:
         data = event.data
         try:
             raw = bytes.fromhex(data.get("bytes", ""))
@@ -97,7 +97,7 @@ class Decoder:
             framing = framing_of(config.endpoint) if config else self._framings.get(bus, "can")
             if framing == "can":
                 return None
-            units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._devices(bus)}
+            units = {d.address: KnownUnit(d.name, TagMap(d.profile)) for d in self._devices(bus)}
             echo = config.echo if config else False
             self._modbus[bus] = ModbusConnectionDecoder(bus, framing, units, echo=echo, served=bus in self._served)
         return self._modbus[bus]
@@ -110,21 +110,21 @@ class Decoder:
     def _devices(self, bus: str) -> list[DeviceConfig]:
         return self._system.devices_on(bus) if self._system else []
 
-    def _words(self, event: Event) -> str:
+    def _words(self, event: TraceEvent) -> str:
         data, where = event.data, event.where
         match event.kind:
-            case Kind.TAG:
+            case TraceKind.TAG:
                 quality = data.get("quality", "")
                 reason = "" if data.get("reason") in (None, "", "none") else f": {data['reason']}"
                 return f"{where} {self._tag_value(where, data.get('value'))}, {quality}{reason}"
-            case Kind.STATE:
+            case TraceKind.STATE:
                 return f"{where} = {show_value(data.get('value'))}"
-            case Kind.FAULT:
+            case TraceKind.FAULT:
                 state = "on" if data.get("on") else "off"
                 return f"fault {where}: {data.get('name', '')} {state} {data.get('target') or ''}".rstrip()
-            case Kind.REFUSED:
+            case TraceKind.REFUSED:
                 return refusal_text(where, data)
-            case Kind.STEP:
+            case TraceKind.STEP:
                 verdict = f": {data['verdict']}" if data.get("verdict") else ""
                 return f"step {where}: {data.get('text', '')}{verdict}"
         return f"{where}: {data.get('text', '')}"
@@ -139,14 +139,14 @@ class Decoder:
         return self._maps[device].show({name: value}).removeprefix(f"{name} ")
 
 
-def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[DecodedExchange]:
+def exchanges(system: System, events: Iterable[TraceEvent], served: Collection[str] = ()) -> list[DecodedExchange]:
     """Return all exchanges of a trace, in the order of their requests."""
     decoder = Decoder(system, served)
     found = [exchange for event in events for exchange in decoder.feed(event)]
     return sorted(found + decoder.finish(), key=lambda e: (e.t_ns, e.end_ns))
 
 
-def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[Event]:
+def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[TraceEvent]:
     """Return the content of a tap (`fieldtwin run --capture`) as FRAME events.
 
     `start_ns` is the tap's time of the run's start. Endpoints that do not belong to a bus of the system are omitted.
@@ -163,7 +163,7 @@ def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0
             data |= {k: True for k, on in _flags(seen.item) if on}
         else:
             data["bytes"] = seen.item.hex()
-        found.append(Event(seen.t_ns - start_ns, Kind.FRAME, bus, data))
+        found.append(TraceEvent(seen.t_ns - start_ns, TraceKind.FRAME, bus, data))
     return found
 
 

@@ -18,7 +18,7 @@ Access = Literal["read", "write"]
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class TouchedSpan:
     """A piece of a device that an exchange touched: `count` registers or bits of `table` from `address`, or (table
     ``object``) one CANopen object, `address` its index."""
 
@@ -66,7 +66,7 @@ class DecodedExchange:
     unit: int
     function: int
     service: str
-    spans: tuple[Span, ...] = ()
+    spans: tuple[TouchedSpan, ...] = ()
     registers: tuple[int, ...] = ()
     tags: dict[str, Scalar | None] = field(default_factory=dict)
     exception: int | None = None

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, Span
-from fieldtwin.capture.decoding.modbus_frames import Expected, Frame, splitter
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, TouchedSpan
+from fieldtwin.capture.decoding.modbus_frames import Expected, ModbusFrame, splitter
 from fieldtwin.capture.decoding.modbus_pdu import DecodedRequest, parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.gateway.core.values import Scalar
@@ -24,7 +24,7 @@ STRAY_SHOWN = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Unit:
+class KnownUnit:
     """A device on the connection: its name in the system and its tags."""
 
     name: str
@@ -33,7 +33,7 @@ class Unit:
 
 @dataclass(slots=True)
 class _Open:
-    frame: Frame
+    frame: ModbusFrame
     asked: DecodedRequest
     device: str
     tags: TagMap | None
@@ -47,7 +47,7 @@ class ModbusConnectionDecoder:
     """
 
     def __init__(
-        self, bus: str, framing: str, units: dict[int, Unit], *, echo: bool = False, served: bool = False
+        self, bus: str, framing: str, units: dict[int, KnownUnit], *, echo: bool = False, served: bool = False
     ) -> None:
         self.bus = bus
         self._units = units
@@ -100,7 +100,7 @@ class ModbusConnectionDecoder:
             texts.append(self._request(frame, done))
         return texts or [f"{_bytes(self._requests.pending)} of a request"], done
 
-    def _request(self, frame: Frame, done: list[DecodedExchange]) -> str:
+    def _request(self, frame: ModbusFrame, done: list[DecodedExchange]) -> str:
         unit, asked = self._units.get(frame.unit), parse_request(frame.pdu)
         opened = _Open(frame, asked, unit.name if unit else "", unit.tags if unit else None)
         text = opened.text = self._describe(opened)
@@ -168,7 +168,7 @@ class ModbusConnectionDecoder:
         """Conclude the reply at a new request: remaining bytes are a complete reply, or noise."""
         self._judge(self._replies.flush(self._expected()), texts, done)
 
-    def _judge(self, frames: Iterable[Frame], texts: list[str], done: list[DecodedExchange]) -> None:
+    def _judge(self, frames: Iterable[ModbusFrame], texts: list[str], done: list[DecodedExchange]) -> None:
         for frame in frames:
             opened = self._open.get(frame.transaction)
             ours = opened is not None and frame.unit == opened.frame.unit and frame.pdu
@@ -190,7 +190,7 @@ class ModbusConnectionDecoder:
         self._given_up.extend(older)
         return [self._unanswered(self._open.pop(t)) for t in older]
 
-    def _stray(self, frame: Frame, done: list[DecodedExchange]) -> str:
+    def _stray(self, frame: ModbusFrame, done: list[DecodedExchange]) -> str:
         if frame.bad:
             return f"{_bytes(len(frame.raw))} of noise ({frame.bad})"
         unit = self._units.get(frame.unit) or self._sender_of(frame)
@@ -210,14 +210,14 @@ class ModbusConnectionDecoder:
         )  # fmt: skip
         return text
 
-    def _sender_of(self, frame: Frame) -> Unit | None:
+    def _sender_of(self, frame: ModbusFrame) -> KnownUnit | None:
         """Return the sender of a frame with an unknown unit ID: the device of the request, or the only device."""
         opened = self._open.get(frame.transaction)
         if opened is not None and opened.frame.unit in self._units:
             return self._units[opened.frame.unit]
         return next(iter(self._units.values())) if len(self._units) == 1 else None
 
-    def _answered(self, opened: _Open, frame: Frame) -> DecodedExchange:
+    def _answered(self, opened: _Open, frame: ModbusFrame) -> DecodedExchange:
         answer = parse_reply(opened.asked, opened.frame.pdu, frame.pdu)
         span, text = opened.asked.read_span, answer.detail or "done"
         registers: tuple[int, ...] = ()
@@ -235,7 +235,7 @@ class ModbusConnectionDecoder:
     def _exchange(
         self,
         opened: _Open,
-        reply: Frame | None,
+        reply: ModbusFrame | None,
         problem: str,
         reply_text: str,
         registers: tuple[int, ...] = (),
@@ -275,12 +275,12 @@ class ModbusConnectionDecoder:
         )
 
 
-def _values(tags: TagMap | None, span: Span, data: bytes, t_ns: int) -> str:
+def _values(tags: TagMap | None, span: TouchedSpan, data: bytes, t_ns: int) -> str:
     found = tags.of_registers(span, data, t_ns) if tags is not None else {}
     return _shown(tags, span, found, words(span, data))
 
 
-def _shown(tags: TagMap | None, span: Span, found: dict[str, Scalar | None], registers: tuple[int, ...]) -> str:
+def _shown(tags: TagMap | None, span: TouchedSpan, found: dict[str, Scalar | None], registers: tuple[int, ...]) -> str:
     """Return the tags as text if there are any, else the words."""
     if tags is not None and found:
         return tags.show(found)

@@ -20,7 +20,7 @@ _LAST_UNIT = 247
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class ModbusFrame:
     """A frame of unit ID `unit` (-1: not readable), whose last byte came at `t_ns`.
 
     `bad` is its fault, "" for a good frame. `transaction` is MBAP's, -1 elsewhere.
@@ -60,7 +60,7 @@ class Splitter(ABC):
         """Return the number of bytes of a frame that is not complete."""
         return len(self._buffer)
 
-    def feed(self, data: bytes, t_ns: int, expected: Expected | None = None) -> list[Frame]:
+    def feed(self, data: bytes, t_ns: int, expected: Expected | None = None) -> list[ModbusFrame]:
         """Add received bytes and return the frames that are complete."""
         self._buffer += data
         if data:
@@ -68,12 +68,12 @@ class Splitter(ABC):
             self._arrivals.append((self._came, t_ns))
         return self._split(expected, False)
 
-    def flush(self, expected: Expected | None = None) -> list[Frame]:
+    def flush(self, expected: Expected | None = None) -> list[ModbusFrame]:
         """Conclude the frame: no further bytes belong to it, and the remaining ones are a frame, or noise."""
         return self._split(expected, True) if self._buffer else []
 
     @abstractmethod
-    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+    def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         """Take frames off the front."""
 
     def _cut(self, size: int) -> tuple[int, bytes]:
@@ -88,16 +88,16 @@ class Splitter(ABC):
             self._arrivals.popleft()
         return t_ns, raw
 
-    def _noise(self, size: int, why: str) -> Frame:
+    def _noise(self, size: int, why: str) -> ModbusFrame:
         t_ns, raw = self._cut(size)
-        return Frame(t_ns, -1, b"", raw, why)
+        return ModbusFrame(t_ns, -1, b"", raw, why)
 
 
 class RtuSplitter(Splitter):
     """RTU (SL 2.5.1)."""
 
-    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
-        found: list[Frame] = []
+    def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
+        found: list[ModbusFrame] = []
         skipped = 0
         while skipped < len(self._buffer):
             size, bad = self._frame_at(skipped, expected, settled)
@@ -110,7 +110,7 @@ class RtuSplitter(Splitter):
                 found.append(self._noise(skipped, "noise"))
                 skipped = 0
             t_ns, raw = self._cut(size)
-            found.append(Frame(t_ns, raw[0], raw[1:-2], raw, bad))
+            found.append(ModbusFrame(t_ns, raw[0], raw[1:-2], raw, bad))
         if settled and self._buffer:
             found.append(self._noise(len(self._buffer), "no frame"))
         elif skipped and len(self._buffer) > MAX_FRAME:
@@ -173,7 +173,7 @@ def _by_its_byte_count(head: bytearray, size: int, expected: Expected | None) ->
 class AsciiSplitter(Splitter):
     """ASCII (SL 2.5.2): from a colon to LF."""
 
-    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+    def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         found = []
         while self._buffer:
             end = self._buffer.find(b"\n")
@@ -190,20 +190,20 @@ class AsciiSplitter(Splitter):
         return found
 
 
-def _ascii_frame(t_ns: int, raw: bytes) -> Frame:
+def _ascii_frame(t_ns: int, raw: bytes) -> ModbusFrame:
     try:
         body = bytes.fromhex(raw[1:].strip(b"\r\n").decode("ascii"))
     except ValueError:
         body = b""
     if len(body) < 3:
-        return Frame(t_ns, -1, b"", raw, "no frame")
-    return Frame(t_ns, body[0], body[1:-1], raw, "" if sum(body) & 0xFF == 0 else "check sum")
+        return ModbusFrame(t_ns, -1, b"", raw, "no frame")
+    return ModbusFrame(t_ns, body[0], body[1:-1], raw, "" if sum(body) & 0xFF == 0 else "check sum")
 
 
 class MbapSplitter(Splitter):
     """Modbus TCP (TG 3.1.3). After an invalid header the rest of the received bytes is noise."""
 
-    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+    def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         found = []
         while len(self._buffer) >= 6:
             size = 6 + int.from_bytes(self._buffer[4:6])
@@ -215,7 +215,7 @@ class MbapSplitter(Splitter):
             foreign = self._buffer[2:4] != b"\0\0"
             t_ns, raw = self._cut(size)
             bad = "not Modbus: the protocol id is not 0" if foreign else ""
-            found.append(Frame(t_ns, raw[6], raw[7:], raw, bad, int.from_bytes(raw[:2])))
+            found.append(ModbusFrame(t_ns, raw[6], raw[7:], raw, bad, int.from_bytes(raw[:2])))
         if settled and self._buffer:
             found.append(self._noise(len(self._buffer), "no frame"))
         return found

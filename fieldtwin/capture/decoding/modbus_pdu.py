@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
-from fieldtwin.capture.decoding.exchange import Span
+from fieldtwin.capture.decoding.exchange import TouchedSpan
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import Table
 
@@ -38,23 +38,23 @@ class DecodedRequest:
 
     function: int
     service: str
-    spans: tuple[Span, ...] = ()
+    spans: tuple[TouchedSpan, ...] = ()
     written: bytes = b""
     reply_bytes: int = 0
     echoes: int = 0
     problem: str = ""
 
     @property
-    def read_span(self) -> Span | None:
+    def read_span(self) -> TouchedSpan | None:
         return next((s for s in self.spans if s.access == "read"), None)
 
     @property
-    def write_span(self) -> Span | None:
+    def write_span(self) -> TouchedSpan | None:
         return next((s for s in self.spans if s.access == "write"), None)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class DecodedReply:
     """A reply, decoded with its request. `read`: as `DecodedRequest.written`. `detail` describes the rest of the reply."""
 
     read: bytes = b""
@@ -81,7 +81,10 @@ def parse_request(pdu: bytes) -> DecodedRequest:
         address, count = _words(pdu[1:5])
         size = (count + 7) // 8 if function < 3 else 2 * count
         return DecodedRequest(
-            function, service_of(function), (Span("read", _TABLES[function], address, count),), reply_bytes=2 + size
+            function,
+            service_of(function),
+            (TouchedSpan("read", _TABLES[function], address, count),),
+            reply_bytes=2 + size,
         )
     if function in (0x05, 0x06) and len(pdu) == 5:
         written = bytes([pdu[3] != 0]) if function == 0x05 else pdu[3:5]
@@ -98,21 +101,21 @@ def parse_request(pdu: bytes) -> DecodedRequest:
         at, count, to, many = _words(pdu[1:9])
         if pdu[9] != 2 * many or len(pdu) != 10 + 2 * many:
             return malformed
-        spans = (Span("read", "holding", at, count), Span("write", "holding", to, many))
+        spans = (TouchedSpan("read", "holding", at, count), TouchedSpan("write", "holding", to, many))
         return DecodedRequest(function, service_of(function), spans, pdu[10:], 2 + 2 * count)
     return malformed if (function in _TABLES and function != 0x18) or function == 0x17 else _other(function, pdu)
 
 
 def _write(function: int, address: int, count: int, written: bytes, echoes: int) -> DecodedRequest:
-    span = Span("write", _TABLES[function], address, count)
+    span = TouchedSpan("write", _TABLES[function], address, count)
     return DecodedRequest(function, service_of(function), (span,), written, echoes, echoes)
 
 
 def _other(function: int, pdu: bytes) -> DecodedRequest:
     """Decode a request that addresses no register by number, or is not in the standard."""
-    spans: tuple[Span, ...] = ()
+    spans: tuple[TouchedSpan, ...] = ()
     if function == 0x18 and len(pdu) == 3:
-        spans = (Span("read", "holding", int.from_bytes(pdu[1:3])),)
+        spans = (TouchedSpan("read", "holding", int.from_bytes(pdu[1:3])),)
     if function in (0x14, 0x15):
         spans = tuple(_file_spans(pdu))
     fixed = {0x07: 2, 0x08: len(pdu), 0x0B: 5, 0x15: len(pdu)}
@@ -122,37 +125,37 @@ def _other(function: int, pdu: bytes) -> DecodedRequest:
     return DecodedRequest(function, service, spans, reply_bytes=fixed.get(function, 0))
 
 
-def _file_spans(pdu: bytes) -> list[Span]:
+def _file_spans(pdu: bytes) -> list[TouchedSpan]:
     """Return the records of functions 14h and 15h: reference type, file, record, length each (AP 6.14, 6.15)."""
     spans, at = [], 2
     while at + 7 <= len(pdu):
         file, record, count = _words(pdu[at + 1 : at + 7])
         access = "read" if pdu[0] == 0x14 else "write"
-        spans.append(Span("read" if access == "read" else "write", "file", record, count, file))
+        spans.append(TouchedSpan("read" if access == "read" else "write", "file", record, count, file))
         at += 7 + (2 * count if access == "write" else 0)
     return spans
 
 
-def parse_reply(asked: DecodedRequest, request: bytes, pdu: bytes) -> Answer:
+def parse_reply(asked: DecodedRequest, request: bytes, pdu: bytes) -> DecodedReply:
     """Decode a reply PDU to that request. A reply to another function, or of another size, is malformed."""
     if len(pdu) == 2 and pdu[0] == asked.function | 0x80:
-        return Answer(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
+        return DecodedReply(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
     if not pdu or pdu[0] != asked.function or (asked.reply_bytes and len(pdu) != asked.reply_bytes):
-        return Answer(problem="malformed", detail=f"{len(pdu)} bytes that do not answer the request")
+        return DecodedReply(problem="malformed", detail=f"{len(pdu)} bytes that do not answer the request")
     if asked.echoes:
         if pdu == request[: asked.echoes]:
-            return Answer(detail="done")
-        return Answer(problem="malformed", detail=f"does not acknowledge the request: {pdu[1:].hex(' ')}")
+            return DecodedReply(detail="done")
+        return DecodedReply(problem="malformed", detail=f"does not acknowledge the request: {pdu[1:].hex(' ')}")
     span = asked.read_span
     if span is None or asked.function in (0x14, 0x18):
-        return Answer(detail=pdu[1:].hex(" "))
+        return DecodedReply(detail=pdu[1:].hex(" "))
     if pdu[1] != asked.reply_bytes - 2:
-        return Answer(problem="malformed", detail=f"a byte count of {pdu[1]}")
-    return Answer(read=bits(pdu[2:], span.count) if span.table in BIT_TABLES else pdu[2:])
+        return DecodedReply(problem="malformed", detail=f"a byte count of {pdu[1]}")
+    return DecodedReply(read=bits(pdu[2:], span.count) if span.table in BIT_TABLES else pdu[2:])
 
 
-def words(span: Span, data: bytes) -> tuple[int, ...]:
-    """Return registers as numbers, bits as 0 and 1, from `DecodedRequest.written` or `Answer.read`."""
+def words(span: TouchedSpan, data: bytes) -> tuple[int, ...]:
+    """Return registers as numbers, bits as 0 and 1, from `DecodedRequest.written` or `DecodedReply.read`."""
     return tuple(data) if span.table in BIT_TABLES else _words(data)
 
 

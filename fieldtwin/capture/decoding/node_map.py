@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fieldtwin.capture.decoding.exchange import SECRET, Span
+from fieldtwin.capture.decoding.exchange import SECRET, TouchedSpan
 from fieldtwin.capture.decoding.tags import TagMap, show_value
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import Scalar
@@ -100,7 +100,7 @@ class NodeMap:
                 return f"{word & 0x7FF:03X}h" + (" (off)" if word & PDO_INVALID else "")
             if index in _MAPPINGS and subindex:
                 return str(PdoEntry.from_word(word))
-        if self.tags.secrets((Span("read", "object", index, 1, subindex),)):
+        if self.tags.secrets((TouchedSpan("read", "object", index, 1, subindex),)):
             return SECRET
         tags, value = self.value(index, subindex, data, t_ns)
         if not tags:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.capture.decoding.exchange import SECRET, Span
+from fieldtwin.capture.decoding.exchange import SECRET, TouchedSpan
 from fieldtwin.gateway.core.files.profile import Box, DeviceProfile, Tag
 from fieldtwin.gateway.core.values import Scalar, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little
@@ -34,12 +34,12 @@ class TagMap:
     def __init__(self, profile: DeviceProfile) -> None:
         self.profile = profile
         self.by_object = {t.object: t for t in profile.tags.values() if t.object is not None}
-        self._plans: dict[Span, _Plan] = {}
+        self._plans: dict[TouchedSpan, _Plan] = {}
         self._exponents: dict[str, TagValue] = {}
         self._secrets = [t for t in profile.tags.values() if t.secret]
         self._scales = {t.scale_by for t in profile.tags.values() if t.scale_by}
 
-    def names(self, span: Span) -> list[str]:
+    def names(self, span: TouchedSpan) -> list[str]:
         """Return the tags, messages and mailboxes that lie completely in `span`, and objects by name."""
         if span.table == "object":
             tag = self.by_object.get((span.address, span.subindex))
@@ -52,18 +52,18 @@ class TagMap:
         """Return whether the device has any secret tag, so that a frame of unknown content may hold one."""
         return bool(self._secrets)
 
-    def secret(self, span: Span) -> bool:
+    def secret(self, span: TouchedSpan) -> bool:
         """Return whether any part of `span` is secret."""
         return any(_touches(tag, span) for tag in self._secrets)
 
-    def secrets(self, spans: Iterable[Span]) -> frozenset[str]:
+    def secrets(self, spans: Iterable[TouchedSpan]) -> frozenset[str]:
         """Return `Exchange.secrets` of an exchange that touches `spans`."""
         if not self._secrets:
             return frozenset()
         found = {tag.name for span in spans for tag in self._secrets if _touches(tag, span)}
         return frozenset(found | {""}) if found else frozenset()
 
-    def of_registers(self, span: Span, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
+    def of_registers(self, span: TouchedSpan, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
         """Return values by name from the register bytes of `span`, as on the bus; bits as one byte each (0 or 1).
 
         Messages and the payloads of mailboxes are shown in hex. A value that is not a number, or is a sentinel, is
@@ -104,14 +104,14 @@ class TagMap:
             value = apply_scale(tag, value, self._exponents.get(tag.scale_by))
         return value.value.hex() if isinstance(value.value, bytes) else value.value
 
-    def _plan(self, span: Span) -> _Plan:
+    def _plan(self, span: TouchedSpan) -> _Plan:
         if span not in self._plans:
             if len(self._plans) >= _KEPT_PLANS:
                 self._plans.clear()
             self._plans[span] = self._make_plan(span)
         return self._plans[span]
 
-    def _make_plan(self, span: Span) -> _Plan:
+    def _make_plan(self, span: TouchedSpan) -> _Plan:
         profile = self.profile
 
         def inside(table: str, address: int, count: int) -> bool:
@@ -129,7 +129,7 @@ class TagMap:
         )
 
 
-def _touches(tag: Tag, span: Span) -> bool:
+def _touches(tag: Tag, span: TouchedSpan) -> bool:
     if span.table == "object":
         return tag.object == (span.address, span.subindex)
     at = tag.at

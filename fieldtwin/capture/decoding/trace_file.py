@@ -12,13 +12,13 @@ from fieldtwin.capture.decoding.decoder import frame_events
 from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
-from fieldtwin.results.trace import Event, Kind, refusal_data
+from fieldtwin.results.trace import TraceEvent, TraceKind, refusal_data
 from fieldtwin.twin.site.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin simulate --trace` writes it"
 
 
-def read_events(path: Path, system: System) -> Iterator[Event]:
+def read_events(path: Path, system: System) -> Iterator[TraceEvent]:
     """Yield the events of a trace, or the frames of a capture on the system's buses, in ns since the first.
 
     A truncated last line is omitted. Raises `FileInvalid` with the line number for any other invalid line.
@@ -32,21 +32,21 @@ def read_events(path: Path, system: System) -> Iterator[Event]:
         refusals: list[dict[str, Any]] = []
         captured = list(read_capture(path, refusals))
         start_ns = captured[0].t_ns if captured else 0
-        refused = [Event(r["t_ns"] - start_ns, Kind.REFUSED, r["tag"], refusal_data(r)) for r in refusals]
+        refused = [TraceEvent(r["t_ns"] - start_ns, TraceKind.REFUSED, r["tag"], refusal_data(r)) for r in refusals]
         yield from sorted([*frame_events(captured, system, start_ns), *refused], key=lambda event: event.t_ns)
         return
     yield from _trace(path)
 
 
-def _trace(path: Path) -> Iterator[Event]:
-    decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in Kind}
+def _trace(path: Path) -> Iterator[TraceEvent]:
+    decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in TraceKind}
     with open_input(path) as file:
         number = 0
         while line := file.readline(MAX_LINE_BYTES):
             number += 1
             try:
                 t_ns, kind, where, data = decoder.decode(line)
-                event = Event(t_ns, kinds[kind], where, data)
+                event = TraceEvent(t_ns, kinds[kind], where, data)
             except (msgspec.DecodeError, KeyError) as e:
                 if not line.endswith(b"\n") and not file.read(1):
                     return

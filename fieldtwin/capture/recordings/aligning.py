@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from fieldtwin.capture.decoding.exchange import Span
+from fieldtwin.capture.decoding.exchange import TouchedSpan
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 
@@ -214,7 +214,7 @@ class Dialogue:
         return RecordedExchange(recorded.t_s, recorded.unit, recorded.request, reply, recorded.latency_s)
 
 
-def _values(exchange: RecordedExchange) -> tuple[Span, list[int]] | None:
+def _values(exchange: RecordedExchange) -> tuple[TouchedSpan, list[int]] | None:
     """Return the values of the reply to a plain read (functions 01 to 04); None for anything else."""
     if not exchange.reply or not 1 <= exchange.request[0] <= 4:
         return None

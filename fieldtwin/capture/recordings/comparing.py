@@ -15,8 +15,8 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from fieldtwin.capture.decoding.exchange import Span
-from fieldtwin.capture.decoding.modbus_pdu import Answer, DecodedRequest, parse_reply, parse_request, words
+from fieldtwin.capture.decoding.exchange import TouchedSpan
+from fieldtwin.capture.decoding.modbus_pdu import DecodedReply, DecodedRequest, parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.capture.recordings.aligning import Shift
 from fieldtwin.gateway.core.files.profile import DeviceProfile
@@ -222,7 +222,9 @@ class Comparer:
         else:
             self._judge_values(recorded, asked.read_span, one, two)
 
-    def _judge_values(self, recorded: RecordedExchange, span: Span, one: Answer, two: Answer) -> None:
+    def _judge_values(
+        self, recorded: RecordedExchange, span: TouchedSpan, one: DecodedReply, two: DecodedReply
+    ) -> None:
         """Compare the values: tags known to the profile, else registers and bits. One difference per exchange is counted."""
         covered: set[int] = set()
         found: list[tuple[str, str, str]] = []
@@ -321,7 +323,7 @@ def request_of(exchange: RecordedExchange) -> Hashable:
     return exchange.unit, exchange.request
 
 
-def _cells(span: Span) -> Iterator[tuple[str, int]]:
+def _cells(span: TouchedSpan) -> Iterator[tuple[str, int]]:
     return ((span.table, span.address + at) for at in range(span.count))
 
 

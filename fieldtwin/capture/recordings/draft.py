@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import Final
 
-from fieldtwin.capture.decoding.exchange import Span
+from fieldtwin.capture.decoding.exchange import TouchedSpan
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 
@@ -87,7 +87,7 @@ class Drafts:
                 unit.written |= {(span.table, span.address + i) for i in range(span.count)}
 
     @staticmethod
-    def _values(unit: _Unit, span: Span, data: bytes) -> None:
+    def _values(unit: _Unit, span: TouchedSpan, data: bytes) -> None:
         if span.table in ("coil", "discrete"):
             words: tuple[int, ...] = tuple(data[: span.count])
         else:

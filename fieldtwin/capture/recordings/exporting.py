@@ -41,7 +41,7 @@ Rows = Iterator[Sequence[Cell]]
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class TableColumn:
     """A column of a table: its name, and the type of its values (float, int, str)."""
 
     name: str
@@ -86,15 +86,15 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
     if header.kind == "signals":
         if kind not in (".csv", ".parquet"):
             raise UsageError("signals are exported as a table", expected=".csv or .parquet", got=kind)
-        names = [Column(f"{n} ({s.unit})" if s.unit else n, float) for n, s in header.signals.items()]
-        return lambda out: _write_table(out, kind, [Column("t_s", float), *names], _signal_rows(path))
+        names = [TableColumn(f"{n} ({s.unit})" if s.unit else n, float) for n, s in header.signals.items()]
+        return lambda out: _write_table(out, kind, [TableColumn("t_s", float), *names], _signal_rows(path))
     if kind == ".pcap":
         return lambda out: _write_exchanges(path, header, out, framing)
     if kind == ".log":
         raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet or .pcap")
     if profile is not None:
         tags = [t for t in profile.tags.values() if t.readable or t.writable]
-        columns = [*_EXCHANGE_COLUMNS[:4], *(Column(t.name, str if t.is_text else float) for t in tags)]
+        columns = [*_EXCHANGE_COLUMNS[:4], *(TableColumn(t.name, str if t.is_text else float) for t in tags)]
         return lambda out: _write_table(out, kind, columns, _tag_rows(path, profile, [t.name for t in tags]))
     return lambda out: _write_table(out, kind, _EXCHANGE_COLUMNS, _exchange_rows(path))
 
@@ -102,12 +102,13 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
 # -- tables ---------------------------------------------------------------------------------------------------------------
 
 _EXCHANGE_COLUMNS = [
-    Column("t_s", float), Column("unit", int), Column("outcome", str), Column("latency_ms", float), Column("service", str),
-    Column("table", str), Column("address", int), Column("count", int), Column("values", str), Column("request", str),
-    Column("reply", str),
+    TableColumn("t_s", float), TableColumn("unit", int), TableColumn("outcome", str), TableColumn("latency_ms", float),
+    TableColumn("service", str), TableColumn("table", str), TableColumn("address", int), TableColumn("count", int),
+    TableColumn("values", str), TableColumn("request", str), TableColumn("reply", str),
 ]  # fmt: skip
 _FRAME_COLUMNS = [
-    Column("t_s", float), Column("channel", str), Column("id", int), Column("kind", str), Column("dlc", int), Column("data", str),
+    TableColumn("t_s", float), TableColumn("channel", str), TableColumn("id", int), TableColumn("kind", str),
+    TableColumn("dlc", int), TableColumn("data", str),
 ]  # fmt: skip
 
 
@@ -164,11 +165,11 @@ _FORMULA = frozenset("=+-@\t\r\n\0")
 """Characters with which a text cell may not begin."""
 
 
-def _write_table(out: Path, kind: str, columns: Sequence[Column], rows: Rows) -> int:
+def _write_table(out: Path, kind: str, columns: Sequence[TableColumn], rows: Rows) -> int:
     return _write_csv(out, columns, rows) if kind == ".csv" else _write_parquet(out, columns, rows)
 
 
-def _write_csv(out: Path, columns: Sequence[Column], rows: Rows) -> int:
+def _write_csv(out: Path, columns: Sequence[TableColumn], rows: Rows) -> int:
     count = 0
     try:
         file = out.open("w", encoding="utf-8", newline="")
@@ -188,7 +189,7 @@ def _not_a_formula(text: str) -> str:
     return f"'{text}" if text[:1] in _FORMULA and text else text
 
 
-def _write_parquet(out: Path, columns: Sequence[Column], rows: Rows) -> int:
+def _write_parquet(out: Path, columns: Sequence[TableColumn], rows: Rows) -> int:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq

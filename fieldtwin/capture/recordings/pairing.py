@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fieldtwin.capture.decoding.modbus_frames import Expected, Frame, splitter
+from fieldtwin.capture.decoding.modbus_frames import Expected, ModbusFrame, splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.gateway.core.files.recording import ExchangeError, RecordedExchange
 from fieldtwin.gateway.protocols.modbus.crc import crc16
@@ -178,7 +178,7 @@ class MbapPairer(Pairer):
 
 @dataclass(slots=True)
 class _Asked:
-    frame: Frame
+    frame: ModbusFrame
     expected: Expected
     began_ns: int
     noise: ExchangeError = "timeout"
@@ -200,7 +200,7 @@ class SerialPairer(Pairer):
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
         found: list[RecordedExchange] = []
         if self._rtu and self._is_frame(sent, data):
-            frame = Frame(t_ns, data[0], data[1:-2], data)
+            frame = ModbusFrame(t_ns, data[0], data[1:-2], data)
             (self._take_requests if sent else self._take_replies)([frame], found)
         elif sent:
             self._take_requests(self._requests.feed(data, t_ns), found)
@@ -234,7 +234,7 @@ class SerialPairer(Pairer):
     def _expected(self) -> Expected | None:
         return self._asked.expected if self._asked else None
 
-    def _take_requests(self, frames: list[Frame], found: list[RecordedExchange]) -> None:
+    def _take_requests(self, frames: list[ModbusFrame], found: list[RecordedExchange]) -> None:
         for frame in frames:
             if frame.bad or not frame.pdu:
                 self._bad(frame.t_ns, True, frame.raw, frame.bad or "no frame")
@@ -242,7 +242,7 @@ class SerialPairer(Pairer):
             self._settle(found)
             self._ask(frame, found)
 
-    def _ask(self, frame: Frame, found: list[RecordedExchange]) -> None:
+    def _ask(self, frame: ModbusFrame, found: list[RecordedExchange]) -> None:
         if frame.unit == 0:
             found.append(self._exchange(frame.t_ns, 0, frame.pdu, b"", frame.t_ns, None))
             return
@@ -261,7 +261,7 @@ class SerialPairer(Pairer):
             self._asked = None
             found.append(self._exchange(asked.began_ns, asked.frame.unit, asked.frame.pdu, None, 0, asked.noise))
 
-    def _take_replies(self, frames: list[Frame], found: list[RecordedExchange]) -> None:
+    def _take_replies(self, frames: list[ModbusFrame], found: list[RecordedExchange]) -> None:
         for frame in frames:
             asked = self._asked
             ours = asked is not None and frame.unit == asked.frame.unit and bool(frame.pdu)
@@ -290,13 +290,13 @@ class HalfDuplexPairer(SerialPairer):
         self._settle(found)
         return found
 
-    def _either(self, frame: Frame, found: list[RecordedExchange]) -> None:
+    def _either(self, frame: ModbusFrame, found: list[RecordedExchange]) -> None:
         if frame.bad or self._may_answer(frame):
             self._take_replies([frame], found)
         else:
             self._take_requests([frame], found)
 
-    def _may_answer(self, frame: Frame) -> bool:
+    def _may_answer(self, frame: ModbusFrame) -> bool:
         asked = self._asked
         if asked is None or frame.unit != asked.frame.unit or not frame.pdu:
             return False

@@ -15,7 +15,7 @@ from fieldtwin.cli.option_groups import option
 from fieldtwin.cli.options import PROFILES, Duration
 from fieldtwin.commissioning.access.address import ORDERS, TYPES, RawForm
 from fieldtwin.commissioning.access.frame_log import FrameLog
-from fieldtwin.commissioning.access.reading import Target, target_of
+from fieldtwin.commissioning.access.reading import DeviceTarget, target_of
 from fieldtwin.gateway.core.connection import Tap
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -45,7 +45,7 @@ class DeviceOptions:
     echo: bool = option("--echo", is_flag=True, help="Serial: the adapter echoes the sent bytes.")
     profiles: tuple[Path, ...] = option("--profiles", **PROFILES)
 
-    def target(self, endpoint: str) -> Target:
+    def target(self, endpoint: str) -> DeviceTarget:
         """Return the device at `endpoint`. Raises `UsageError`, `FileInvalid`."""
         if endpoint.lower().startswith("can:"):
             if self.unit is not None:

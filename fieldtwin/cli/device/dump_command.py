@@ -16,7 +16,7 @@ from fieldtwin.cli.device.device_options import DeviceOptions, log_option, words
 from fieldtwin.cli.device.dump_view import estimate_text, notes, profile_gaps, summary, unknown_text
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
-from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, Job
+from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, DumpJob
 from fieldtwin.commissioning.dump.dump import Progress as Told
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.dump.profile import dumped_tags
@@ -111,7 +111,7 @@ def command(
         raise UsageError("a dump always writes its log next to itself", got="--log")
     modbus = target.protocol == "modbus"
     spacing_s = 1 / reading.rate if reading.rate else 0.0
-    job = Job(
+    job = DumpJob(
         target,
         spans=register_spans(ranges) if modbus else (),
         objects=() if modbus else object_ranges(ranges),
@@ -160,7 +160,7 @@ def command(
     return 0
 
 
-def _tell_what_is_left_out(job: Job) -> None:
+def _tell_what_is_left_out(job: DumpJob) -> None:
     if job.target.profile is not None and not job.spans and job.target.protocol == "modbus":
         left = [t.name for t in dumped_tags(job.target.profile)[1]]
         if left:

@@ -12,8 +12,8 @@ from fieldtwin.cli.device.value_table import exit_code, value_table
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.commissioning.access.address import tags_of
-from fieldtwin.commissioning.access.point import Answer
-from fieldtwin.commissioning.access.reading import Target, dry_point, read_all, row_of
+from fieldtwin.commissioning.access.point import PointValue
+from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point, read_all, row_of
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.gateway.core.files.profile import Tag
@@ -66,6 +66,6 @@ def command(
     return exit_code(answers.values())
 
 
-async def _read(target: Target, tags: list[Tag], log: Path | None) -> dict[str, Answer]:
+async def _read(target: DeviceTarget, tags: list[Tag], log: Path | None) -> dict[str, PointValue]:
     with logged(log) as taps:
         return await read_all(target, tags, taps=taps)

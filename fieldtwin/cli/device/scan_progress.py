@@ -10,12 +10,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.console import stderr
 
 
 class ScanProgress:
-    """``with ScanProgress(stoppable) as show:``; call it with each `Progress`."""
+    """``with ScanProgress(stoppable) as show:``; call it with each `PhaseProgress`."""
 
     def __init__(self, stoppable: bool) -> None:
         self._hint = "q stops and keeps the results" if stoppable else "Ctrl-C stops and keeps the results"
@@ -32,7 +32,7 @@ class ScanProgress:
         if self._live is not None:
             self._live.stop()
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: PhaseProgress) -> None:
         new = progress.phase != self._phase
         self._phase = progress.phase
         if self._live is None:
@@ -43,7 +43,7 @@ class ScanProgress:
             self._shown = progress.done_s
             self._live.update(self._render(progress), refresh=True)
 
-    def _render(self, progress: Progress) -> Table:
+    def _render(self, progress: PhaseProgress) -> Table:
         table = Table.grid(padding=(0, 1))
         left_s = max(0.0, progress.total_s - progress.done_s)
         table.add_row(
@@ -59,7 +59,7 @@ class ScanProgress:
         return outer
 
 
-def phase_line(progress: Progress) -> str:
+def phase_line(progress: PhaseProgress) -> str:
     """``likely settings: up to 30 s``."""
     about = f": up to {duration(progress.total_s)}" if progress.total_s >= 1 else ""
     return f"{progress.phase}{about}"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.commissioning.access.point import Answer
+from fieldtwin.commissioning.access.point import PointValue
 from fieldtwin.commissioning.access.reading import place_of, text_of
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.values import Reason
@@ -16,7 +16,7 @@ COLOUR = {"good": "", "uncertain": "yellow", "bad": "red"}
 REFUSED, UNREACHABLE = 5, 4
 
 
-def value_table(tags: Sequence[Tag], answers: Mapping[str, Answer]) -> Table:
+def value_table(tags: Sequence[Tag], answers: Mapping[str, PointValue]) -> Table:
     """Return a table with name, value, unit, address and the raw data received."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("name", overflow="fold")
@@ -36,7 +36,7 @@ def value_table(tags: Sequence[Tag], answers: Mapping[str, Answer]) -> Table:
     return table
 
 
-def exit_code(answers: Iterable[Answer]) -> int:
+def exit_code(answers: Iterable[PointValue]) -> int:
     """Return 0 if every value was read; 4 if one was lost on the bus, else 5 if the device refused one."""
     reasons = {a.value.reason for a in answers if a.problem}
     if reasons - {Reason.REFUSED}:

@@ -21,8 +21,8 @@ from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.plotting import check_plot, plot
-from fieldtwin.commissioning.access.point import Answer
-from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, row_of, text_of
+from fieldtwin.commissioning.access.point import PointValue
+from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point, point_at, row_of, text_of
 from fieldtwin.commissioning.access.watching import History, Sample, samples
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -113,7 +113,7 @@ def command(
 class _Watch:
     """Take samples and show them: as one table on a terminal, elsewhere one line per sample."""
 
-    def __init__(self, target: Target, tags: Sequence[Tag], *, as_json: bool) -> None:
+    def __init__(self, target: DeviceTarget, tags: Sequence[Tag], *, as_json: bool) -> None:
         self.histories = {t.name: History() for t in tags}
         self.count = 0
         self.exit_code = 0
@@ -194,10 +194,10 @@ class _Watch:
         return Text(f"{self._target.url}: sample {sample.number}, {sample.t_s:.1f} s{late}{more}. Ctrl-C stops", "dim")
 
 
-def _cell(tag: Tag, answer: Answer) -> str:
+def _cell(tag: Tag, answer: PointValue) -> str:
     return answer.problem or f"{text_of(tag, answer)} {tag.unit}".rstrip()
 
 
-def _short(tag: Tag, answer: Answer) -> dict[str, Any]:
+def _short(tag: Tag, answer: PointValue) -> dict[str, Any]:
     row = row_of(tag, answer)
     return {key: row[key] for key in ("value", "quality", "meaning", "reason", "problem") if key in row}

@@ -19,8 +19,8 @@ from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.access import writing
 from fieldtwin.commissioning.access.address import of_behaviour, tags_of, with_care
 from fieldtwin.commissioning.access.connection import frame_of, modbus_at
-from fieldtwin.commissioning.access.point import Answer, Point, decoded
-from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, text_of
+from fieldtwin.commissioning.access.point import Point, PointValue, decoded
+from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point, point_at, text_of
 from fieldtwin.commissioning.access.writing import Write, Written
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
@@ -107,7 +107,7 @@ def command(
     return 0
 
 
-def _pairs(items: tuple[str, ...], target: Target, raw: RawOptions) -> list[tuple[Tag, str]]:
+def _pairs(items: tuple[str, ...], target: DeviceTarget, raw: RawOptions) -> list[tuple[Tag, str]]:
     if not items:
         raise UsageError("nothing to write", expected="ITEM=VALUE, such as holding:100=42")
     pairs: list[tuple[Tag, str]] = []
@@ -123,7 +123,7 @@ def _pairs(items: tuple[str, ...], target: Target, raw: RawOptions) -> list[tupl
 
 
 async def _write(
-    target: Target, writes: Sequence[Write], log: Path | None, *, yes: bool, hold_s: float | None, blind: bool
+    target: DeviceTarget, writes: Sequence[Write], log: Path | None, *, yes: bool, hold_s: float | None, blind: bool
 ) -> list[Written]:
     with logged(log) as taps:
         async with point_at(target, taps=taps) as point:
@@ -137,7 +137,7 @@ async def _write(
 
 
 async def _carry_out(
-    point: Point, writes: Sequence[Write], old: Sequence[Answer | None], hold_s: float | None
+    point: Point, writes: Sequence[Write], old: Sequence[PointValue | None], hold_s: float | None
 ) -> list[Written]:
     """Write all values in order. With `hold_s`, restore them afterwards, also after a failure or an interruption."""
     done: list[Written] = []
@@ -172,7 +172,7 @@ async def _put_back(point: Point, done: list[Written]) -> list[Written]:
     return back
 
 
-def _show(writes: Sequence[Write], old: Sequence[Answer | None]) -> None:
+def _show(writes: Sequence[Write], old: Sequence[PointValue | None]) -> None:
     for write, before in zip(writes, old, strict=True):
         was = text_of(write.tag, before) if before is not None else "(not read)"
         line = Text.assemble((write.tag.name, "bold"), f": {was} → {_new(write)} {write.tag.unit}".rstrip())
@@ -182,11 +182,11 @@ def _show(writes: Sequence[Write], old: Sequence[Answer | None]) -> None:
 
 
 def _new(write: Write) -> str:
-    return text_of(write.tag, Answer(decoded(write.tag, write.data, 1)))
+    return text_of(write.tag, PointValue(decoded(write.tag, write.data, 1)))
 
 
 def _held(tag: Tag, raw: bytes | None) -> str:
-    return "(not read)" if raw is None else text_of(tag, Answer(decoded(tag, raw, 1)))
+    return "(not read)" if raw is None else text_of(tag, PointValue(decoded(tag, raw, 1)))
 
 
 def _told(written: Written) -> Text:
@@ -212,7 +212,9 @@ def _row(written: Written) -> dict[str, Any]:
     }
 
 
-def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: bool, yes: bool, dry_run: bool) -> int:
+def _restart(
+    target: DeviceTarget, items: Sequence[str], log: Path | None, *, i_know: bool, yes: bool, dry_run: bool
+) -> int:
     """Send function 08h, sub-function 01h: the unit restarts its port and clears its counters (AP 6.8.1)."""
     if items or target.protocol != "modbus":
         raise UsageError("--restart-communications takes no ITEM and needs a Modbus unit")

@@ -10,12 +10,12 @@ import click
 from fieldtwin.cli.emulate.emulate_options import OneDeviceOptions, RecordingOptions, SystemOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import pairs
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.site.data_files import data_root, find
 
 if TYPE_CHECKING:
-    from fieldtwin.run.emulate.device import Extras
+    from fieldtwin.run.emulate.device import ModbusExtras
 
 
 @click.command("emulate", cls=GroupedCommand)
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 @group("One device", device=OneDeviceOptions)
 @group("Recordings", replay=RecordingOptions)
 @group("System", field=SystemOptions)
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 def command(
     what: str,
     device: OneDeviceOptions,
     replay: RecordingOptions,
     field: SystemOptions,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
 ) -> int:
     """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file. A plain name is a profile, else a system.
 
@@ -136,12 +136,12 @@ def _emulate_one(kind: str, path: Path, device: OneDeviceOptions, replay: Record
     )  # fmt: skip
 
 
-def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | None) -> Extras | None:
+def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | None) -> ModbusExtras | None:
     """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
     from fieldtwin.emulators.device_faults import check_device
     from fieldtwin.emulators.faults.schema import load_faults
     from fieldtwin.gateway.core.files.profile import load_profile
-    from fieldtwin.run.emulate.device import Extras
+    from fieldtwin.run.emulate.device import ModbusExtras
 
     values, faults = device.values, device.faults_file
     if not (values or faults or device.any_unit):
@@ -161,7 +161,7 @@ def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | N
         if unknown is not None:
             raise UsageError(f"{profile.name} has no tag {unknown!r}", expected=", ".join(profile.tags))
     said = load_faults(Path(faults), lambda spec: check_device(spec, profile)) if faults else ()
-    return Extras(held, said, device.seed, device.any_unit)
+    return ModbusExtras(held, said, device.seed, device.any_unit)
 
 
 def _values(said: tuple[str, ...]) -> dict[str, float | str]:

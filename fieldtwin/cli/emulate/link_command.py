@@ -15,7 +15,7 @@ from fieldtwin.emulators.can_link import CanLink
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.frames import FrameDirection, Framing
 from fieldtwin.emulators.faults.on_link import check_can_link, check_link, wire_faults
 from fieldtwin.emulators.faults.schema import FaultSpec, load_faults
 from fieldtwin.emulators.link import run_link
@@ -131,7 +131,7 @@ async def _can(near: Endpoint, far: Endpoint, faults: WireFaults) -> None:
         try:
             raise await asyncio.shield(link.ended)
         finally:
-            to, back = link.passed[Way.REQUEST], link.passed[Way.REPLY]
+            to, back = link.passed[FrameDirection.REQUEST], link.passed[FrameDirection.REPLY]
             stderr.print(f"{to} frames to {far}, {back} back, {link.lost} lost", soft_wrap=True, markup=False)
 
 

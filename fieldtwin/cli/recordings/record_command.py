@@ -20,9 +20,9 @@ from fieldtwin.capture.recordings.sinks import CanLogSink, ExchangeSink, LineSin
 from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logged, words
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
-from fieldtwin.cli.recordings.record_options import FileOptions, PollOptions, SourceOptions
+from fieldtwin.cli.recordings.record_options import FileOptions, PollOptions, RecordingSourceOptions
 from fieldtwin.commissioning.access.address import tags_of
-from fieldtwin.commissioning.access.reading import Target, dry_point
+from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point
 from fieldtwin.commissioning.record.asking import frame_for
 from fieldtwin.commissioning.record.polling import (
     PollCounters,
@@ -50,14 +50,14 @@ REFRESH_S = 0.5
 
 @click.command("record", cls=GroupedCommand)
 @click.argument("endpoint", required=False)
-@group("Source", source=SourceOptions)
+@group("Source", source=RecordingSourceOptions)
 @group("Polling", polling=PollOptions)
 @group("Device", device=DeviceOptions)
 @group("Output", files=FileOptions)
 @group("Output", log_option, json_option)
 def command(
     endpoint: str | None,
-    source: SourceOptions,
+    source: RecordingSourceOptions,
     polling: PollOptions,
     device: DeviceOptions,
     files: FileOptions,
@@ -155,7 +155,7 @@ class _Job:
 
     # -- kinds --------------------------------------------------------------------------------------------------------
 
-    def polls(self, target: Target, one_round: Round, device: str) -> int:
+    def polls(self, target: DeviceTarget, one_round: Round, device: str) -> int:
         if self._polling.dry_run:
             return self._dry(frame_for(target.url, unit, pdu) for unit, pdu in one_round.asks)
         counters = PollCounters()
@@ -181,7 +181,7 @@ class _Job:
                 click.echo(frame if isinstance(frame, str) else frame.hex(" "))
         return 0
 
-    def bus(self, target: Target, node: int | None) -> int:
+    def bus(self, target: DeviceTarget, node: int | None) -> int:
         polled = target.profile is not None or target.dictionary is not None
         if not polled and node is not None:
             raise UsageError(

@@ -12,7 +12,7 @@ from fieldtwin.cli.options import Duration
 
 
 @dataclass(frozen=True)
-class SourceOptions:
+class RecordingSourceOptions:
     """The source of a recording that replaces polling a device by the tags of its profile."""
 
     taps: tuple[str, str] | None = option(

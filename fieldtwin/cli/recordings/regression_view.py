@@ -14,9 +14,9 @@ from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.cli.recordings.regression_options import ToleranceOptions
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
+from fieldtwin.scenarios.regression.as_scenario import ScenarioOptions, as_scenario
 from fieldtwin.scenarios.regression.comparing import Allowed, RunComparison, compare
-from fieldtwin.scenarios.regression.run_history import story_of
+from fieldtwin.scenarios.regression.run_history import run_history
 from fieldtwin.twin.site.system import System
 
 SHOWN = 30
@@ -45,7 +45,9 @@ def allowed_of(options: ToleranceOptions) -> Allowed:
 
 def judged(system: System, old: Path, new: Path, allowed: Allowed) -> RunComparison:
     """Compare the run in `new` with the run in `old`. Raises `FileInvalid`."""
-    return compare(story_of(system, read_events(old, system)), story_of(system, read_events(new, system)), allowed)
+    return compare(
+        run_history(system, read_events(old, system)), run_history(system, read_events(new, system)), allowed
+    )
 
 
 def show(verdict: RunComparison, old: Path, *, as_json: bool) -> int:
@@ -101,7 +103,7 @@ def write_scenario(
     if not out.name.endswith(SUFFIX):
         raise UsageError("a scenario's name", expected=f"NAME{SUFFIX}", got=out.name)
     beside = Path(named).is_file()
-    wanted = Wanted(
+    wanted = ScenarioOptions(
         f"{system.name}, as in {run.name}",
         os.path.relpath(system.path.resolve(), out.resolve().parent) if beside else f"{system.name}.yaml",
         allowed.share,
@@ -110,7 +112,7 @@ def write_scenario(
         values,
         run.name,
     )
-    text = as_scenario(system, story_of(system, read_events(run, system)), wanted)
+    text = as_scenario(system, run_history(system, read_events(run, system)), wanted)
     try:
         with out.open("x", encoding="utf-8") as file:
             file.write(text)

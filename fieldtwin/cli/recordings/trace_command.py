@@ -14,11 +14,11 @@ from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.recordings.regression_options import ToleranceOptions
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 
 
 @click.command("trace", cls=GroupedCommand)
@@ -49,7 +49,7 @@ from fieldtwin.results.trace import Event, Kind
     ),
     tolerance=ToleranceOptions,
 )
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group(
     "Output",
     click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead."),
@@ -68,7 +68,7 @@ def command(
     seed: int | None,
     set_values: bool,
     tolerance: ToleranceOptions,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     as_json: bool,
 ) -> int:
     """Show FILE, a trace (simulate --trace) or a capture (run --capture) of SYSTEM, with decoded frames. With --json,
@@ -125,30 +125,32 @@ def command(
     return 0
 
 
-def _decoded(decoder: Decoder, events: Iterator[Event], end_ns: int | None) -> Iterator[tuple[Event, Decoded]]:
+def _decoded(
+    decoder: Decoder, events: Iterator[TraceEvent], end_ns: int | None
+) -> Iterator[tuple[TraceEvent, Decoded]]:
     for event in events:
         if end_ns is not None and event.t_ns > end_ns:
             return
         yield event, decoder.decode(event)
 
 
-def _wanted(only: tuple[str, ...], event: Event, decoded: Decoded) -> bool:
+def _wanted(only: tuple[str, ...], event: TraceEvent, decoded: Decoded) -> bool:
     names = {event.where, event.where.partition(".")[0], *(e.device for e in decoded.exchanges)}
     told = decoded.text.partition(":")[0]  # a request names its device as well
-    return not only or not names.isdisjoint(only) or (event.kind is Kind.FRAME and told in only)
+    return not only or not names.isdisjoint(only) or (event.kind is TraceKind.FRAME and told in only)
 
 
-def _line(event: Event, decoded: Decoded) -> str:
-    if event.kind is Kind.FRAME:
+def _line(event: TraceEvent, decoded: Decoded) -> str:
+    if event.kind is TraceKind.FRAME:
         head = f"{event.where} {'→' if event.data.get('dir') == 'sent' else '←'}"
     else:
         head = event.kind.value
     return f"{event.t_ns / NS_PER_S:12.6f}  {head:<10}  {decoded.text}"
 
 
-def _show_refusal(event: Event, decoded: Decoded, only: tuple[str, ...], *, as_json: bool) -> None:
+def _show_refusal(event: TraceEvent, decoded: Decoded, only: tuple[str, ...], *, as_json: bool) -> None:
     """Report a write that did not reach its device: nothing was sent, so no exchange shows it."""
-    if event.kind is not Kind.REFUSED or not _wanted(only, event, decoded):
+    if event.kind is not TraceKind.REFUSED or not _wanted(only, event, decoded):
         return
     if as_json:
         click.echo(json.dumps({"t_s": event.t_ns / NS_PER_S, "refused": event.where, **event.data}))

@@ -13,7 +13,7 @@ import msgspec
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
@@ -219,7 +219,7 @@ def why(tag: str, instance: str, as_json: bool) -> int:
     return 0
 
 
-def _agreed(system: str, sources: SourceOptions) -> System:
+def _agreed(system: str, sources: TemplateSearchOptions) -> System:
     """Return the system whose program is inspected: the program is imported, and nothing is opened."""
     from fieldtwin.run.template import system_file
 
@@ -230,8 +230,8 @@ def _agreed(system: str, sources: SourceOptions) -> System:
 @click.argument("system")
 @click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a state table.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Output file; default: stdout.")
-@group("Options", sources=SourceOptions)
-def diagram(system: str, program: str, output: Path | None, sources: SourceOptions) -> int:
+@group("Options", sources=TemplateSearchOptions)
+def diagram(system: str, program: str, output: Path | None, sources: TemplateSearchOptions) -> int:
     """Draw the state table of a program of SYSTEM as SVG."""
     from fieldtwin.plc.diagram import svg
     from fieldtwin.run.processes.plc_client import chosen, table_of
@@ -256,14 +256,14 @@ def diagram(system: str, program: str, output: Path | None, sources: SourceOptio
     type=click.Path(dir_okay=False, path_type=Path),
     help="Write a counterexample to this file, as a scenario.",
 )
-@group("Options", sources=SourceOptions)
+@group("Options", sources=TemplateSearchOptions)
 @json_option
 def prove(
     system: str,
     program: str,
     max_states: int,
     output: Path | None,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     as_json: bool,
 ) -> int:
     """Check all reachable states of a program of SYSTEM against its invariants.

@@ -15,7 +15,7 @@ from rich.text import Text
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.plc.prove import Proof, Result
+from fieldtwin.plc.prove import Proof, SearchResult
 from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
 from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
 
@@ -247,7 +247,7 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
             stdout.print(f"    {name} was {_value(value)}", markup=False)
 
 
-def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
+def print_proof(name: str, proof: Proof, result: SearchResult, text: str) -> None:
     seen = f"{result.states} states, {result.transitions} scans, {result.depth} deep"
     if result.proved:
         stdout.print(f"{name}: proved for {seen}", markup=False)

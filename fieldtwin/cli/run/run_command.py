@@ -16,13 +16,13 @@ from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, moved_options, option
 from fieldtwin.cli.options import Duration, Secret, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, listen_option, systems_of
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.run.processes.topside import DEFAULT_SCRIPT
 from fieldtwin.run.template import system_file
-from fieldtwin.service.attached import Service, ServiceOptions, check
+from fieldtwin.service.attached import RunService, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
 
@@ -67,7 +67,7 @@ class PlaceOptions:
 
 
 @dataclass(frozen=True)
-class FieldOptions:
+class EmulationOptions:
     """Where the devices of a prototype are emulated, and the file of their faults, empty for none."""
 
     can: str = option(
@@ -128,9 +128,9 @@ class ThreadOptions:
 @click.argument("system", shell_complete=systems)
 @group("Plant or prototype", place=PlaceOptions)
 @group("Simulated devices", replay=ReplayOptions)
-@group("Simulated devices", listen_option, commands_option, field=FieldOptions)
+@group("Simulated devices", listen_option, commands_option, field=EmulationOptions)
 @group("Digital thread", thread=ThreadOptions)
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group(
     "Output",
     click.option(
@@ -160,9 +160,9 @@ def command(
     commands: tuple[int, ...] | None,
     listen: dict[str, str],
     replay: ReplayOptions,
-    field: FieldOptions,
+    field: EmulationOptions,
     thread: ThreadOptions,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     capture: Path | None,
     metrics: str,
     log: Format | None,
@@ -262,7 +262,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
             if service_options.log is None:
                 print_mapping(session)
                 show_warnings(session.system.warnings)
-            async with Service(session, service_options, notifier) as service:
+            async with RunService(session, service_options, notifier) as service:
                 if service_options.log is None:
                     print_metrics(service.url)
                 if hasattr(signal, "SIGHUP"):

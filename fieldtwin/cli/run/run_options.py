@@ -11,7 +11,7 @@ import click
 
 from fieldtwin.cli.option_groups import option
 from fieldtwin.cli.options import pairs
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.processes.topside import parse_periods
 from fieldtwin.run.template import agree
@@ -62,7 +62,7 @@ listen_option = click.option(
 
 def systems_of(
     file: str,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     others: Mapping[str, object],
     available: str,
     *,

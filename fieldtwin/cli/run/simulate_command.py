@@ -15,7 +15,7 @@ from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, systems_of
 from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.template import system_file
 
@@ -58,7 +58,7 @@ class ManyRuns(SeedOptions):
     ),
     choice=FaultChoice,
 )
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group(
     "Output",
     click.option(
@@ -82,7 +82,7 @@ def command(
     replay: ReplayOptions,
     faults: str,
     choice: FaultChoice,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     trace: Path | None,
     compare: Path | None,
     as_json: bool,

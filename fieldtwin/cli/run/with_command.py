@@ -11,7 +11,7 @@ from rich.markup import escape
 from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.run.run_options import ReplayOptions, listen_option
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import show_warnings, stderr
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -26,7 +26,7 @@ LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "
 @click.option("--faults", default="", metavar="FILE", help="Inject these faults (see fieldtwin faults).")
 @click.option("--instance", default="", help="Name of a permanent run directory; default: a temporary one.")
 @click.option("--quiet", is_flag=True, help="Do not print the environment.")
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 def command(
     system: str,
     argv: tuple[str, ...],
@@ -35,7 +35,7 @@ def command(
     faults: str,
     instance: str,
     quiet: bool,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
 ) -> int:
     """Run CMD against the simulated field devices of SYSTEM, or of a template, and end with CMD's exit status.
 

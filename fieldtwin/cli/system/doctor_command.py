@@ -10,7 +10,7 @@ import click
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import stdout
 from fieldtwin.doctor.checks import examine
-from fieldtwin.doctor.verdicts import Check, HostVerdict
+from fieldtwin.doctor.verdicts import DoctorCheck, HostVerdict
 
 MARK = {
     HostVerdict.OK: "[green]ok[/green]  ",
@@ -39,7 +39,7 @@ def command(as_json: bool) -> int:
     return 1 if any(c.verdict is HostVerdict.BAD for c in checks) else 0
 
 
-def _show(check: Check) -> None:
+def _show(check: DoctorCheck) -> None:
     stdout.print(f"{MARK[check.verdict]} {check.name:<16} {check.found}", soft_wrap=True)
     if check.advice:
         stdout.print(f"{'':21}{check.advice}", soft_wrap=True)

@@ -29,7 +29,7 @@ from fieldtwin.twin.template.check import (
     software_difference,
     unified,
 )
-from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.pack import TemplateExtras, collect, pack
 from fieldtwin.twin.template.package import FolderPackage, open_package, unpack
 from fieldtwin.twin.template.software import modules_hash
 from fieldtwin.twin.template.template import DOCUMENTS, DocumentKind, Manifest
@@ -75,7 +75,7 @@ def pack_command(
     loaded = load_system(system, profiles)
     beside = prototype_path(loaded)
     collected = collect(loaded, profiles, prototype_file or (beside if beside.is_file() else None))
-    manifest = pack(loaded, collected, Extras(_documents(documents), wheel), __version__, out)
+    manifest = pack(loaded, collected, TemplateExtras(_documents(documents), wheel), __version__, out)
     if as_json:
         _print_json({"template": str(out), **_described(manifest)})
         return 0

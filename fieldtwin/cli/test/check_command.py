@@ -27,7 +27,7 @@ from fieldtwin.results.subject import who
 if TYPE_CHECKING:
     from fieldtwin.conformance.clients.run import ClientPlan
     from fieldtwin.conformance.clients.session import Listener
-    from fieldtwin.conformance.core.case import Case
+    from fieldtwin.conformance.core.case import ClientCase
     from fieldtwin.conformance.core.results import CaseResult
     from fieldtwin.emulators.modbus.bank import Table
 
@@ -86,7 +86,7 @@ class MasterOptions:
         help="Skip test cases with a higher impact level.",
     )
 
-    def plan(self, choice: CaseOptions, cases: Sequence[Case], has: frozenset[str] = frozenset()) -> ClientPlan:
+    def plan(self, choice: CaseOptions, cases: Sequence[ClientCase], has: frozenset[str] = frozenset()) -> ClientPlan:
         """Return the plan. `has` are the options that some cases need."""
         from fieldtwin.conformance.clients.run import ClientPlan
         from fieldtwin.conformance.core.case import Impact
@@ -256,12 +256,12 @@ def _judged(
     protocol: str,
     endpoint: str,
     plan: ClientPlan,
-    cases: Sequence[Case],
+    cases: Sequence[ClientCase],
     choice: CaseOptions,
     files: ResultOptions,
 ) -> int:
     """Run the test, show the results, write the files, and return the exit code."""
-    from fieldtwin.cli.test.check_view import Progress
+    from fieldtwin.cli.test.check_view import CheckProgress
     from fieldtwin.conformance.clients.frame_log import MasterLog
     from fieldtwin.conformance.clients.results import as_json, as_report
     from fieldtwin.conformance.clients.session import Listener
@@ -276,7 +276,7 @@ def _judged(
     began = started.isoformat(timespec="seconds")
     with ExitStack() as stack:
         log = stack.enter_context(MasterLog(files.log_path, endpoint, words)) if files.log_path else None
-        progress = stack.enter_context(Progress(sum(case.chosen(plan.only) for case in cases)))
+        progress = stack.enter_context(CheckProgress(sum(case.chosen(plan.only) for case in cases)))
         listener = Listener(progress.say, progress.tell, *([log.on_event] if log is not None else []))
         found = run(judge(listener))
     results = [waive(result, waivers, started.date()) for result in found]

@@ -60,7 +60,7 @@ class CareOptions:
     by: str | None = option("--by", help="Name of the tester, for the reports.  [default: your login name]")
 
 
-class Check:
+class DeviceCheck:
     """The common parts of the two commands: the plan, the confirmation, the files."""
 
     def __init__(
@@ -128,7 +128,7 @@ class Check:
 
         Ctrl-C ends it after the present test case, a second one at once; changed values are restored in any case.
         """
-        from fieldtwin.cli.test.check_view import Progress
+        from fieldtwin.cli.test.check_view import CheckProgress
         from fieldtwin.commissioning.access.frame_log import FrameLog
         from fieldtwin.console import stderr
         from fieldtwin.gateway.wallclock import run
@@ -136,7 +136,7 @@ class Check:
         with ExitStack() as stack:
             path = self.files.log_path
             log = stack.enter_context(FrameLog(path, self.words)) if path is not None else None
-            progress = stack.enter_context(Progress(most, "examining its answers"))
+            progress = stack.enter_context(CheckProgress(most, "examining its answers"))
 
             def go_on() -> str:
                 if self.interrupted:

@@ -11,7 +11,7 @@ import click
 
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration
-from fieldtwin.cli.test.check_device import CareOptions, Check
+from fieldtwin.cli.test.check_device import CareOptions, DeviceCheck
 from fieldtwin.cli.test.check_options import CaseOptions, ResultOptions
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -82,7 +82,7 @@ def modbus(
     may_write = {table: (at, count) for table, at, count in map(_cell, writes)}
     if set(may_write) - {"holding", "coil"}:
         raise UsageError("--write", expected="holding:ADDRESS or coil:ADDRESS", got=", ".join(writes))
-    check = Check("modbus", endpoint, unit, care, choice, files)
+    check = DeviceCheck("modbus", endpoint, unit, care, choice, files)
     plan = check.plan(CASES, set(may_write), bool(writes))
     to_do = ModbusOptions(
         endpoint, unit, plan, timeout_s, 1 / care.rate, echo, share_bus=share_bus,
@@ -174,7 +174,7 @@ def canopen(
     if not Endpoint.parse(endpoint).is_can:
         raise UsageError("CANopen needs a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
     may_write = tuple(_object(text) for text in writes)
-    check = Check("canopen", endpoint, node, care, choice, files)
+    check = DeviceCheck("canopen", endpoint, node, care, choice, files)
     has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
     plan = check.plan(CASES, has, bool(writes))
     to_do = CanopenOptions(

@@ -42,7 +42,7 @@ MARK = {
 DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magenta"}
 
 
-class Progress:
+class CheckProgress:
     """A progress bar on a terminal; elsewhere failures are printed as they occur."""
 
     def __init__(self, most: int, at_first: str = "learning the polling pattern") -> None:
@@ -52,7 +52,7 @@ class Progress:
         )  # fmt: skip
         self._task = self._bar.add_task(at_first, total=most)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> CheckProgress:
         self._bar.start()
         return self
 

@@ -22,7 +22,7 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.check_options import JunitOptions
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.conformance.core.case import Impact
@@ -70,7 +70,7 @@ class _WithCommand(GroupedCommand):
     ),
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group("Output", junit=JunitOptions)
 @group(
     "Output",
@@ -91,7 +91,7 @@ def command(
     retries: int,
     waivers: str | None,
     campaign: CampaignOptions,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     junit: JunitOptions,
     html: str | None,
     trace: str | None,
@@ -117,7 +117,7 @@ def command(
     """
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
     from fieldtwin.results.model import Report, key_of
-    from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+    from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
     from fieldtwin.run.targets.template_scenarios import agree_to_scenario
     from fieldtwin.scenarios.judging.waiving import all_well, ids_of, waive
     from fieldtwin.scenarios.language.form import load_scenario
@@ -140,7 +140,7 @@ def command(
     show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
-    where = Target(
+    where = ScenarioTarget(
         target,
         seed,
         at.instance,

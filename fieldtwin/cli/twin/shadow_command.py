@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.run.shadow.shadow import Shadowing
 from fieldtwin.run.template import system_file
-from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.site.system import System, load_system
 
@@ -32,7 +32,7 @@ class ShadowTalk:
         self._quiet = quiet
         self._states: dict[str, str] = {}
 
-    def __call__(self, verdict: Verdict) -> None:
+    def __call__(self, verdict: AnalysisFinding) -> None:
         known = verdict.finding == "agree" and self._states.get(verdict.subject) == verdict.text
         if self._quiet or known or (verdict.again and verdict.fine):
             return

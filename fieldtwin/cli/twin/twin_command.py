@@ -12,7 +12,7 @@ import click
 
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
@@ -24,7 +24,7 @@ from fieldtwin.run.shadow.rules import Plans, PythonPlanner, load_planner, quest
 from fieldtwin.run.shadow.shadow import limits_of
 from fieldtwin.run.shadow.twin import Twinning
 from fieldtwin.run.template import system_file
-from fieldtwin.run.what_if.asking import Asking, Subject
+from fieldtwin.run.what_if.asking import Asking, ForkSubject
 from fieldtwin.twin.model.mape.plan import RulePlanner
 from fieldtwin.twin.model.mape.what_if import Question
 from fieldtwin.twin.plant.instance import Instance
@@ -95,7 +95,7 @@ from fieldtwin.twin.site.system import System, load_system
         help="Prototype file of the simulation; default: next to the system file.",
     ),
 )
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group(
     "Output",
     json_option,
@@ -113,7 +113,7 @@ def command(
     store: str,
     duration_s: float,
     instance: str,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     as_json: bool,
 ) -> int:
     """Run the digital twin of SYSTEM: like `fieldtwin shadow`, and command the plant by rules for its findings.
@@ -134,7 +134,7 @@ def command(
     with Instance(instance or f"{loaded.name}-twin") as here:
         by_hand = [encode_period(period) for period in periods]
         talks = TwinTalk(quiet=as_json)
-        subject = Subject(loaded, folders, prototype_file)
+        subject = ForkSubject(loaded, folders, prototype_file)
         asking = (
             Asking(subject, WallClock(), timeout_s, talks.asks)
             if questions or isinstance(plans.planner, PythonPlanner)

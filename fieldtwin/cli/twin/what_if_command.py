@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
-from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.twin.what_if_view import show
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
@@ -63,7 +63,7 @@ from fieldtwin.run.what_if.state import KnownState
         "--prototype-file", type=click.Path(path_type=Path), help="Prototype file; default: next to the system file."
     ),
 )
-@group("Profiles and templates", sources=SourceOptions)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 @group(
     "Output",
     json_option,
@@ -83,7 +83,7 @@ def command(
     seed: int | None,
     prototype_file: Path | None,
     save_state: Path | None,
-    sources: SourceOptions,
+    sources: TemplateSearchOptions,
     as_json: bool,
 ) -> int:
     """Simulate SYSTEM in virtual time from its present state, and show the effect of a plan.

@@ -50,7 +50,7 @@ MOST_SILENT = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PointValue:
     """A tag's value, or a bad value whose `problem` is the error of the device or the connection."""
 
     value: TagValue
@@ -66,8 +66,8 @@ class Point(Protocol):
     """Number of requests, or transfers, sent to it."""
 
     async def read(
-        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
-    ) -> dict[str, Answer]:
+        self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
+    ) -> dict[str, PointValue]:
         """Return each tag's value by name, read in as few requests as possible.
 
         A refused or lost read is an answer too; only errors that end the connection are raised. `found` then holds the
@@ -163,8 +163,8 @@ class ModbusPoint:
         return self._client
 
     async def read(
-        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
-    ) -> dict[str, Answer]:
+        self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
+    ) -> dict[str, PointValue]:
         """Read as `Point.read`. A tag that is scaled by a second tag reads that tag too.
 
         With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: the tags
@@ -172,7 +172,7 @@ class ModbusPoint:
         """
         found = {} if found is None else found
         plan = self._plan(self._with_scales(tags))
-        answers: dict[str, Answer] = {}
+        answers: dict[str, PointValue] = {}
         todo, silent = list(plan.reads), 0
         try:
             while todo:
@@ -195,7 +195,9 @@ class ModbusPoint:
                 else:
                     silent = 0
                     plan.taken(read)
-                    answers |= {t.name: Answer(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags}
+                    answers |= {
+                        t.name: PointValue(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags
+                    }
             plan.pass_ended()
         finally:
             found |= {t.name: self._scaled(t, answers) for t in tags if t.name in answers}
@@ -235,12 +237,12 @@ class ModbusPoint:
                     known.setdefault(tag.scale_by, self._profile.tags[tag.scale_by])
         return list(known.values())
 
-    def _scaled(self, tag: Tag, answers: dict[str, Answer]) -> Answer:
+    def _scaled(self, tag: Tag, answers: dict[str, PointValue]) -> PointValue:
         answer = answers[tag.name]
         if tag.scale_by is None or answer.problem:
             return answer
         by = answers.get(tag.scale_by)
-        return Answer(apply_scale(tag, answer.value, by.value if by is not None else None))
+        return PointValue(apply_scale(tag, answer.value, by.value if by is not None else None))
 
     def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
         """Return the gateway's own planner over just these tags; later calls use what was learnt."""
@@ -267,10 +269,10 @@ class CanopenPoint:
         return self._master
 
     async def read(
-        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
-    ) -> dict[str, Answer]:
+        self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
+    ) -> dict[str, PointValue]:
         """Read as `Point.read`: one transfer a tag, so `alone` has no effect."""
-        answers: dict[str, Answer] = {} if found is None else found
+        answers: dict[str, PointValue] = {} if found is None else found
         for tag in tags:
             assert tag.object is not None
             self.requests += 1
@@ -281,7 +283,7 @@ class CanopenPoint:
             except WIRE_TROUBLE as e:
                 answers |= _bad([tag], Reason.TIMEOUT if isinstance(e, ReplyTimeout) else Reason.WIRE_ERROR, e)
             else:
-                answers[tag.name] = Answer(decoded(tag, data, 1))
+                answers[tag.name] = PointValue(decoded(tag, data, 1))
         return answers
 
     async def write(self, tag: Tag, data: bytes) -> None:
@@ -355,5 +357,5 @@ def read_request(at: RegisterRange) -> Request[Any]:
 
 def _bad(
     tags: Sequence[Tag], reason: Reason, error: DeviceRefused | ReplyTimeout | CrcError | Desync
-) -> dict[str, Answer]:
-    return {t.name: Answer(TagValue(None, Quality.BAD, reason), error.message) for t in tags}
+) -> dict[str, PointValue]:
+    return {t.name: PointValue(TagValue(None, Quality.BAD, reason), error.message) for t in tags}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class PhaseProgress:
     """A phase in words, and its elapsed and estimated seconds (`total_s` 0: not known)."""
 
     phase: str

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.commissioning.access.connection import canopen_at, modbus_at
-from fieldtwin.commissioning.access.point import Answer, CanopenPoint, ModbusPoint, Point
+from fieldtwin.commissioning.access.point import CanopenPoint, ModbusPoint, Point, PointValue
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -26,7 +26,7 @@ MOST_HEX_BYTES = 48
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class DeviceTarget:
     """A device: its endpoint, its unit ID or node ID, and its profile or EDS."""
 
     url: str
@@ -52,7 +52,7 @@ def target_of(
     bitrate: int = 0,
     timeout_s: float = 1.0,
     echo: bool = False,
-) -> Target:
+) -> DeviceTarget:
     """Return the device that a command line names. Without `address` it is the profile's factory setting, else 1.
 
     A serial line whose URL states no baud rate or frame takes the profile's. Raises `UsageError` where endpoint and
@@ -75,12 +75,12 @@ def target_of(
     address = 1 if address is None else address
     eds = eds or (profile.eds_path if profile is not None else None)
     dictionary = load_dictionary(eds, address) if eds is not None else None
-    return Target(url, address, profile, dictionary, bitrate, timeout_s, echo)
+    return DeviceTarget(url, address, profile, dictionary, bitrate, timeout_s, echo)
 
 
 @asynccontextmanager
 async def point_at(
-    target: Target,
+    target: DeviceTarget,
     *,
     taps: Sequence[Tap] = (),
     spacing_s: float = 0.0,
@@ -115,18 +115,18 @@ async def point_at(
 
 
 async def read_all(
-    target: Target,
+    target: DeviceTarget,
     tags: Sequence[Tag],
     *,
     taps: Sequence[Tap] = (),
-) -> dict[str, Answer]:
+) -> dict[str, PointValue]:
     """Read each of `tags` once, and return a value or a problem for each of them by name.
 
     A tag that cannot be read (`access: wo`) is not requested. A tag of a request that failed is read alone. If the
     connection is lost, the tags that were not read before have that as their problem; if none was read, the error is
     raised: `Unreachable` or `ConnectionLost`.
     """
-    found: dict[str, Answer] = {}
+    found: dict[str, PointValue] = {}
     lost: Unreachable | None = None
     try:
         async with point_at(target, taps=taps) as point:
@@ -138,21 +138,21 @@ async def read_all(
     return {t.name: found.get(t.name) or _not_read(t, lost) for t in tags}
 
 
-def _not_read(tag: Tag, lost: Unreachable | None) -> Answer:
+def _not_read(tag: Tag, lost: Unreachable | None) -> PointValue:
     if not tag.readable:
-        return Answer(TagValue(None, Quality.BAD, Reason.REFUSED), "not asked: it can only be written (access: wo)")
+        return PointValue(TagValue(None, Quality.BAD, Reason.REFUSED), "not asked: it can only be written (access: wo)")
     problem = lost.message if lost is not None else "not asked"
-    return Answer(TagValue(None, Quality.BAD, Reason.UNREACHABLE), problem)
+    return PointValue(TagValue(None, Quality.BAD, Reason.UNREACHABLE), problem)
 
 
-def dry_point(target: Target) -> Point:
+def dry_point(target: DeviceTarget) -> Point:
     """Return the device for `--dry-run`: it returns frames and cannot send."""
     if target.protocol == "canopen":
         return CanopenPoint(None, target.url, target.address)
     return ModbusPoint(None, target.url, target.address, target.profile)
 
 
-def text_of(tag: Tag, answer: Answer) -> str:
+def text_of(tag: Tag, answer: PointValue) -> str:
     """Return a value for display, with the profile's name of the number if it has one; secrets are hidden."""
     value = answer.value.value
     if value is None:
@@ -177,7 +177,7 @@ def place_of(tag: Tag) -> str:
     return f"{tag.object[0]:04X}h:{tag.object[1]:02X}"
 
 
-def row_of(tag: Tag, answer: Answer) -> dict[str, Any]:
+def row_of(tag: Tag, answer: PointValue) -> dict[str, Any]:
     """Return a value for JSON. `raw` are the bytes that the device sent, in hex (bits one per byte)."""
     value = answer.value
     shown = value.value.hex() if isinstance(value.value, bytes) else value.value

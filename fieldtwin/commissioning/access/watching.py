@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fieldtwin.commissioning.access.point import Answer, Point
+from fieldtwin.commissioning.access.point import Point, PointValue
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.files.profile import Tag
 
@@ -36,7 +36,7 @@ class History:
     most: float = -math.inf
     _last: object = None
 
-    def add(self, t_s: float, answer: Answer) -> None:
+    def add(self, t_s: float, answer: PointValue) -> None:
         value = answer.value.value
         good = answer.value.good
         number = float(value) if isinstance(value, int | float) and good else None
@@ -74,7 +74,7 @@ class Sample:
 
     number: int
     t_s: float
-    answers: Mapping[str, Answer]
+    answers: Mapping[str, PointValue]
     late_s: float
 
 

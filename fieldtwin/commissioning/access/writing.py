@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from fieldtwin.commissioning.access.address import AUTO
-from fieldtwin.commissioning.access.point import Answer, ModbusPoint, Point, encoded
+from fieldtwin.commissioning.access.point import ModbusPoint, Point, PointValue, encoded
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.values import Scalar
@@ -123,7 +123,7 @@ def check_broadcast(point: Point, *, i_know: bool) -> None:
         raise NotAllowed("unit 0 is a broadcast to all units of the line, and no unit answers it", expected="--i-know")
 
 
-async def before(point: Point, write: Write) -> Answer | None:
+async def before(point: Point, write: Write) -> PointValue | None:
     """Return the device's current value; None where it cannot be read.
 
     Raises `CheckFailed` where the device refuses or does not answer: without the old value a write cannot be undone.
@@ -140,7 +140,7 @@ async def before(point: Point, write: Write) -> Answer | None:
     return answer
 
 
-async def carry_out(point: Point, write: Write, old: Answer | None) -> Written:
+async def carry_out(point: Point, write: Write, old: PointValue | None) -> Written:
     """Write, read back, compare. A nonvolatile value that is held already is not written.
 
     Raises `VerifyFailed` when the device acknowledged the write but holds a different value, and the errors of

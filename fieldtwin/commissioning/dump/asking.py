@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from fieldtwin.commissioning.dump.objects import ObjectKey
-from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, RefusedRead, Silent, Taken
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import (
     Bug,
@@ -60,7 +60,7 @@ class AskResult:
     requests: int
 
 
-class Asker(Protocol):
+class DeviceReader(Protocol):
     """Asks one device."""
 
     async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
@@ -118,7 +118,7 @@ class ModbusAsker:
                 if e.code in (NO_PATH, NO_TARGET):
                     raise  # a gateway speaks, and not the device
                 if e.code not in (ACKNOWLEDGE, BUSY) or busy >= MOST_BUSY:
-                    return AskResult(Refused(e.code), self._us(asked_ns), lost + busy + 1)
+                    return AskResult(RefusedRead(e.code), self._us(asked_ns), lost + busy + 1)
                 busy += 1
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + round(BUSY_WAIT_S * NS_PER_S))
             except (ReplyTimeout, CrcError, Desync) as e:
@@ -162,7 +162,7 @@ class CanopenAsker:
                 outcome: Outcome = Taken(await self._master.sdo_upload(self._node, asked.index, asked.subindex))
             except SdoAborted as e:
                 if e.code != TIMED_OUT:
-                    outcome = Refused(e.code)
+                    outcome = RefusedRead(e.code)
                 else:
                     outcome = Silent(e.message)
             except (ReplyTimeout, CrcError, Desync) as e:

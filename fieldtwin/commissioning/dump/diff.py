@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 from fieldtwin.commissioning.access.address import tag_of_entry
-from fieldtwin.commissioning.access.point import Answer, decoded
+from fieldtwin.commissioning.access.point import PointValue, decoded
 from fieldtwin.commissioning.access.reading import text_of
 from fieldtwin.commissioning.dump.coverage import INVALID, REFUSED, SILENT
 from fieldtwin.commissioning.dump.file import Cell, Dump, Pass
@@ -228,7 +228,7 @@ def _tags(profile: DeviceProfile | None, dictionary: ObjectDictionary | None) ->
 
 
 def _shown(tag: Tag, value: TagValue | None) -> str:
-    return "-" if value is None else f"{text_of(tag, Answer(value))} {tag.unit}".rstrip()
+    return "-" if value is None else f"{text_of(tag, PointValue(value))} {tag.unit}".rstrip()
 
 
 def _diff_unnamed(out: Differences, left: Dump, right: Dump, named: set[Cell], leave: Leave) -> int:

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fieldtwin.commissioning.access.frame_log import FrameLog
-from fieldtwin.commissioning.access.reading import Target
-from fieldtwin.commissioning.dump.asking import PROBES, Asker, AskResult
+from fieldtwin.commissioning.access.reading import DeviceTarget
+from fieldtwin.commissioning.dump.asking import PROBES, AskResult, DeviceReader
 from fieldtwin.commissioning.dump.beyond import beyond_silence, other_lengths
 from fieldtwin.commissioning.dump.file import (
     LATENCY_LIMITS_NS,
@@ -31,7 +31,7 @@ from fieldtwin.commissioning.dump.file import (
 )
 from fieldtwin.commissioning.dump.objects import EVERYTHING, ListedObjects, ObjectKey, ObjectSweep, of_dictionary
 from fieldtwin.commissioning.dump.profile import ProfileSweep, dumped_tags
-from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Sweep, TableMap, Taken
+from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, RefusedRead, Silent, Sweep, TableMap, Taken
 from fieldtwin.gateway.core.clock import NS_PER_S, NS_PER_US, Clock
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
 from fieldtwin.gateway.core.files.profile import RegisterRange, gap_text
@@ -49,7 +49,7 @@ Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class DumpJob:
     """The task of a dump.
 
     For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride`
@@ -59,7 +59,7 @@ class Job:
     silent or allows a value to be read only whole. `spacing_s`: the pause after each request, which counts against it.
     """
 
-    target: Target
+    target: DeviceTarget
     spans: tuple[RegisterRange, ...] = ()
     objects: tuple[tuple[int, int], ...] = ()
     stride: int = 8
@@ -113,7 +113,7 @@ class Job:
 
 
 @dataclass
-class Result:
+class DumpResult:
     """The result of a dump. `requests` counts those sent in this session, `replayed` those answered from the file."""
 
     maps: list[TableMap] = field(default_factory=list)
@@ -129,8 +129,8 @@ class Dumper:
 
     def __init__(
         self,
-        job: Job,
-        asker: Asker,
+        job: DumpJob,
+        asker: DeviceReader,
         clock: Clock,
         writer: DumpWriter,
         log: FrameLog | None = None,
@@ -142,9 +142,9 @@ class Dumper:
         self._recorded = deque(line for line in lines if not line.keys() & set(NOT_OF_THE_JOB))
         self._progress = progress
         self._so_far = Dump("", job.header())
-        self.result = Result()
+        self.result = DumpResult()
 
-    async def run(self) -> Result:
+    async def run(self) -> DumpResult:
         """Run all passes and return the result.
 
         Raises `Unreachable` where the device answered no request at all, and errors that end a connection; the answers
@@ -231,7 +231,7 @@ class Dumper:
     async def _read_again(self, asked: RegisterRange | ObjectKey) -> None:
         """Repeat a read, and halve it if it is refused: there may be a border where two sweeps' reads met."""
         outcome = await self._outcome(asked)
-        if isinstance(outcome, Refused) and isinstance(asked, RegisterRange) and asked.count > 1:
+        if isinstance(outcome, RefusedRead) and isinstance(asked, RegisterRange) and asked.count > 1:
             half = asked.count // 2
             await self._read_again(RegisterRange(asked.table, asked.address, half))
             await self._read_again(RegisterRange(asked.table, asked.address + half, asked.count - half))
@@ -302,7 +302,7 @@ class Dumper:
         return line
 
 
-def check_resumable(job: Job, earlier: Dump) -> None:
+def check_resumable(job: DumpJob, earlier: Dump) -> None:
     """Raise `FileInvalid` when `earlier` is the dump of a different job."""
     now = job.header()
     different = [key for key, value in now.items() if earlier.header.get(key) != value]
@@ -315,7 +315,7 @@ def check_resumable(job: Job, earlier: Dump) -> None:
         )
 
 
-def started(job: Job, clock: Clock) -> dict[str, Any]:
+def started(job: DumpJob, clock: Clock) -> dict[str, Any]:
     """Return the header of a new dump."""
     return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns()), "by": who()}
 
@@ -339,7 +339,7 @@ def _line(asked: AskResult) -> dict[str, Any]:
     outcome = asked.outcome
     if isinstance(outcome, Taken):
         return {"hex": outcome.raw.hex(), "us": asked.us}
-    if isinstance(outcome, Refused):
+    if isinstance(outcome, RefusedRead):
         return {"code": outcome.code, "us": asked.us}
     if isinstance(outcome, Invalid):
         return {"invalid": outcome.problem, "us": asked.us} | ({"values": outcome.values} if outcome.values else {})

@@ -42,7 +42,7 @@ from fieldtwin.commissioning.dump.coverage import (
     joined,
 )
 from fieldtwin.commissioning.dump.objects import ObjectKey
-from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, RefusedRead, Silent, Taken
 from fieldtwin.gateway.core.clock import NS_PER_S, NS_PER_US
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import RegisterRange, Table, gap_text, resolve_gap
@@ -291,7 +291,7 @@ def take_read(dump: Dump, line: dict[str, Any]) -> int:
 def _take_outcome(current: Pass, cell: Cell, outcome: Outcome) -> None:
     if isinstance(outcome, Taken):
         current.cells[cell] = outcome.raw
-    elif isinstance(outcome, Refused):
+    elif isinstance(outcome, RefusedRead):
         current.refused[cell] = outcome.code
     elif isinstance(outcome, Silent):
         current.silent[cell] = outcome.problem
@@ -299,7 +299,7 @@ def _take_outcome(current: Pass, cell: Cell, outcome: Outcome) -> None:
         current.invalid[cell] = outcome.problem
 
 
-STATE_OF = {Taken: READABLE, Refused: REFUSED, Silent: SILENT, Invalid: INVALID}
+STATE_OF = {Taken: READABLE, RefusedRead: REFUSED, Silent: SILENT, Invalid: INVALID}
 
 
 def outcome_of(line: dict[str, Any]) -> Outcome:
@@ -308,7 +308,7 @@ def outcome_of(line: dict[str, Any]) -> Outcome:
     if "hex" in line:
         return Taken(bytes.fromhex(line["hex"]), us)
     if "code" in line:
-        return Refused(int(line["code"]), us)
+        return RefusedRead(int(line["code"]), us)
     if "invalid" in line:
         return Invalid(str(line["invalid"]), us, int(line.get("values", 0)))
     return Silent(str(line["silent"]), us)

@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 
 from fieldtwin.commissioning.dump.coverage import coarse_to_fine
-from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Invalid, Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Invalid, Outcome, RefusedRead, Silent, Taken
 from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
@@ -104,7 +104,7 @@ class ObjectSweep(_Patience):
         outcome = yield from self._ask(index, 0)
         if isinstance(outcome, Taken) and len(outcome.raw) == 1 and outcome.raw[0]:
             yield from self._members(index, outcome.raw[0])
-        elif isinstance(outcome, Refused) and outcome.code == NO_SUBINDEX:
+        elif isinstance(outcome, RefusedRead) and outcome.code == NO_SUBINDEX:
             yield from self._members(index, 1)
 
     def _members(self, index: int, count: int) -> Generator[ObjectKey, Outcome, None]:
@@ -112,7 +112,9 @@ class ObjectSweep(_Patience):
         missing = 0
         for sub in range(1, min(count, 254) + 1):
             outcome = yield from self._ask(index, sub)
-            missing = missing + 1 if isinstance(outcome, Refused) and outcome.code in (NO_SUBINDEX, NO_OBJECT) else 0
+            missing = (
+                missing + 1 if isinstance(outcome, RefusedRead) and outcome.code in (NO_SUBINDEX, NO_OBJECT) else 0
+            )
             if self.stopped or self.lost or missing >= MOST_MISSING or (missing and sub == 1):
                 return
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from fieldtwin.commissioning.access.point import asked_profile
 from fieldtwin.commissioning.dump.coverage import joined
-from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Asking, Invalid, Refused, Silent, TableMap, Taken
+from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Asking, Invalid, RefusedRead, Silent, TableMap, Taken
 from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, Tag
 from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan
 
@@ -42,9 +42,9 @@ class ProfileSweep:
                 self.plan.taken(read)
                 found.readable = joined([*found.readable, (read.range.address, read.range.end)])
                 found.max_read = max(found.max_read, read.range.count)
-            elif isinstance(outcome, Refused):
+            elif isinstance(outcome, RefusedRead):
                 found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1
-            if isinstance(outcome, Refused) and outcome.code in (ILLEGAL_ADDRESS, TOO_LONG):
+            if isinstance(outcome, RefusedRead) and outcome.code in (ILLEGAL_ADDRESS, TOO_LONG):
                 todo[:0] = self.plan.refused(read, outcome.code)
             elif isinstance(outcome, Silent | Invalid) and heard:  # one register of several may be the reason
                 todo[:0] = self.plan.refused(read)

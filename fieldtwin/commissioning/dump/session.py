@@ -14,8 +14,8 @@ from fieldtwin.commissioning.access.address import raw_tag
 from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modbus_at
 from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.commissioning.access.point import CanopenPoint, read_request
-from fieldtwin.commissioning.dump.asking import Asker, CanopenAsker, ModbusAsker
-from fieldtwin.commissioning.dump.dump import Dumper, Job, Progress, Result, check_resumable, started
+from fieldtwin.commissioning.dump.asking import CanopenAsker, DeviceReader, ModbusAsker
+from fieldtwin.commissioning.dump.dump import Dumper, DumpJob, DumpResult, Progress, check_resumable, started
 from fieldtwin.commissioning.dump.file import TABLES, Dump, DumpWriter, load_dump
 from fieldtwin.commissioning.dump.objects import ListedObjects, ObjectSweep
 from fieldtwin.commissioning.dump.profile import ProfileSweep
@@ -73,7 +73,7 @@ def object_ranges(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
     return tuple(ranges)
 
 
-def estimate(job: Job, spacing_s: float) -> Estimate:
+def estimate(job: DumpJob, spacing_s: float) -> Estimate:
     """Return the estimated number of requests and duration of a pass at this rate."""
     least = most = 0
     for sweep in job.sweeps():
@@ -102,7 +102,7 @@ def estimate(job: Job, spacing_s: float) -> Estimate:
     return Estimate(least, most, least * (each + long_s), most * (each + short_s), budgets_s)
 
 
-def frames(job: Job) -> list[str]:
+def frames(job: DumpJob) -> list[str]:
     """Return the frames that would be sent if everything could be read."""
     target = job.target
     shown: list[str] = []
@@ -133,7 +133,7 @@ def log_path(out: Path) -> Path:
 
 
 async def dump(
-    job: Job,
+    job: DumpJob,
     out: Path,
     *,
     words: str,
@@ -143,7 +143,7 @@ async def dump(
     progress: Progress = lambda done, total, requests: None,
     connector: Connector | None = None,
     clock: Clock | None = None,
-) -> Result:
+) -> DumpResult:
     """Dump to the file `out`, which must not exist unless `resume`. Raises as `Dumper.run`, and `FileInvalid`.
 
     For a file that is complete, `resume` only makes further passes.
@@ -175,8 +175,8 @@ async def dump(
 
 
 async def _run(
-    job: Job, asker: Asker, clock: Clock, out: Path, earlier: Dump | None, log: FrameLog, progress: Progress
-) -> Result:
+    job: DumpJob, asker: DeviceReader, clock: Clock, out: Path, earlier: Dump | None, log: FrameLog, progress: Progress
+) -> DumpResult:
     resume_at = earlier.whole_bytes if earlier is not None else 0 if out.exists() and not out.stat().st_size else None
     writer = DumpWriter(out, resume_at=resume_at)
     try:

@@ -40,7 +40,7 @@ class Taken:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class RefusedRead:
     """The device answered with this exception."""
 
     code: int
@@ -64,7 +64,7 @@ class Invalid:
     values: int = 0
 
 
-Outcome = Taken | Refused | Silent | Invalid
+Outcome = Taken | RefusedRead | Silent | Invalid
 Asking = Generator[RegisterRange, Outcome, None]
 Trying = Generator[RegisterRange, Outcome, bool]
 
@@ -331,7 +331,7 @@ class Sweep:
             self._add(found.readable, address, address + count)
             found.max_read = max(found.max_read, count)
             found.limit_proved |= count == self.standard
-        elif isinstance(outcome, Refused):
+        elif isinstance(outcome, RefusedRead):
             self._silent = 0
             self.coverage.note(at, REFUSED)
             found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from datetime import datetime
 
-from fieldtwin.capture.decoding.exchange import Span
+from fieldtwin.capture.decoding.exchange import TouchedSpan
 from fieldtwin.capture.decoding.modbus_pdu import BIT_TABLES, parse_reply, parse_request
 from fieldtwin.commissioning.dump.file import VERSION, Cell, Dump, Pass
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -92,7 +92,7 @@ def _values(exchange: RecordedExchange) -> dict[Cell, bytes] | None:
     return _cells(span, answer.read)
 
 
-def _cells(span: Span, data: bytes) -> dict[Cell, bytes] | None:
+def _cells(span: TouchedSpan, data: bytes) -> dict[Cell, bytes] | None:
     width = 1 if span.table in BIT_TABLES else 2
     if len(data) != span.count * width:
         return None

@@ -69,7 +69,7 @@ class _Sent(Tap):
         """Ignore CAN frames: Modbus has none."""
 
 
-class Asker:
+class RecordingClient:
     """Asks through `client`. Times count from `zero_ns` of `clock`."""
 
     def __init__(self, client: ModbusClient, clock: Clock, endpoint: Endpoint, sent: _Sent, zero_ns: int) -> None:
@@ -128,7 +128,7 @@ async def asker_at(
     taps: tuple[Tap, ...] = (),
     connector: Connector | None = None,
     clock: Clock | None = None,
-) -> AsyncIterator[Asker]:
+) -> AsyncIterator[RecordingClient]:
     """Yield an asker on the endpoint `url`; errors as `modbus_at`. Times count from `zero_ns`, by default from now."""
     clock = clock or WallClock()
     endpoint = Endpoint.parse(url)
@@ -136,4 +136,4 @@ async def asker_at(
     async with modbus_at(
         url, timeout_s=timeout_s, spacing_s=spacing_s, echo=echo, taps=(sent, *taps), connector=connector, clock=clock
     ) as client:
-        yield Asker(client, clock, endpoint, sent, clock.monotonic_ns() if zero_ns is None else zero_ns)
+        yield RecordingClient(client, clock, endpoint, sent, clock.monotonic_ns() if zero_ns is None else zero_ns)

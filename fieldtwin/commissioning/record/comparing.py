@@ -15,8 +15,8 @@ from fieldtwin.capture.recordings.aligning import Dialogue
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules
 from fieldtwin.capture.recordings.comparing_can import TRANSFERS, Frames, compare_logs
 from fieldtwin.commissioning.access.connection import canopen_at
-from fieldtwin.commissioning.access.reading import Target
-from fieldtwin.commissioning.record.asking import Asker, changes
+from fieldtwin.commissioning.access.reading import DeviceTarget
+from fieldtwin.commissioning.record.asking import RecordingClient, changes
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
@@ -41,7 +41,7 @@ def cells_written(request: bytes) -> set[Cell]:
 
 async def compare_device(
     recorded: Iterable[RecordedExchange],
-    asker: Asker,
+    asker: RecordingClient,
     comparer: Comparer,
     *,
     unit: int | None = None,
@@ -73,7 +73,7 @@ async def compare_device(
 
 async def _ask_all(
     recorded: Iterable[RecordedExchange],
-    asker: Asker,
+    asker: RecordingClient,
     comparer: Comparer,
     dialogue: Dialogue,
     unit: int | None,
@@ -134,7 +134,7 @@ def uploads_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
 
 async def compare_node(
     recorded: Callable[[], Frames],
-    target: Target,
+    target: DeviceTarget,
     rules: Rules,
     *,
     node: int | None = None,

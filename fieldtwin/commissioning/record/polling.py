@@ -16,8 +16,8 @@ from fieldtwin.capture.recordings.sinks import CanLogSink
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.connection import canopen_at, frames_at
 from fieldtwin.commissioning.access.point import CanopenPoint
-from fieldtwin.commissioning.access.reading import Target
-from fieldtwin.commissioning.record.asking import Asker, asker_at, changes
+from fieldtwin.commissioning.access.reading import DeviceTarget
+from fieldtwin.commissioning.record.asking import RecordingClient, asker_at, changes
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError
@@ -53,7 +53,7 @@ class Round(Protocol):
         """Return unit ID and request PDU of each request in the current round."""
         ...
 
-    async def __call__(self, asker: Asker, sink: Sink) -> None: ...
+    async def __call__(self, asker: RecordingClient, sink: Sink) -> None: ...
 
 
 class ProfileRound:
@@ -73,14 +73,14 @@ class ProfileRound:
         """As `Round.asks`."""
         return [(self._unit, _request(read)) for plan in self._plans for read in plan.reads]
 
-    async def __call__(self, asker: Asker, sink: Sink) -> None:
+    async def __call__(self, asker: RecordingClient, sink: Sink) -> None:
         for plan in self._plans:
             waiting = list(plan.reads)
             while waiting:
                 waiting[:1] = await self._read(plan, waiting[0], asker, sink)
             plan.pass_ended()
 
-    async def _read(self, plan: GroupPlan, read: Read, asker: Asker, sink: Sink) -> tuple[Read, ...]:
+    async def _read(self, plan: GroupPlan, read: Read, asker: RecordingClient, sink: Sink) -> tuple[Read, ...]:
         """Return the reads that replace this one."""
         exchange = await asker.ask(self._unit, _request(read))
         if exchange is None:
@@ -121,7 +121,7 @@ class SameRequests:
         """As `Round.asks`."""
         return list(self.requests)
 
-    async def __call__(self, asker: Asker, sink: Sink) -> None:
+    async def __call__(self, asker: RecordingClient, sink: Sink) -> None:
         for unit, pdu in self.requests:
             exchange = await asker.ask(unit, pdu)
             if exchange is not None:
@@ -129,7 +129,7 @@ class SameRequests:
 
 
 async def record_polls(
-    target: Target,
+    target: DeviceTarget,
     one_round: Round,
     sink: Sink,
     *,
@@ -166,7 +166,7 @@ async def record_polls(
 
 
 async def record_node(
-    target: Target,
+    target: DeviceTarget,
     sink: CanLogSink,
     *,
     every_s: float,
@@ -251,7 +251,7 @@ async def _pause(stop: asyncio.Event, seconds: float) -> None:
 
 
 async def follow_bus(
-    target: Target,
+    target: DeviceTarget,
     sink: CanLogSink,
     *,
     stop: asyncio.Event,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 
-from fieldtwin.capture.decoding.modbus_frames import Frame, splitter
+from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.capture.recordings.sinks import LineSink
 from fieldtwin.commissioning.record.tapping import Say
 from fieldtwin.commissioning.scan.traffic import SETTLE_NS, is_reply
@@ -29,26 +29,26 @@ class Directions:
 
     def __init__(self, framing: str) -> None:
         self._splitter = splitter(framing)
-        self._asked: Frame | None = None
+        self._asked: ModbusFrame | None = None
         self._last_ns: int | None = None
 
-    def feed(self, data: bytes, t_ns: int) -> list[tuple[Direction, Frame]]:
+    def feed(self, data: bytes, t_ns: int) -> list[tuple[Direction, ModbusFrame]]:
         """Add a chunk received at `t_ns`; return the frames that are now complete, oldest first, including damaged ones."""
         found = self.settle(t_ns)
         self._last_ns = t_ns
         return found + [self._told(frame) for frame in self._splitter.feed(data, t_ns)]
 
-    def settle(self, now_ns: int) -> list[tuple[Direction, Frame]]:
+    def settle(self, now_ns: int) -> list[tuple[Direction, ModbusFrame]]:
         """Return the frames that a silence before `now_ns` has ended; an incomplete frame stays incomplete."""
         if self._last_ns is None or now_ns - self._last_ns <= SETTLE_NS:
             return []
         return self.flush()
 
-    def flush(self) -> list[tuple[Direction, Frame]]:
+    def flush(self) -> list[tuple[Direction, ModbusFrame]]:
         """Return the remaining bytes as frames at the end."""
         return [self._told(frame) for frame in self._splitter.flush()]
 
-    def _told(self, frame: Frame) -> tuple[Direction, Frame]:
+    def _told(self, frame: ModbusFrame) -> tuple[Direction, ModbusFrame]:
         if frame.bad:
             return (Direction.SENT if self._asked is None else Direction.RECEIVED), frame
         asked = self._asked
@@ -89,6 +89,6 @@ class LineSniffer:
             self._keep(self._directions.flush())
             await connection.aclose()
 
-    def _keep(self, frames: list[tuple[Direction, Frame]]) -> None:
+    def _keep(self, frames: list[tuple[Direction, ModbusFrame]]) -> None:
         for direction, frame in frames:
             self._sink.saw(direction, frame.t_ns, frame.raw)

@@ -13,7 +13,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 from fieldtwin.commissioning.access.connection import canopen_at, frames_at
-from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan.can_listener import BusHeard, BusListener
 from fieldtwin.gateway.connections.can_facts import CanFacts, can_facts
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -99,7 +99,7 @@ class CanScanner:
         url: str,
         options: CanScanOptions | None = None,
         *,
-        on_progress: Callable[[Progress], None] = lambda _: None,
+        on_progress: Callable[[PhaseProgress], None] = lambda _: None,
         stop: Callable[[], bool] = lambda: False,
         taps: Sequence[Tap] = (),
         connector: Connector | None = None,
@@ -182,7 +182,7 @@ class CanScanner:
             began_ns = clock.monotonic_ns()
             while not self._stop() and (elapsed_s := (clock.monotonic_ns() - began_ns) / NS_PER_S) < listen_s:
                 heard = self._ear.heard
-                self._tell(Progress(phase, elapsed_s, listen_s, f"{heard.frames} frames", len(heard.nodes)))
+                self._tell(PhaseProgress(phase, elapsed_s, listen_s, f"{heard.frames} frames", len(heard.nodes)))
                 await clock.sleep_until_ns(clock.monotonic_ns() + round(min(0.1, listen_s - elapsed_s) * NS_PER_S))
                 connection.inbound.data_stream.clear()  # already counted when it arrived
             result.listened_s += (clock.monotonic_ns() - began_ns) / NS_PER_S
@@ -233,7 +233,7 @@ class CanScanner:
             for i, node in enumerate(options.nodes):
                 if self._stop() or self._met_master():
                     return
-                self._tell(Progress("asking nodes", i * each_s, total_s, f"node {node}", len(self.result.nodes)))
+                self._tell(PhaseProgress("asking nodes", i * each_s, total_s, f"node {node}", len(self.result.nodes)))
                 await self._ask_node(master, node, each_s)
             if options.lss and not self._met_master():
                 await self._look_for_unconfigured(master, len(options.nodes) * each_s, total_s)
@@ -284,14 +284,14 @@ class CanScanner:
             result.asked += 1
             if not await lss.any_unconfigured():
                 return
-            self._tell(Progress("LSS fastscan", done_s, total_s, "", len(result.nodes)))
+            self._tell(PhaseProgress("LSS fastscan", done_s, total_s, "", len(result.nodes)))
             try:
                 while not self._stop() and len(result.unconfigured) < MOST_UNCONFIGURED:
                     found = await lss.fastscan(verify=not result.unconfigured)  # a node that was found keeps silent now
                     if found is None:
                         break
                     result.unconfigured.append(found)
-                    self._tell(Progress("LSS fastscan", done_s, total_s, str(found), len(result.nodes)))
+                    self._tell(PhaseProgress("LSS fastscan", done_s, total_s, str(found), len(result.nodes)))
             except (WireError, DeviceRefused) as e:
                 result.notes.append(f"LSS fastscan ended early: {e}")
             finally:

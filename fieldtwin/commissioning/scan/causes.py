@@ -14,7 +14,7 @@ from fieldtwin.commissioning.scan.listening import LineVerdict
 from fieldtwin.commissioning.scan.settings import name_of
 from fieldtwin.commissioning.scan.traffic import Heard
 from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.connections.line_counters import UartCounters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2
@@ -27,7 +27,7 @@ _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class LikelyCause:
     """One explanation: the cause, its evidence, the remedy. Causes with a larger `weight` are checked first."""
 
     name: str
@@ -39,7 +39,7 @@ class Cause:
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class ScanProbe:
     """One question that was sent: its echo, and its answer.
 
     `echo`: ``none``, ``whole`` or ``damaged``. `answer`: ``none``, ``good`` or ``damaged``.
@@ -60,16 +60,16 @@ class SerialEvidence:
 
     settings: SerialSettings
     heard: Heard
-    errors: LineCounters | None = None
+    errors: UartCounters | None = None
     verdict: LineVerdict | None = None
     control: tuple[tuple[str, bool], ...] = ()
     ignored: tuple[str, ...] = ()
-    probe: Probe | None = None
+    probe: ScanProbe | None = None
 
 
-def ranked(causes: Iterable[Cause]) -> list[Cause]:
+def ranked(causes: Iterable[LikelyCause]) -> list[LikelyCause]:
     """Sort the causes, most likely first, without those of weight 0; of equal names only the one with the largest weight."""
-    best: dict[str, Cause] = {}
+    best: dict[str, LikelyCause] = {}
     for cause in causes:
         if cause.weight > 0 and (cause.name not in best or best[cause.name].weight < cause.weight):
             best[cause.name] = cause
@@ -79,12 +79,12 @@ def ranked(causes: Iterable[Cause]) -> list[Cause]:
 # -- serial lines -----------------------------------------------------------------------------------------------------
 
 
-def serial_causes(e: SerialEvidence) -> list[Cause]:
+def serial_causes(e: SerialEvidence) -> list[LikelyCause]:
     """Return the causes of silence, of garbage, and of an unanswered question on a serial line."""
-    found: list[Cause] = []
+    found: list[LikelyCause] = []
     if e.ignored:
         found.append(
-            Cause(
+            LikelyCause(
                 "the port ignores settings",
                 70 if e.heard.bytes and not e.heard.sure else 5,
                 f"its driver did not take {', '.join(e.ignored)}",
@@ -101,7 +101,7 @@ def serial_causes(e: SerialEvidence) -> list[Cause]:
     if e.errors is not None and e.errors.overrun + e.errors.buffer_overrun:
         lost = e.errors.overrun + e.errors.buffer_overrun
         found.append(
-            Cause(
+            LikelyCause(
                 "this computer reads too slowly", 75, f"{lost} characters were lost in the port", "close other programs"
             )
         )
@@ -120,12 +120,12 @@ def _many_errors(e: SerialEvidence) -> bool:
     return e.errors is not None and e.errors.parity + e.errors.frame > (1 - HEALTHY) * e.heard.bytes
 
 
-def _of_silence(e: SerialEvidence) -> list[Cause]:
+def _of_silence(e: SerialEvidence) -> list[LikelyCause]:
     causes = []
     breaks = e.errors.breaks + e.errors.frame if e.errors is not None else 0
     if breaks:
         causes.append(
-            Cause(
+            LikelyCause(
                 "A and B swapped",
                 90,
                 f"no byte, but {breaks} breaks: the line idles at the wrong level",
@@ -133,7 +133,7 @@ def _of_silence(e: SerialEvidence) -> list[Cause]:
             )
         )
         causes.append(
-            Cause(
+            LikelyCause(
                 "the line is held low",
                 60,
                 f"{breaks} breaks",
@@ -142,7 +142,7 @@ def _of_silence(e: SerialEvidence) -> list[Cause]:
         )
     elif e.probe is None:
         causes.append(
-            Cause(
+            LikelyCause(
                 "no client sends requests",
                 80,
                 "a Modbus line is silent until a client sends",
@@ -154,27 +154,29 @@ def _of_silence(e: SerialEvidence) -> list[Cause]:
     inputs = [name for name in ("CTS", "DSR", "DCD") if name in control]
     if inputs and not any(control[name] for name in inputs):
         causes.append(
-            Cause("nothing is connected", 35, f"{', '.join(inputs)} are all off (an RS485 adapter may leave them so)",
+            LikelyCause("nothing is connected", 35, f"{', '.join(inputs)} are all off (an RS485 adapter may leave them so)",
                   "check the device's power, the cable, and the choice of port")
         )  # fmt: skip
     else:
         causes.append(
-            Cause("nothing is connected", 30, "no byte and no error", "check the cable and the choice of port")
+            LikelyCause("nothing is connected", 30, "no byte and no error", "check the cable and the choice of port")
         )
     if e.errors is None and not breaks:
         causes.append(
-            Cause("A and B swapped", 15, "this port has no error counters that would show it", "swap A and B once")
+            LikelyCause(
+                "A and B swapped", 15, "this port has no error counters that would show it", "swap A and B once"
+            )
         )
     return causes
 
 
-def _of_garbage(e: SerialEvidence) -> list[Cause]:
+def _of_garbage(e: SerialEvidence) -> list[LikelyCause]:
     heard, errors, causes = e.heard, e.errors, []
     if e.verdict is not None and e.verdict.settings != e.settings and e.verdict.heard and e.verdict.heard.sure:
         other = e.verdict.settings
         name = "the baud rate" if other.baudrate != e.settings.baudrate else "the parity or the stop bits"
         return [
-            Cause(
+            LikelyCause(
                 name,
                 100,
                 f"at {name_of(other)} there are {e.verdict.heard.frames} valid frames",
@@ -189,33 +191,39 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
     if text > 0.9 and total >= ENOUGH_TEXT and heard.framing == "rtu":
         colons = heard.values.get(0x3A, 0)
         what = "Modbus ASCII, perhaps" if colons and heard.values.get(0x0D) else "not Modbus RTU"
-        causes.append(Cause("another protocol", 90, f"{text:.0%} of it is readable text: {what}", "try ascii:PORT"))
+        causes.append(
+            LikelyCause("another protocol", 90, f"{text:.0%} of it is readable text: {what}", "try ascii:PORT")
+        )
     if heard.frames and heard.share > MANY:
         if heard.glitches >= max(2, heard.frames // 4):
             causes.append(
-                Cause("direction control", 85, f"{heard.glitches} stray bytes besides {heard.frames} good frames",
+                LikelyCause("direction control", 85, f"{heard.glitches} stray bytes besides {heard.frames} good frames",
                       "the transceiver is switched too early or too late: rs485=1, or an adapter that switches by itself")
             )  # fmt: skip
         damaged = f"{heard.bad_frames} damaged besides {heard.frames} good frames"
         causes.append(
-            Cause("termination or noise", 70, damaged, "check 120 ohms at both ends only, bias resistors, shield")
+            LikelyCause("termination or noise", 70, damaged, "check 120 ohms at both ends only, bias resistors, shield")
         )
-        causes.append(Cause("two units answer at once", 40, damaged, "check whether two devices have the same unit ID"))
+        causes.append(
+            LikelyCause("two units answer at once", 40, damaged, "check whether two devices have the same unit ID")
+        )
     elif parity > MANY and framing < parity:
         causes.append(
-            Cause("the parity or the stop bits", 95, f"{parity:.0%} of the bytes have a wrong parity", "8E1, 8O1, 8N1")
+            LikelyCause(
+                "the parity or the stop bits", 95, f"{parity:.0%} of the bytes have a wrong parity", "8E1, 8O1, 8N1"
+            )
         )
     if not heard.frames or heard.share <= MANY:
         faster = edges > 0.6
         causes.append(
-            Cause("the baud rate", 85 if framing > MANY or faster else 60,
+            LikelyCause("the baud rate", 85 if framing > MANY or faster else 60,
                   f"{framing:.0%} framing errors" if framing > MANY else
                   "long bits: the sender is slower than this port" if faster else "bytes, but no valid frame",
                   "`scan --listen` tries other settings without sending")
         )  # fmt: skip
         breaks = errors.breaks if errors is not None else 0
         causes.append(
-            Cause(
+            LikelyCause(
                 "A and B swapped",
                 88 if breaks else 45,
                 f"{breaks} breaks" if breaks else "no whole frame",
@@ -223,25 +231,27 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
             )
         )
         causes.append(
-            Cause("termination or noise", 30, "no whole frame", "check whether a device sends, or the line is open")
+            LikelyCause(
+                "termination or noise", 30, "no whole frame", "check whether a device sends, or the line is open"
+            )
         )
         if text <= 0.9:
-            causes.append(Cause("another protocol", 25, "no whole frame", "check which protocol is expected"))
+            causes.append(LikelyCause("another protocol", 25, "no whole frame", "check which protocol is expected"))
     return causes
 
 
-def _of_talk(heard: Heard) -> list[Cause]:
+def _of_talk(heard: Heard) -> list[LikelyCause]:
     causes = []
     asked = sum(u.requests for u in heard.units.values())
     answered = sum(u.replies + u.exceptions for u in heard.units.values())
     if asked and not answered:
         causes.append(
-            Cause("only the client is received", 80, f"{asked} requests and no reply",
+            LikelyCause("only the client is received", 80, f"{asked} requests and no reply",
                   "the devices are off, or have different settings; on RS232 an adapter receives one direction")
         )  # fmt: skip
     elif answered and not asked:
         causes.append(
-            Cause(
+            LikelyCause(
                 "only devices are received",
                 80,
                 f"{answered} replies and no request",
@@ -251,122 +261,130 @@ def _of_talk(heard: Heard) -> list[Cause]:
     elif heard.silent:
         units = ", ".join(map(str, heard.silent[:10]))
         causes.append(
-            Cause(
+            LikelyCause(
                 "units that do not answer", 60, f"no reply from units {units}", "check their power and their unit IDs"
             )
         )
     if heard.repeated > asked // 2 and heard.repeated > 2:
         causes.append(
-            Cause(
+            LikelyCause(
                 "an echo", 40, f"{heard.repeated} requests came twice", "the sender's adapter receives its own frames"
             )
         )
     return causes
 
 
-def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
+def _of_probe(probe: ScanProbe, e: SerialEvidence) -> list[LikelyCause]:
     if probe.answer == "good":
         return []
     unit = f"unit {probe.unit}"
     if probe.answer == "damaged":
         return [
-            Cause(
+            LikelyCause(
                 "termination or noise",
                 80,
                 f"{unit} answered, damaged",
                 "check 120 ohms at both ends, bias resistors, shield",
             ),
-            Cause("the parity or the stop bits", 75, f"{unit} answered, damaged", "8E1, 8O1, 8N1"),
-            Cause(
+            LikelyCause("the parity or the stop bits", 75, f"{unit} answered, damaged", "8E1, 8O1, 8N1"),
+            LikelyCause(
                 "two units answer at once",
                 60,
                 f"{unit} answered, damaged",
                 "check whether two devices have this unit ID",
             ),
-            Cause(
+            LikelyCause(
                 "direction control", 50, f"{unit} answered, damaged", "rs485=1, or an adapter that switches by itself"
             ),
         ]
     if probe.echo == "damaged":
         return [
-            Cause(
+            LikelyCause(
                 "termination or noise",
                 88,
                 "our own request came back damaged",
                 "a short circuit, or another sender on the line",
             ),
-            Cause("another master", 80, "our own request came back damaged", "listen for longer: `line --listen 60s`"),
+            LikelyCause(
+                "another master", 80, "our own request came back damaged", "listen for longer: `line --listen 60s`"
+            ),
         ]
     wrong = [
-        Cause("a different unit ID", 85, f"{unit} does not answer", "`scan` tries all"),
-        Cause("the baud rate", 75, f"{unit} does not answer", "`scan` tries the likely settings"),
+        LikelyCause("a different unit ID", 85, f"{unit} does not answer", "`scan` tries all"),
+        LikelyCause("the baud rate", 75, f"{unit} does not answer", "`scan` tries the likely settings"),
     ]
     if probe.echo == "whole":
         return [
             *wrong,
-            Cause(
+            LikelyCause(
                 "A and B swapped", 60, "only our own echo is received, so this end works", "swap A and B at the device"
             ),
-            Cause(
+            LikelyCause(
                 "the device is off", 55, "only our own echo is received", "check its power and the ground connection"
             ),
         ]
     return [
         *wrong,
-        Cause("A and B swapped", 70, f"no echo, no answer from {unit}", "swap A and B once"),
-        Cause(
+        LikelyCause("A and B swapped", 70, f"no echo, no answer from {unit}", "swap A and B once"),
+        LikelyCause(
             "direction control",
             65,
             "there is no sign that the request was sent",
             "rs485=1, or an adapter that switches by itself",
         ),
-        Cause("nothing is connected", 60, f"no echo, no answer from {unit}", "check the cable and the device's power"),
+        LikelyCause(
+            "nothing is connected", 60, f"no echo, no answer from {unit}", "check the cable and the device's power"
+        ),
     ]
 
 
 # -- CAN --------------------------------------------------------------------------------------------------------------
 
 
-def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
+def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[LikelyCause]:
     """Return the causes of a silent CAN bus, of errors, and of a full bus."""
-    found: list[Cause] = []
+    found: list[LikelyCause] = []
     errors = facts.tx_errors + facts.rx_errors
     if facts.state == "bus-off":
         found.append(
-            Cause("the controller is off", 100, "bus-off: its own frames failed 32 times",
+            LikelyCause("the controller is off", 100, "bus-off: its own frames failed 32 times",
                   "bit rate and wiring first, then `ip link set IFACE down` and `up`")
         )  # fmt: skip
     if facts.tx_errors >= 96:
         why = f"{facts.tx_errors} transmit errors: no node acknowledges"
-        found.append(Cause("alone on the bus", 85, why, "check that another node is on, with the same bit rate"))
+        found.append(LikelyCause("alone on the bus", 85, why, "check that another node is on, with the same bit rate"))
     if heard.errors and not heard.frames:
         why = f"{heard.errors} error frames and no valid one"
-        found.append(Cause("the bit rate", 90, why, "compare with the other nodes"))
-        found.append(Cause("CAN-H and CAN-L swapped", 70, why, "swap them"))
-        found.append(Cause("termination or noise", 60, why, "60 ohms between CAN-H and CAN-L when everything is off"))
+        found.append(LikelyCause("the bit rate", 90, why, "compare with the other nodes"))
+        found.append(LikelyCause("CAN-H and CAN-L swapped", 70, why, "swap them"))
+        found.append(
+            LikelyCause("termination or noise", 60, why, "60 ohms between CAN-H and CAN-L when everything is off")
+        )
     elif heard.errors or (facts.rx_errors >= 96 and heard.frames):
         why = f"{heard.errors} error frames besides {heard.frames} good ones"
         found.append(
-            Cause(
+            LikelyCause(
                 "termination or noise", 80, why, "60 ohms between CAN-H and CAN-L when everything is off; short stubs"
             )
         )
-        found.append(Cause("a node at another bit rate", 60, why, "disconnect nodes one by one"))
+        found.append(LikelyCause("a node at another bit rate", 60, why, "disconnect nodes one by one"))
     elif not heard.frames:
         why = "no frame and no error" + (f", {errors} errors counted" if errors else "")
         found.append(
-            Cause(
+            LikelyCause(
                 "no node sends", 80, why, "nodes without a heartbeat are silent: use `scan` to ask them", harmless=True
             )
         )
-        found.append(Cause("nothing is connected", 45, why, "check the cable and the choice of interface"))
+        found.append(LikelyCause("nothing is connected", 45, why, "check the cable and the choice of interface"))
     if load > 0.8:
-        found.append(Cause("the bus is full", 75, f"load {load:.0%}", "longer PDO inhibit times, a higher bit rate"))
+        found.append(
+            LikelyCause("the bus is full", 75, f"load {load:.0%}", "longer PDO inhibit times, a higher bit rate")
+        )
     doubled = [n for n, node in heard.nodes.items() if node.boot_ups > 2]
     if doubled:
         why = f"node {', '.join(map(str, doubled))} boots repeatedly"
         found.append(
-            Cause("a node restarts", 70, why, "check its supply, its watchdog, and whether a master resets it")
+            LikelyCause("a node restarts", 70, why, "check its supply, its watchdog, and whether a master resets it")
         )
     return ranked(found)
 
@@ -374,28 +392,30 @@ def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
 # -- TCP --------------------------------------------------------------------------------------------------------------
 
 
-def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[Cause]:
+def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[LikelyCause]:
     """Return the causes for a host that cannot be reached (`problem` is the operating system's error), or that misbehaves."""
     text = problem.lower()
-    table: list[tuple[Callable[[], bool], list[Cause]]] = [
+    table: list[tuple[Callable[[], bool], list[LikelyCause]]] = [
         (lambda: "refused" in text, [
-            Cause("no program listens there", 90, f"the host refuses port {port}", "check the port and the service"),
-            Cause("a firewall", 40, "some firewalls refuse like a host", "ask its administrator"),
+            LikelyCause("no program listens there", 90, f"the host refuses port {port}", "check the port and the service"),
+            LikelyCause("a firewall", 40, "some firewalls refuse like a host", "ask its administrator"),
         ]),
         (lambda: "timed out" in text or "no answer" in text, [
-            Cause("the host is off, or a firewall drops packets", 90, problem, "ping it, and check the address"),
+            LikelyCause("the host is off, or a firewall drops packets", 90, problem, "ping it, and check the address"),
         ]),
         (lambda: "route" in text or "unreachable" in text, [
-            Cause("no route to that network", 90, problem, "address, netmask and gateway of this computer"),
+            LikelyCause("no route to that network", 90, problem, "address, netmask and gateway of this computer"),
         ]),
-        (lambda: "name" in text or "known" in text, [Cause("the name is not known", 90, problem, "use the address")]),
-        (lambda: bool(problem), [Cause("the connection fails", 60, problem, "")]),
+        (lambda: "name" in text or "known" in text, [LikelyCause("the name is not known", 90, problem, "use the address")]),
+        (lambda: bool(problem), [LikelyCause("the connection fails", 60, problem, "")]),
         (lambda: hung_up, [
-            Cause("no room for another client", 80, "it closes the connection at once", "close other clients: many allow 1 to 5"),
-            Cause("an allow list", 60, "it closes the connection at once", "add this computer to the list"),
+            LikelyCause("no room for another client", 80, "it closes the connection at once",
+                        "close other clients: many allow 1 to 5"),
+            LikelyCause("an allow list", 60, "it closes the connection at once", "add this computer to the list"),
         ]),
         (lambda: bool(heard), [
-            Cause("another protocol", 90, f"it sends unrequested data: {heard[:16].hex(' ')}", "a Modbus server only replies"),
+            LikelyCause("another protocol", 90, f"it sends unrequested data: {heard[:16].hex(' ')}",
+                        "a Modbus server only replies"),
         ]),
     ]  # fmt: skip
     for holds, causes in table:

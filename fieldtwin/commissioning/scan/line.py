@@ -11,17 +11,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.access.connection import bytes_at
-from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan import settings as plan
 from fieldtwin.commissioning.scan.can_listener import BusHeard
 from fieldtwin.commissioning.scan.canopen import CanScanner, CanScanOptions
-from fieldtwin.commissioning.scan.causes import Cause, Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
+from fieldtwin.commissioning.scan.causes import (
+    LikelyCause,
+    ScanProbe,
+    SerialEvidence,
+    can_causes,
+    serial_causes,
+    tcp_causes,
+)
 from fieldtwin.commissioning.scan.listening import describe
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
-from fieldtwin.commissioning.scan.sweep import Send, UnitSweep
+from fieldtwin.commissioning.scan.sweep import SendRequest, UnitSweep
 from fieldtwin.commissioning.scan.traffic import Heard
 from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import CountsErrors, LineCounters
+from fieldtwin.gateway.connections.line_counters import CountsErrors, UartCounters
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
@@ -39,12 +46,12 @@ class LineReport:
     url: str
     kind: str
     facts: list[tuple[str, str]] = field(default_factory=list)
-    causes: list[Cause] = field(default_factory=list)
+    causes: list[LikelyCause] = field(default_factory=list)
     heard: Heard | None = None
-    errors: LineCounters | None = None
+    errors: UartCounters | None = None
     bus: BusHeard | None = None
     can: CanFacts | None = None
-    probe: Probe | None = None
+    probe: ScanProbe | None = None
     sent: bool = False
 
     @property
@@ -68,7 +75,7 @@ async def look_at_line(
     url: str,
     look: LineLook | None = None,
     *,
-    on_progress: Callable[[Progress], None] = lambda _: None,
+    on_progress: Callable[[PhaseProgress], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     taps: Sequence[Tap] = (),
     connector: Connector | None = None,
@@ -92,7 +99,7 @@ class _Looker:
         self,
         endpoint: Endpoint,
         look: LineLook,
-        on_progress: Callable[[Progress], None],
+        on_progress: Callable[[PhaseProgress], None],
         stop: Callable[[], bool],
         taps: Sequence[Tap],
         connector: Connector | None,
@@ -141,7 +148,7 @@ class _Looker:
                 return {}, ignored, False
             return connection.control_lines(), ignored, connection.counters() is not None
 
-    async def _probe(self, settings: SerialSettings, unit: int, *, quiet: bool) -> Probe:
+    async def _probe(self, settings: SerialSettings, unit: int, *, quiet: bool) -> ScanProbe:
         """Send one question and return its echo, its answer and the bytes after it."""
         sweep = UnitSweep(
             framing_of(self._endpoint),
@@ -153,7 +160,7 @@ class _Looker:
         url, clock, heard, sent = str(plan.with_settings(self._endpoint, settings)), self._clock, bytearray(), b""
         async with bytes_at(url, taps=self._taps, connector=self._connector, clock=clock) as connection:
             while sweep.asked < 2 and (step := sweep.poll(clock.monotonic_ns())) is not None:
-                if isinstance(step, Send):
+                if isinstance(step, SendRequest):
                     if sweep.asked > 1:
                         break  # one question only: it is not repeated if damaged
                     sent = step.data
@@ -243,7 +250,9 @@ class _Looker:
             left_s = self._look.listen_s - (self._clock.monotonic_ns() - began_ns) / NS_PER_S
             if left_s <= 0 or len(heard) > 256:
                 break
-            self._tell(Progress("listening", self._look.listen_s - left_s, self._look.listen_s, f"{len(heard)} bytes"))
+            self._tell(
+                PhaseProgress("listening", self._look.listen_s - left_s, self._look.listen_s, f"{len(heard)} bytes")
+            )
             try:
                 heard += await connection.read_within(min(0.1, left_s))
             except ConnectionLost:
@@ -251,7 +260,7 @@ class _Looker:
         return heard, False
 
 
-def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> Probe:
+def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> ScanProbe:
     """Classify the bytes received after a question: its echo, an answer, both, or other bytes."""
     if heard.startswith(sent):
         echo, rest = "whole", heard[len(sent) :]
@@ -260,7 +269,7 @@ def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> Probe:
     else:
         echo, rest = "none", heard
     answer = "good" if answered else "damaged" if rest else "none"
-    return Probe(unit, echo, answer, len(heard))
+    return ScanProbe(unit, echo, answer, len(heard))
 
 
 def _alike(sent: bytes, heard: bytes) -> bool:
@@ -275,7 +284,7 @@ def _serial_facts(
     control: dict[str, bool],
     ignored: tuple[str, ...],
     counts: bool,
-    probe: Probe | None,
+    probe: ScanProbe | None,
 ) -> list[tuple[str, str]]:
     audition = scan.auditions[0]
     heard, errors = audition.heard, audition.errors

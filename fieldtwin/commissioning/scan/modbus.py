@@ -11,15 +11,15 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from fieldtwin.commissioning.access.connection import bytes_at
-from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan import settings as plan
 from fieldtwin.commissioning.scan.listening import Audition, LineVerdict, dwell_over, judge, siblings, worth_hearing
 from fieldtwin.commissioning.scan.odd_replies import OddReply, gathered
-from fieldtwin.commissioning.scan.settings import Pace, Step
+from fieldtwin.commissioning.scan.settings import Pace, ScanStep
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, Alike, likeness, spread_over
-from fieldtwin.commissioning.scan.sweep import Send, UnitAnswer, UnitSweep
+from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
-from fieldtwin.gateway.connections.line_counters import CountsErrors, LineCounters
+from fieldtwin.gateway.connections.line_counters import CountsErrors, UartCounters
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
@@ -101,7 +101,7 @@ class ModbusScanner:
         url: str,
         options: ScanOptions | None = None,
         *,
-        on_progress: Callable[[Progress], None] = lambda _: None,
+        on_progress: Callable[[PhaseProgress], None] = lambda _: None,
         stop: Callable[[], bool] = lambda: False,
         taps: Sequence[Tap] = (),
         connector: Connector | None = None,
@@ -152,7 +152,7 @@ class ModbusScanner:
         """Return whether the scan must send no more questions."""
         return self._met_master or self._stop()
 
-    def planned(self) -> list[tuple[str, list[Step]]]:
+    def planned(self) -> list[tuple[str, list[ScanStep]]]:
         """Return the questions of `run` after listening, phase by phase, for the case that no unit answers."""
         if not self._endpoint.is_serial:
             first = spread_over(self._units)
@@ -199,7 +199,7 @@ class ModbusScanner:
             return
         await self._search_all(done)
 
-    async def _search_all(self, done: list[Step]) -> None:
+    async def _search_all(self, done: list[ScanStep]) -> None:
         every = plan.all_settings(self._endpoint)
         steps = plan.full_pass(self._pace, every, self._units, done)
         await self._steps(steps, "every setting", until_found=not self._options.every_setting)
@@ -263,7 +263,7 @@ class ModbusScanner:
                 if (clear or not ear.heard.bytes) and elapsed_s >= listen_s if whole else clear:
                     break
                 detail = f"{plan.name_of(settings)}, {ear.heard.bytes} bytes, {ear.heard.frames} frames"
-                self._tell(Progress("listening", elapsed_s, max(listen_s, elapsed_s), detail))
+                self._tell(PhaseProgress("listening", elapsed_s, max(listen_s, elapsed_s), detail))
                 data = await connection.read_within(0.1)
                 ear.feed(data, self._clock.monotonic_ns())
             ear.settle(self._clock.monotonic_ns() + NS_PER_S)
@@ -273,7 +273,7 @@ class ModbusScanner:
 
     # -- questions ------------------------------------------------------------------------------------------------
 
-    async def _steps(self, steps: list[Step], phase: str, *, until_found: bool = False) -> list[Step]:
+    async def _steps(self, steps: list[ScanStep], phase: str, *, until_found: bool = False) -> list[ScanStep]:
         """Run `steps`; return those that were begun."""
         total_s, done_s = plan.seconds_of(steps), 0.0
         for i, step in enumerate(steps):
@@ -286,13 +286,13 @@ class ModbusScanner:
                 return steps[: i + 1]
         return steps
 
-    def _told(self, phase: str, done_s: float, total_s: float, step: Step, sweep: UnitSweep) -> None:
+    def _told(self, phase: str, done_s: float, total_s: float, step: ScanStep, sweep: UnitSweep) -> None:
         where = f"{plan.name_of(step.settings)}, " if step.settings else ""
         part = sweep.asked / max(1, sweep.asked + sweep.left)
         found = len(self.result.units) + len(sweep.found)
-        self._tell(Progress(phase, done_s + part * step.seconds, total_s, f"{where}unit {sweep.asking}", found))
+        self._tell(PhaseProgress(phase, done_s + part * step.seconds, total_s, f"{where}unit {sweep.asking}", found))
 
-    async def _step(self, step: Step, tell: Callable[[Step, UnitSweep], None]) -> None:
+    async def _step(self, step: ScanStep, tell: Callable[[ScanStep, UnitSweep], None]) -> None:
         settings = step.settings
         endpoint = plan.with_settings(self._endpoint, settings) if settings else self._endpoint
         shared = self.result.heard is not None and self.result.heard.bytes > 0
@@ -338,7 +338,7 @@ class ModbusScanner:
     async def _ask(self, sweep: UnitSweep, connection: ByteConnection, tell: Callable[[], None]) -> None:
         clock = self._clock
         while not self._ended and (step := sweep.poll(clock.monotonic_ns())) is not None:
-            if isinstance(step, Send):
+            if isinstance(step, SendRequest):
                 tell()
                 await connection.write(step.data)
                 sweep.handed_over(clock.monotonic_ns())
@@ -409,5 +409,5 @@ class ModbusScanner:
         return likeness(answers, len(units), again=list(sweep.found.values()))
 
 
-def _counters(connection: ByteConnection) -> LineCounters | None:
+def _counters(connection: ByteConnection) -> UartCounters | None:
     return connection.counters() if isinstance(connection, CountsErrors) else None

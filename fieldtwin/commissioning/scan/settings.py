@@ -50,7 +50,7 @@ def name_of(settings: SerialSettings) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ScanStep:
     """One stretch of a scan: these units at these settings (None: no serial line). `request_chars` for its time."""
 
     settings: SerialSettings | None
@@ -73,7 +73,7 @@ class Step:
         )
 
 
-def seconds_of(steps: Iterable[Step]) -> float:
+def seconds_of(steps: Iterable[ScanStep]) -> float:
     """Return the total duration in seconds of all steps if no unit answers."""
     return sum(step.seconds for step in steps)
 
@@ -86,15 +86,15 @@ class Pace:
     interval_s: float
     ascii: bool = False
 
-    def step(self, settings: SerialSettings | None, units: Sequence[int]) -> Step:
-        return Step(settings, tuple(units), 17 if self.ascii else 8, self.timeout_s, self.interval_s)
+    def step(self, settings: SerialSettings | None, units: Sequence[int]) -> ScanStep:
+        return ScanStep(settings, tuple(units), 17 if self.ascii else 8, self.timeout_s, self.interval_s)
 
 
 def quick_pass(
     pace: Pace, candidates: Sequence[SerialSettings], units: Sequence[int], budget_s: float = 30.0
-) -> list[Step]:
+) -> list[ScanStep]:
     """Return steps for likely units at likely settings, as many as `budget_s` allows: some units at every setting first."""
-    steps: list[Step] = []
+    steps: list[ScanStep] = []
     left_s = budget_s
     for first, last in ((0, 5), (5, 10), (10, 18), (18, len(UNITS))):
         batch = [u for u in UNITS if u in units][first:last]
@@ -108,8 +108,8 @@ def quick_pass(
 
 
 def full_pass(
-    pace: Pace, candidates: Sequence[SerialSettings | None], units: Sequence[int], done: Iterable[Step] = ()
-) -> list[Step]:
+    pace: Pace, candidates: Sequence[SerialSettings | None], units: Sequence[int], done: Iterable[ScanStep] = ()
+) -> list[ScanStep]:
     """Return steps for every unit at every one of `candidates`, without those in `done`."""
     asked: dict[SerialSettings | None, set[int]] = {}
     for step in done:

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldtwin.capture.decoding.modbus_frames import Frame, splitter
+from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.modbus.framings import Framing, make_framer
 from fieldtwin.gateway.protocols.modbus.request import Request
@@ -47,7 +47,7 @@ class UnitAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class Send:
+class SendRequest:
     """Write `data` now and say `handed_over`: the question to `unit`."""
 
     unit: int
@@ -55,7 +55,7 @@ class Send:
 
 
 @dataclass(frozen=True, slots=True)
-class Wait:
+class WaitForBytes:
     """Wait until `until_ns`, unless bytes arrive."""
 
     until_ns: int
@@ -141,11 +141,11 @@ class UnitSweep:
         """Return the unit that is asked now."""
         return self._now.unit if self._now is not None else None
 
-    def poll(self, now_ns: int) -> Send | Wait | None:
+    def poll(self, now_ns: int) -> SendRequest | WaitForBytes | None:
         """Return the next step; None when all units have been asked."""
         if self._now is not None:
             if now_ns < self._now.deadline_ns:
-                return Wait(self._now.deadline_ns)
+                return WaitForBytes(self._now.deadline_ns)
             self._give_up(now_ns)
         if now_ns < self._not_before_ns:
             return self._await_silence(now_ns)
@@ -163,7 +163,7 @@ class UnitSweep:
             if len(self._ids) > MAX_REMEMBERED:
                 del self._ids[next(iter(self._ids))]
         self.handed_over(now_ns)
-        return Send(unit, data)
+        return SendRequest(unit, data)
 
     def handed_over(self, now_ns: int) -> None:
         """Note that the driver has accepted the question, whose characters are sent from now on."""
@@ -208,7 +208,7 @@ class UnitSweep:
 
     # -- received bytes ------------------------------------------------------------------------------------------
 
-    def _judge(self, frame: Frame, now_ns: int) -> None:
+    def _judge(self, frame: ModbusFrame, now_ns: int) -> None:
         asked = self._now
         if frame.bad:
             self.noise_bytes += len(frame.raw)
@@ -274,13 +274,13 @@ class UnitSweep:
         self._past[asked.unit] = asked.began_ns
         self._now = None
 
-    def _await_silence(self, now_ns: int) -> Wait:
+    def _await_silence(self, now_ns: int) -> WaitForBytes:
         if self._silence_wanted_ns is None:
             self._silence_wanted_ns = now_ns
         elif now_ns - self._silence_wanted_ns > max(NEVER_SILENT_NS, 2 * self._interval_ns):
             self.never_silent = True
             self._not_before_ns = now_ns
-        return Wait(max(self._not_before_ns, now_ns))
+        return WaitForBytes(max(self._not_before_ns, now_ns))
 
 
 def _looks_like_request(pdu: bytes) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fieldtwin.capture.decoding.modbus_frames import Frame, splitter
+from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.modbus.framings import Framing
 
@@ -80,7 +80,7 @@ class LineListener:
         self.heard = Heard(framing)
         self._splitter = splitter(framing)
         self._last_ns: int | None = None
-        self._open: Frame | None = None
+        self._open: ModbusFrame | None = None
 
     def feed(self, data: bytes, t_ns: int) -> None:
         """Add a chunk received at `t_ns`."""
@@ -103,7 +103,7 @@ class LineListener:
             for frame in self._splitter.flush():
                 self._take(frame)
 
-    def _take(self, frame: Frame) -> None:
+    def _take(self, frame: ModbusFrame) -> None:
         heard = self.heard
         if frame.bad:
             heard.bad_frames += 1
@@ -127,7 +127,7 @@ class LineListener:
             self._open = frame
 
 
-def is_reply(frame: Frame, asked: Frame | None) -> bool:
+def is_reply(frame: ModbusFrame, asked: ModbusFrame | None) -> bool:
     """Return whether a good frame is a reply, by its shape, or else by the request `asked` before it."""
     if frame.pdu[0] & 0x80:
         return True

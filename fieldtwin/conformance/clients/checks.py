@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 
 from fieldtwin.conformance.core.case import CheckFunction, Finding, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.core.observation import (
-    Came,
     Ended,
     Garbled,
     Left,
     Observation,
+    ObservedConnection,
     ReplySent,
     RequestSeen,
     ValuePublished,
@@ -75,7 +75,7 @@ def asks_cleanly(seen: Observation) -> Finding | None:
 def does_not_flood(seen: Observation) -> Finding | None:
     """Check that the numbers of retries and new connections are bounded."""
     span_s = max((seen.until_ns - seen.begun_ns) / NS_PER_S, 0.001)
-    for kind, what in ((RequestSeen, "requests"), (Came, "connections")):
+    for kind, what in ((RequestSeen, "requests"), (ObservedConnection, "connections")):
         count = sum(isinstance(event, kind) for event in seen.events if event.t_ns >= seen.begun_ns)
         if count > FLOOD_FLOOR and count > FLOOD_FACTOR * seen.habit.rate_per_s * span_s:
             usual = seen.habit.rate_per_s
@@ -301,7 +301,7 @@ write_echo = all_of(goes_on, asks_cleanly, does_not_flood, checks_echo_of_write)
 
 
 def reconnects(seen: Observation) -> Finding | None:
-    if next(seen.of(Came, seen.begun_ns), None) is None:
+    if next(seen.of(ObservedConnection, seen.begun_ns), None) is None:
         return failed("no new connection after the old one was cut")
     return None
 

@@ -6,7 +6,7 @@ import itertools
 import math
 
 from fieldtwin.conformance.core.case import Finding, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.core.observation import Came, Left, Observation, RequestSeen
+from fieldtwin.conformance.core.observation import Left, Observation, ObservedConnection, RequestSeen
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 TURNAROUND_MS = 100
@@ -66,7 +66,7 @@ def few_connections(seen: Observation) -> Finding:
     """Check that a master that loses a connection closes its end: each one that stays open occupies one of the device's."""
     count = most = 0
     for event in seen.events:
-        count += isinstance(event, Came) - isinstance(event, Left)
+        count += isinstance(event, ObservedConnection) - isinstance(event, Left)
         most = max(most, count)
     if most > MOST_CONNECTIONS:
         return failed(f"{most} connections at once: it does not close those that it no longer uses")

@@ -46,7 +46,7 @@ def _flush(tty: str) -> None:
         os.close(descriptor)
 
 
-class Program:
+class ProgramUnderTest:
     """The program under test: ``async with Program(argv, endpoint, on_text, on_end)``.
 
     It and its children end on leaving. `on_text` receives its output, and whether that is its log (standard error);
@@ -68,7 +68,7 @@ class Program:
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
 
-    async def __aenter__(self) -> Program:
+    async def __aenter__(self) -> ProgramUnderTest:
         await self._start()
         return self
 

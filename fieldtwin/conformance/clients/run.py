@@ -13,7 +13,16 @@ from typing import Generic, Protocol, TypeVar
 
 from fieldtwin.conformance.clients.probe import Probe
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.case import OTHER_WIRE, TRAIL_S, Case, CasePlan, Finding, Impact, inconclusive, skipped
+from fieldtwin.conformance.core.case import (
+    OTHER_WIRE,
+    TRAIL_S,
+    CasePlan,
+    ClientCase,
+    Finding,
+    Impact,
+    inconclusive,
+    skipped,
+)
 from fieldtwin.conformance.core.evidence import Line, lines
 from fieldtwin.conformance.core.observation import (
     Ended,
@@ -40,7 +49,7 @@ class Playable(Protocol):
     """A case with its reply function, for any protocol: see `C` and `CanopenCase`."""
 
     @property
-    def about(self) -> Case: ...
+    def about(self) -> ClientCase: ...
     @property
     def wants(self) -> str: ...
     @property

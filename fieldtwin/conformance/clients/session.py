@@ -15,7 +15,7 @@ from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
 from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, traits, wire_for
 from fieldtwin.conformance.clients.modbus.pty_line import PtyLine
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe, Probe, RegisterProbe
-from fieldtwin.conformance.clients.program import OnText, Program
+from fieldtwin.conformance.clients.program import OnText, ProgramUnderTest
 from fieldtwin.conformance.clients.run import C, ClientPlan, MasterRun
 from fieldtwin.conformance.core.observation import Event, Word
 from fieldtwin.conformance.core.results import CaseResult
@@ -123,7 +123,7 @@ async def _judged(
     listener.say(f"listening on {options.listen}; the client or master connects to {theirs}")
     if not options.command:
         return await run.run()
-    program = Program(options.command, theirs, on_text, run.ended)
+    program = ProgramUnderTest(options.command, theirs, on_text, run.ended)
     try:
         async with program:
             run.restart = program.restart

@@ -172,7 +172,7 @@ class CasePlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Case(About):
+class ClientCase(About):
     """A case for masters, with its check."""
 
     judge: CheckFunction

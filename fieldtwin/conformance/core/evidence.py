@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from fieldtwin.conformance.core.observation import (
-    Came,
     Ended,
     Event,
     Garbled,
     Left,
+    ObservedConnection,
     ReplySent,
     RequestSeen,
     Sent,
@@ -76,7 +76,7 @@ def line_of(event: Event) -> tuple[str, str, str]:
             return "master", str(frame), _abort(frame.data) if sdo else ""
         case Garbled():
             return "master", event.data.hex(" "), "no request"
-        case Came():
+        case ObservedConnection():
             return (
                 ("device", "", "gives the port back")
                 if event.by_us

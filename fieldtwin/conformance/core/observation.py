@@ -67,7 +67,7 @@ class Garbled:
 
 
 @dataclass(frozen=True, slots=True)
-class Came:
+class ObservedConnection:
     """A connection of the master, numbered from 1. A serial line and a bus have one that is always there; `by_us`: the case
     took the port away and gave it back."""
 
@@ -115,8 +115,8 @@ class Ended:
     status: int
 
 
-Event = RequestSeen | ReplySent | Sent | Garbled | Came | Left | ValuePublished | Ended
-E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, Came, Left, ValuePublished, Ended)
+Event = RequestSeen | ReplySent | Sent | Garbled | ObservedConnection | Left | ValuePublished | Ended
+E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, ObservedConnection, Left, ValuePublished, Ended)
 
 
 @dataclass(frozen=True, slots=True)

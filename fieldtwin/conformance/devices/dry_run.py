@@ -22,7 +22,7 @@ from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import OnClient
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
@@ -45,7 +45,12 @@ def modbus_dry_run(options: ModbusOptions) -> Checked:
 
 def _device(options: ModbusOptions) -> ModbusUnit:
     end = sum(options.may_write["holding"]) if "holding" in options.may_write else CELLS
-    spans = [Span("coil", 0, CELLS), Span("discrete", 0, CELLS), Span("holding", 0, end), Span("input", 0, CELLS)]
+    spans = [
+        CellSpan("coil", 0, CELLS),
+        CellSpan("discrete", 0, CELLS),
+        CellSpan("holding", 0, end),
+        CellSpan("input", 0, CELLS),
+    ]
     return ModbusUnit(MapBank(spans), identification=Identification({0: b"paper", 1: b"paper", 2: b"0"}))
 
 

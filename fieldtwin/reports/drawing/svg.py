@@ -6,7 +6,7 @@ emulated parts are dashed. Pure: facts in, text out.
 
 from __future__ import annotations
 
-from fieldtwin.reports.drawing.wiring import Station, Wire, Wiring
+from fieldtwin.reports.drawing.wiring import DrawnBus, Station, Wiring
 from fieldtwin.reports.markup import Child, Markup, el
 
 CHAR = 7.25
@@ -106,7 +106,7 @@ def _controller(wires: Wiring) -> tuple[list[Markup], float, float]:
     return parts, width, 34 + tall + (26 + len(served) * LINE if served else 0) + 6
 
 
-def _wire(wire: Wire, left: float, top: float) -> tuple[Markup, float, float]:
+def _wire(wire: DrawnBus, left: float, top: float) -> tuple[Markup, float, float]:
     """Return a bus that starts at the controller's edge at `left`: the drawing, its width from there, its height."""
     dashed = " emulated" if wire.stand_in else ""
     head = [(f"{wire.name}  {wire.kind}" + (f", {wire.rate}" if wire.rate else ""), "name"), (wire.endpoint, "")]

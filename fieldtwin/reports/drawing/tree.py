@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from fieldtwin.reports.drawing.wiring import Logic, Server, Station, Wire, Wiring
+from fieldtwin.reports.drawing.wiring import DrawnBus, Logic, Server, Station, Wiring
 
 Cells = tuple[str, ...]
 
@@ -45,7 +45,7 @@ def _leaves(rows: Sequence[Cells], columns: int) -> Iterator[str]:
         yield line.rstrip()
 
 
-def _wire_line(wire: Wire) -> str:
+def _wire_line(wire: DrawnBus) -> str:
     place = f"{wire.endpoint}  →  {wire.stand_in}" if wire.stand_in else wire.endpoint
     return f"{place}, {wire.rate}" if wire.rate else place
 

@@ -29,7 +29,7 @@ class Station:
 
 
 @dataclass(frozen=True, slots=True)
-class Wire:
+class DrawnBus:
     """A bus with the plant's endpoint. `stand_in`: where its emulators listen; empty if the real bus is used."""
 
     name: str
@@ -66,7 +66,7 @@ class Wiring:
 
     system: str
     prototype: bool
-    wires: tuple[Wire, ...]
+    wires: tuple[DrawnBus, ...]
     programs: tuple[Logic, ...]
     servers: tuple[Server, ...]
 
@@ -86,11 +86,11 @@ def wiring(system: System, prototype: Prototype | None = None) -> Wiring:
     )
 
 
-def _wire(system: System, bus: BusConfig, prototype: Prototype | None) -> Wire:
+def _wire(system: System, bus: BusConfig, prototype: Prototype | None) -> DrawnBus:
     listen = prototype.buses[bus.name].listen if prototype else None
     stations = tuple(_station(device, prototype) for device in system.devices_on(bus.name))
     kind, rate = _kind(bus)
-    return Wire(bus.name, kind, str(bus.endpoint), rate, str(listen or ""), stations)
+    return DrawnBus(bus.name, kind, str(bus.endpoint), rate, str(listen or ""), stations)
 
 
 def _kind(bus: BusConfig) -> tuple[str, str]:

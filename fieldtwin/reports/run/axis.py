@@ -17,7 +17,7 @@ CHAR = 6.3
 
 
 @dataclass
-class Axis:
+class TimeAxis:
     """Converts times to positions, in px from the left."""
 
     start_ns: int

@@ -1,6 +1,6 @@
 """The coverage of a run: registers and objects, refusals, transitions, faults in states.
 
-`Collector` listens to a trace (or is fed with one) and gives `Counts`, which add up over scenarios. What is missing is
+`Collector` listens to a trace (or is fed with one) and gives `AccessCounts`, which add up over scenarios. What is missing is
 derived from the profiles when the report is written. The counts are bounded by the contents of the system, and by
 `MOST` for everything else.
 """
@@ -18,8 +18,8 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import RegisterRange
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
-from fieldtwin.results.model import Counts, Machine
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.model import AccessCounts, Machine
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST = 2000
@@ -32,17 +32,17 @@ class Collector:
     """Counts one run's events. Subscribe `feed` to a trace: then events that a full trace drops are counted too."""
 
     def __init__(self, system: System | None, machines: Iterable[Machine] = ()) -> None:
-        self.counts = Counts()
+        self.counts = AccessCounts()
         self._decoder = Decoder(system)
         self._machines = {m.variable: m for m in machines}
         self._states: dict[str, str] = {}
         self._faults: dict[str, str] = {}
 
-    def feed(self, event: Event) -> None:
+    def feed(self, event: TraceEvent) -> None:
         """Take an event."""
         self.take(event, self._decoder.feed(event))
 
-    def finish(self) -> Counts:
+    def finish(self) -> AccessCounts:
         """End the run and return its counts."""
         self.add(self._decoder.finish())
         return self.counts
@@ -52,13 +52,13 @@ class Collector:
         for exchange in exchanges:
             self._exchange(exchange)
 
-    def take(self, event: Event, exchanges: Iterable[DecodedExchange]) -> None:
+    def take(self, event: TraceEvent, exchanges: Iterable[DecodedExchange]) -> None:
         """Take an event that the caller has already decoded into `exchanges`."""
-        if event.kind is Kind.FRAME:
+        if event.kind is TraceKind.FRAME:
             self.add(exchanges)
-        elif event.kind is Kind.STATE and event.where in self._machines:
+        elif event.kind is TraceKind.STATE and event.where in self._machines:
             self._state(event.where, self._machines[event.where].name_of(event.data.get("value")))
-        elif event.kind is Kind.FAULT:
+        elif event.kind is TraceKind.FAULT:
             self._fault(event.where, str(event.data.get("name", event.where)), bool(event.data.get("on")))
 
     def _exchange(self, exchange: DecodedExchange) -> None:
@@ -100,7 +100,7 @@ def _count(counter: Counter[K], key: K) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class TagCoverage:
     """A tag of a device: how often it was read, written and refused, and whether it can be read and written at all."""
 
     name: str
@@ -124,7 +124,7 @@ class DeviceCoverage:
 
     device: str
     profile: str
-    places: tuple[Place, ...]
+    places: tuple[TagCoverage, ...]
     others: tuple[tuple[str, int], ...] = field(default=())
 
     def share(self, what: str) -> tuple[int, int]:
@@ -133,12 +133,12 @@ class DeviceCoverage:
         return sum(what not in p.missing for p in able), len(able)
 
 
-def devices_covered(system: System, counts: Counts) -> list[DeviceCoverage]:
+def devices_covered(system: System, counts: AccessCounts) -> list[DeviceCoverage]:
     """Return the coverage of every device of the system. A longer read that includes a tag's registers counts for the tag."""
     return [_device(config, counts) for config in system.devices.values()]
 
 
-def _device(config: DeviceConfig, counts: Counts) -> DeviceCoverage:
+def _device(config: DeviceConfig, counts: AccessCounts) -> DeviceCoverage:
     touched = {key: n for key, n in counts.touched.items() if key[0] == config.name}
     refused = {key: n for key, n in counts.refused.items() if key[0] == config.name}
     places, known = [], set()
@@ -148,7 +148,7 @@ def _device(config: DeviceConfig, counts: Counts) -> DeviceCoverage:
         known |= read.keys() | written.keys()
         failed = sum(n for key, n in refused.items() if _covers(key, at))
         where = str(at) if isinstance(at, RegisterRange) else f"{at[0]:04X}h:{at[1]:02X}"
-        places.append(Place(name, where, readable, writable, sum(read.values()), sum(written.values()), failed))
+        places.append(TagCoverage(name, where, readable, writable, sum(read.values()), sum(written.values()), failed))
     others = sorted((_where(key), n) for key, n in touched.items() if key not in known)
     return DeviceCoverage(config.name, config.profile.name, tuple(places), tuple(others))
 
@@ -186,13 +186,13 @@ def _where(key: _Key) -> str:
     return f"{access} {table}:{address}" + (f" x {count}" if count != 1 else "")
 
 
-def exceptions_missing(counts: Counts) -> list[int]:
+def exceptions_missing(counts: AccessCounts) -> list[int]:
     """Return the exception codes of the standard that no device sent."""
     seen = {code for _, code in counts.exceptions}
     return [code for code in ModbusExceptionReply.NAMES if code not in seen]
 
 
-def aborts_missing(counts: Counts) -> list[int]:
+def aborts_missing(counts: AccessCounts) -> list[int]:
     """Return the abort codes of the standard that no device sent."""
     seen = {code for _, code in counts.aborts}
     return [code for code in MEANINGS if code not in seen]

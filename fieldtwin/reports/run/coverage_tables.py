@@ -11,7 +11,7 @@ from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS, meaning
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import fill
 from fieldtwin.reports.run.coverage import aborts_missing, devices_covered, exceptions_missing
-from fieldtwin.results.model import Counts, Machine, Report
+from fieldtwin.results.model import AccessCounts, Machine, Report
 
 MOST_ROWS = 200
 """Rows of one table; the rest is counted."""
@@ -47,7 +47,7 @@ class Grid:
     rows: list[tuple[str, list[Cell]]]
 
 
-def coverage_section(report: Report, counts: Counts) -> Markup:
+def coverage_section(report: Report, counts: AccessCounts) -> Markup:
     """Return the section with everything that was counted."""
     spoken = {b.endpoint.is_can for b in report.system.buses.values()} if report.system is not None else set()
     codes = []
@@ -91,7 +91,7 @@ def _count(n: int) -> Cell:
     return ("passed", str(n)) if n else ("missing", "never")
 
 
-def _transitions(machine: Machine, counts: Counts) -> Grid:
+def _transitions(machine: Machine, counts: AccessCounts) -> Grid:
     """Return the transitions from each state (row) to each state (column): how often, never, or not in the machine's table."""
     taken = {(a, b): n for (variable, a, b), n in counts.transitions.items() if variable == machine.variable}
     known = list(dict.fromkeys([*machine.states, *(s for pair in taken for s in pair)]))
@@ -107,7 +107,7 @@ def _transitions(machine: Machine, counts: Counts) -> Grid:
     return Grid(machine.variable, done, len(machine.transitions), ["from \\ to", *known], rows)
 
 
-def _pairs(report: Report, counts: Counts) -> Grid | None:
+def _pairs(report: Report, counts: AccessCounts) -> Grid | None:
     """Return how often each fault was active in each state; None without faults."""
     faults = list(dict.fromkeys([*report.faults, *sorted(counts.faults)]))
     if not faults:

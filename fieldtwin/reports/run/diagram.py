@@ -14,9 +14,9 @@ from fieldtwin.capture.decoding.tags import show_value
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.reports.markup import Markup, el
-from fieldtwin.reports.run.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
+from fieldtwin.reports.run.axis import CHAR, LEFT, RIGHT, WIDTH, TimeAxis, fitted, label, seconds
 from fieldtwin.reports.run.value_lanes import value_lane
-from fieldtwin.reports.run.window import FaultBar, Step, Window
+from fieldtwin.reports.run.window import FaultBar, PlotStep, Window
 from fieldtwin.twin.site.system import System
 
 MOST_TAGS = 10
@@ -29,7 +29,7 @@ MOST_MARKS = 250
 
 def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
     """Return the drawing."""
-    axis = Axis(window.start_ns, window.span_ns)
+    axis = TimeAxis(window.start_ns, window.span_ns)
     lanes: list[tuple[float, list[Markup]]] = []
     lanes += [_fault_lane(axis, bar) for bar in window.faults[:MOST_FAULTS]]
     lanes += [_wire_lane(axis, window, bus, system) for bus in _buses(window)]
@@ -67,7 +67,7 @@ def _buses(window: Window) -> list[str]:
     return sorted(buses, key=lambda b: b not in about)[:MOST_BUSES]
 
 
-def _chosen(window: Window, lanes: dict[str, list[Step]]) -> list[str]:
+def _chosen(window: Window, lanes: dict[str, list[PlotStep]]) -> list[str]:
     """Return the lanes to draw: the named ones, then those of the same devices, then others; words before numbers, and
     those that changed most first. A lane that is not named and never changes is left out, except for a state in words.
     """
@@ -88,7 +88,7 @@ def _chosen(window: Window, lanes: dict[str, list[Step]]) -> list[str]:
     return sorted(filter(tells, lanes), key=rank)[:most]
 
 
-def _in_words(steps: list[Step]) -> bool:
+def _in_words(steps: list[PlotStep]) -> bool:
     return any(isinstance(s.value, str) for s in steps)
 
 
@@ -101,7 +101,7 @@ def _tag(system: System | None, name: str) -> Tag | None:
 # -- lanes --------------------------------------------------------------------------------------------------------------
 
 
-def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
+def _fault_lane(axis: TimeAxis, bar: FaultBar) -> tuple[float, list[Markup]]:
     x1, x2 = axis.x(bar.on_ns), axis.x(bar.off_ns) if bar.off_ns is not None else WIDTH - RIGHT
     said = f"{bar.name} {bar.target}".strip()
     off = f"to {seconds(bar.off_ns)}" if bar.off_ns is not None else "and not removed"
@@ -112,7 +112,7 @@ def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
     return 22.0, [*label(f"fault {bar.id}"), box, *fitted(said, x1, x2, 15.0, "faulttext")]
 
 
-def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
+def _wire_lane(axis: TimeAxis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
     """Return the lane of a bus.
 
     A request is a box as long as the wait for its answer, a message is a tick; text is added where there is room.
@@ -164,7 +164,7 @@ def _row(exchange: DecodedExchange) -> int:
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
 
-def _scan_lane(axis: Axis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
+def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
     """Return the lane of the scans that changed something, each with its changes; other scans are not drawn."""
     changed: dict[int, list[str]] = {}
     for name, steps in window.states.items():
@@ -215,7 +215,7 @@ def _tooltip(exchange: DecodedExchange) -> str:
 # -- axis and failure -----------------------------------------------------------------------------------------------
 
 
-def _time_axis(axis: Axis, window: Window, height: float) -> list[Markup]:
+def _time_axis(axis: TimeAxis, window: Window, height: float) -> list[Markup]:
     wanted = window.span_ns / 8
     magnitude = 10 ** math.floor(math.log10(wanted))
     step = int(next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= wanted))
@@ -229,7 +229,7 @@ def _time_axis(axis: Axis, window: Window, height: float) -> list[Markup]:
     return marks
 
 
-def _failure(axis: Axis, window: Window, height: float) -> list[Markup]:
+def _failure(axis: TimeAxis, window: Window, height: float) -> list[Markup]:
     x, check = axis.x(window.at_ns), window.check
     marks = []
     if check.since_ns is not None and check.since_ns < window.at_ns:

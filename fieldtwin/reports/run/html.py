@@ -20,7 +20,7 @@ from fieldtwin.reports.run.coverage_tables import coverage_section
 from fieldtwin.reports.run.diagram import timing_diagram
 from fieldtwin.reports.run.requirements import requirement_matrix
 from fieldtwin.reports.run.window import MOST_FRAMES, FrameLine, Study, Window
-from fieldtwin.results.model import CheckResult, Counts, Report, ScenarioResult, SystemKey, Verdict, key_of
+from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioResult, SystemKey, Verdict, key_of
 
 MOST_DRAWN = 16
 """Largest number of failures with a diagram and frames."""
@@ -106,7 +106,7 @@ def _why(scenario: ScenarioResult) -> str:
 class _Studied:
     """The traces, read once: `parts` have the counts by system, each with the report for that system."""
 
-    parts: dict[SystemKey | None, tuple[Report, Counts]] = field(default_factory=dict)
+    parts: dict[SystemKey | None, tuple[Report, AccessCounts]] = field(default_factory=dict)
     failures: list[Markup] = field(default_factory=list)
     not_drawn: list[tuple[int, ScenarioResult]] = field(default_factory=list)
 
@@ -115,11 +115,11 @@ def _study(report: Report) -> _Studied:
     studied = _Studied()
     used = 0
     if not report.scenarios or report.system is not None:
-        studied.parts[key_of(report.system) if report.system is not None else None] = report, Counts()
+        studied.parts[key_of(report.system) if report.system is not None else None] = report, AccessCounts()
     for number, scenario in enumerate(report.scenarios):
         own_part = report.part_of(scenario)
         key = None if own_part.system is None else key_of(own_part.system)
-        part, counts = studied.parts.setdefault(key, (own_part, Counts()))
+        part, counts = studied.parts.setdefault(key, (own_part, AccessCounts()))
         room = scenario.verdict.bad and len(studied.failures) < MOST_DRAWN and used < BUDGET
         wanted = [c for c in scenario.checks if c.verdict.bad][:PER_SCENARIO] if room else []
         windows: list[Window] = []

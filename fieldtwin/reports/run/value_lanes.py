@@ -9,8 +9,8 @@ from typing import Any
 
 from fieldtwin.capture.decoding.tags import show_value
 from fieldtwin.reports.markup import Markup, el
-from fieldtwin.reports.run.axis import Axis, fitted, label, seconds
-from fieldtwin.reports.run.window import Step, Window, thin_steps
+from fieldtwin.reports.run.axis import TimeAxis, fitted, label, seconds
+from fieldtwin.reports.run.window import PlotStep, Window, thin_steps
 
 MOST_POINTS = 300
 """Largest number of changes that are drawn in a lane."""
@@ -20,7 +20,12 @@ _FEW = 3
 
 
 def value_lane(
-    axis: Axis, window: Window, name: str, steps: list[Step], unit: str = "", words: Mapping[Any, str] | None = None
+    axis: TimeAxis,
+    window: Window,
+    name: str,
+    steps: list[PlotStep],
+    unit: str = "",
+    words: Mapping[Any, str] | None = None,
 ) -> tuple[float, list[Markup]]:
     """Return height and marks of a lane. `words` are the names of values; a state with more values is drawn as a number."""
     drawn = _thinned(steps)
@@ -33,7 +38,7 @@ def value_lane(
 
 
 def _line(
-    axis: Axis, window: Window, name: str, steps: Sequence[Step], unit: str, *, thinned: bool
+    axis: TimeAxis, window: Window, name: str, steps: Sequence[PlotStep], unit: str, *, thinned: bool
 ) -> tuple[float, list[Markup]]:
     numbers = [s.value for s in steps if _is_number(s.value)]
     low, high = min(numbers), max(numbers)
@@ -63,13 +68,13 @@ def _line(
     return height, marks + lines
 
 
-def _thinned(steps: list[Step]) -> list[Step]:
+def _thinned(steps: list[PlotStep]) -> list[PlotStep]:
     while len(steps) > MOST_POINTS:
         steps = thin_steps(steps)
     return steps
 
 
-def _risers(axis: Axis, steps: Sequence[Step], y: object) -> Markup:
+def _risers(axis: TimeAxis, steps: Sequence[PlotStep], y: object) -> Markup:
     """Return the vertical lines between two consecutive values."""
     assert callable(y)
     parts = [
@@ -80,7 +85,9 @@ def _risers(axis: Axis, steps: Sequence[Step], y: object) -> Markup:
     return el("path", cls="riser", d="".join(parts)) if parts else Markup("")
 
 
-def _boxes(axis: Axis, window: Window, steps: Sequence[Step], words: Mapping[Any, str], cls: str) -> list[Markup]:
+def _boxes(
+    axis: TimeAxis, window: Window, steps: Sequence[PlotStep], words: Mapping[Any, str], cls: str
+) -> list[Markup]:
     """Return a box for each value from its start to its end, with slanted edges, as logic analysers draw them."""
     marks = []
     for step, end_ns in _merged(window, steps):
@@ -98,15 +105,15 @@ def _boxes(axis: Axis, window: Window, steps: Sequence[Step], words: Mapping[Any
     return marks
 
 
-def _merged(window: Window, steps: Sequence[Step], *, by_quality: bool = False) -> Iterable[tuple[Step, int]]:
+def _merged(window: Window, steps: Sequence[PlotStep], *, by_quality: bool = False) -> Iterable[tuple[PlotStep, int]]:
     """Yield spans, with neighbours of the same value (or of the same quality and reason) merged into one."""
 
-    def same(a: Step, b: Step) -> bool:
+    def same(a: PlotStep, b: PlotStep) -> bool:
         if by_quality:
             return (a.quality, a.reason) == (b.quality, b.reason)
         return (a.value, a.quality) == (b.value, b.quality)
 
-    held: tuple[Step, int] | None = None
+    held: tuple[PlotStep, int] | None = None
     for step, end_ns in _spans(window, steps):
         if held is not None and same(held[0], step):
             held = held[0], end_ns
@@ -118,14 +125,14 @@ def _merged(window: Window, steps: Sequence[Step], *, by_quality: bool = False) 
         yield held
 
 
-def _spans(window: Window, steps: Sequence[Step]) -> Iterable[tuple[Step, int]]:
+def _spans(window: Window, steps: Sequence[PlotStep]) -> Iterable[tuple[PlotStep, int]]:
     for number, step in enumerate(steps):
         end_ns = steps[number + 1].t_ns if number + 1 < len(steps) else window.end_ns
         if end_ns > window.start_ns or number + 1 == len(steps):
             yield step, end_ns
 
 
-def _quality(step: Step) -> str:
+def _quality(step: PlotStep) -> str:
     return _QUALITIES.get(step.quality, "bad")
 
 

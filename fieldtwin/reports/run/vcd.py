@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.reports.markup import clean
 from fieldtwin.results.model import Machine
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST_CHARACTERS = 48
@@ -33,7 +33,7 @@ _QUALITY_BITS = 3
 _QUALITIES = {str(q): int(q) for q in Quality}
 
 
-class Change(NamedTuple):
+class VcdChange(NamedTuple):
     """A change of one variable. `quality` marks the number of a tag's quality."""
 
     t_ns: int
@@ -45,7 +45,7 @@ class Change(NamedTuple):
 
 def write_vcd(
     path: Path,
-    events: Sequence[Event],
+    events: Sequence[TraceEvent],
     system: System | None = None,
     machines: Sequence[Machine] = (),
     comment: str = "",
@@ -59,7 +59,7 @@ def write_vcd(
 
 
 def _write(
-    file: TextIO, events: Sequence[Event], system: System | None, machines: Sequence[Machine], comment: str
+    file: TextIO, events: Sequence[TraceEvent], system: System | None, machines: Sequence[Machine], comment: str
 ) -> None:
     changes = sorted(_changes(events, system, {m.variable: m for m in machines}), key=lambda c: c.t_ns)
     types: dict[str, dict[tuple[str, bool], str]] = {}
@@ -80,39 +80,41 @@ def _write(
                 writer.change(variable, change.t_ns, value)
 
 
-def _changes(events: Iterable[Event], system: System | None, machines: dict[str, Machine]) -> Iterator[Change]:
+def _changes(events: Iterable[TraceEvent], system: System | None, machines: dict[str, Machine]) -> Iterator[VcdChange]:
     decoder = Decoder(system) if system is not None else None
     devices = system.devices.values() if system is not None else ()
     secrets = {f"{d.name}.{t.name}" for d in devices for t in d.profile.tags.values() if t.secret}
     for event in events:
         data, t_ns = event.data, max(0, event.t_ns)
         match event.kind:
-            case Kind.TAG:
+            case TraceKind.TAG:
                 scope, _, name = event.where.rpartition(".")
                 if data.get("value") is not None and event.where not in secrets:
-                    yield Change(t_ns, scope, name or "value", data["value"])
-                yield Change(t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), quality=True)
-            case Kind.STATE:
+                    yield VcdChange(t_ns, scope, name or "value", data["value"])
+                yield VcdChange(
+                    t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), quality=True
+                )
+            case TraceKind.STATE:
                 machine, value = machines.get(event.where), data.get("value")
-                yield Change(t_ns, "plc", event.where, machine.name_of(value) if machine else value)
-            case Kind.FAULT:
-                yield Change(t_ns, "faults", f"{event.where}_{data.get('name', '')}", bool(data.get("on")))
-            case Kind.STEP:
+                yield VcdChange(t_ns, "plc", event.where, machine.name_of(value) if machine else value)
+            case TraceKind.FAULT:
+                yield VcdChange(t_ns, "faults", f"{event.where}_{data.get('name', '')}", bool(data.get("on")))
+            case TraceKind.STEP:
                 text = f"{event.where} {data.get('text', '')} {data.get('verdict', '')}"
-                yield Change(t_ns, "scenario", "step", text)
-            case Kind.FRAME if decoder is not None:
+                yield VcdChange(t_ns, "scenario", "step", text)
+            case TraceKind.FRAME if decoder is not None:
                 decoded = decoder.decode(event)
-                yield Change(t_ns, event.where, "sent" if data.get("dir") == "sent" else "received", decoded.text)
+                yield VcdChange(t_ns, event.where, "sent" if data.get("dir") == "sent" else "received", decoded.text)
                 for exchange in decoded.exchanges:
                     if exchange.latency_ns is not None:  # a request waited for its answer
                         waiting = f"waiting_{exchange.unit}"
-                        yield Change(max(0, exchange.t_ns), event.where, waiting, True)
-                        yield Change(max(0, exchange.end_ns), event.where, waiting, False)
+                        yield VcdChange(max(0, exchange.t_ns), event.where, waiting, True)
+                        yield VcdChange(max(0, exchange.end_ns), event.where, waiting, False)
                     if exchange.problem:
-                        yield Change(t_ns, event.where, "problem", f"{exchange.device} {exchange.problem}")
+                        yield VcdChange(t_ns, event.where, "problem", f"{exchange.device} {exchange.problem}")
 
 
-def _type(change: Change) -> str:
+def _type(change: VcdChange) -> str:
     if isinstance(change.value, bool):
         return "wire"
     return "real" if isinstance(change.value, int | float) and not change.quality else "reg"

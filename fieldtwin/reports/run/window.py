@@ -15,8 +15,8 @@ from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.reports.run.coverage import Collector
-from fieldtwin.results.model import CheckResult, Counts, Report, ScenarioResult
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioResult
+from fieldtwin.results.trace import TraceEvent, TraceKind
 
 MOST_FRAMES = 160
 """Number of frames before the failure; after it, a quarter as many."""
@@ -27,7 +27,7 @@ LONGEST_NS = 60 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PlotStep:
     """A tag or state that has had `value` since `t_ns`. `quality` is "" for a state."""
 
     t_ns: int
@@ -71,8 +71,8 @@ class Window:
     at_ns: int
     lost: bool = False
     exchanges: list[DecodedExchange] = field(default_factory=list)
-    states: dict[str, list[Step]] = field(default_factory=dict)
-    tags: dict[str, list[Step]] = field(default_factory=dict)
+    states: dict[str, list[PlotStep]] = field(default_factory=dict)
+    tags: dict[str, list[PlotStep]] = field(default_factory=dict)
     faults: list[FaultBar] = field(default_factory=list)
     before: deque[FrameLine] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
     after: list[FrameLine] = field(default_factory=list)
@@ -118,11 +118,11 @@ class Study:
         devices = report.system.devices.values() if report.system else ()
         self._secrets = {f"{d.name}.{t.name}" for d in devices for t in d.profile.tags.values() if t.secret}
         self._hiding = {d.bus for d in devices if any(t.secret for t in d.profile.tags.values())}
-        self._now: dict[Kind, dict[str, Step]] = {Kind.TAG: {}, Kind.STATE: {}}
+        self._now: dict[TraceKind, dict[str, PlotStep]] = {TraceKind.TAG: {}, TraceKind.STATE: {}}
         self._on: dict[str, FaultBar] = {}
         self._off: list[FaultBar] = []
 
-    def run(self, checks: Sequence[CheckResult]) -> tuple[Counts, list[Window]]:
+    def run(self, checks: Sequence[CheckResult]) -> tuple[AccessCounts, list[Window]]:
         """Read the scenario's trace and return its counts and windows.
 
         If a listener has already counted, its counts are returned.
@@ -156,13 +156,13 @@ class Study:
 
     def _begin(self, window: Window) -> None:
         """Start a window with the current values and states."""
-        window.tags = {name: [step] for name, step in self._now[Kind.TAG].items()}
-        window.states = {name: [step] for name, step in self._now[Kind.STATE].items()}
+        window.tags = {name: [step] for name, step in self._now[TraceKind.TAG].items()}
+        window.states = {name: [step] for name, step in self._now[TraceKind.STATE].items()}
 
-    def _event(self, event: Event, inside: list[Window], windows: list[Window]) -> None:
+    def _event(self, event: TraceEvent, inside: list[Window], windows: list[Window]) -> None:
         data = event.data
         done: tuple[DecodedExchange, ...] = ()
-        if event.kind is Kind.FRAME:
+        if event.kind is TraceKind.FRAME:
             if inside:
                 decoded = self._decoder.decode(event)
                 done = decoded.exchanges
@@ -179,9 +179,9 @@ class Study:
                 done = tuple(self._decoder.feed(event))
             for exchange in done:
                 self._exchange(exchange, windows)
-        elif event.kind in (Kind.TAG, Kind.STATE):
+        elif event.kind in (TraceKind.TAG, TraceKind.STATE):
             self._changed(event, inside)
-        elif event.kind is Kind.FAULT:
+        elif event.kind is TraceKind.FAULT:
             self._fault(event)
         self._collector.take(event, done)
 
@@ -194,23 +194,23 @@ class Study:
                 if len(window.exchanges) > MOST_EXCHANGES:
                     _thin_exchanges(window)
 
-    def _changed(self, event: Event, inside: list[Window]) -> None:
+    def _changed(self, event: TraceEvent, inside: list[Window]) -> None:
         data, name, value = event.data, event.where, event.data.get("value")
         machine = self._machines.get(name)
-        if event.kind is Kind.TAG and name in self._secrets:
+        if event.kind is TraceKind.TAG and name in self._secrets:
             value = SECRET
-        step = Step(
+        step = PlotStep(
             event.t_ns, machine.name_of(value) if machine else value, data.get("quality", ""), data.get("reason", "")
         )
         self._now[event.kind][name] = step
         for window in inside:
-            steps = (window.tags if event.kind is Kind.TAG else window.states).setdefault(name, [])
+            steps = (window.tags if event.kind is TraceKind.TAG else window.states).setdefault(name, [])
             steps.append(step)
             if len(steps) > MOST_STEPS:
                 window.thinned.add(name)
                 steps[:] = thin_steps(steps)
 
-    def _fault(self, event: Event) -> None:
+    def _fault(self, event: TraceEvent) -> None:
         id, on = event.where, bool(event.data.get("on"))
         known = self._on.pop(id, None)
         if known is not None:
@@ -230,7 +230,7 @@ def _thin_exchanges(window: Window) -> None:
         del held[: len(held) // 2]
 
 
-def thin_steps(steps: list[Step]) -> list[Step]:
+def thin_steps(steps: list[PlotStep]) -> list[PlotStep]:
     """Return about half of the steps: of every four changes the lowest and the highest, and all that change the
     quality; if that is most of them, the newer half. The result keeps the extremes."""
     kept = set()
@@ -242,7 +242,7 @@ def thin_steps(steps: list[Step]) -> list[Step]:
     return thin if len(thin) < len(steps) * 3 // 4 else thin[len(thin) // 2 :]
 
 
-def _height(step: Step) -> float:
+def _height(step: PlotStep) -> float:
     value = step.value
     return value if isinstance(value, int | float) and value == value else 0.0
 
@@ -255,7 +255,7 @@ def _keep(window: Window, line: FrameLine) -> None:
         window.after.append(line)
 
 
-def _raw(event: Event, text: str, hiding: Collection[str]) -> str:
+def _raw(event: TraceEvent, text: str, hiding: Collection[str]) -> str:
     """Return the frame's bytes in hexadecimal, after a CAN identifier if there is one.
 
     A frame whose text hides a secret is hidden, and so is a partial frame on a bus with secret tags.

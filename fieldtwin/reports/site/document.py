@@ -40,7 +40,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class DocumentPiece:
     """One file: the result of one action on one device.
 
     `facts` are in reading order. `protocol`, `address` and `endpoint` identify the device; `verdict` is one word, `summary` one
@@ -68,7 +68,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SourceFile:
     """A file as it was read: its name, size and SHA-256, which prove later that it is the same file."""
 
     name: str
@@ -81,14 +81,14 @@ class Source:
 
 
 @dataclass
-class Device:
+class ReportedDevice:
     """One device: all pieces with the same protocol, bus and address. The user can set `label` and `serial`."""
 
     number: int
     protocol: str
     address: int
     endpoint: str
-    pieces: list[Piece] = field(default_factory=list)
+    pieces: list[DocumentPiece] = field(default_factory=list)
     label: str = ""
     serial_said: str = ""
 
@@ -135,19 +135,19 @@ class Device:
 
 
 @dataclass(frozen=True)
-class Document:
+class SiteDocument:
     """The whole document. `prepared` is ISO 8601 in UTC."""
 
     site: str
     by: str
     prepared: str
-    devices: Sequence[Device]
-    sources: Sequence[Source]
+    devices: Sequence[ReportedDevice]
+    sources: Sequence[SourceFile]
     remarks: str = ""
     customer: str = ""
 
     @property
-    def deviations(self) -> list[tuple[Device, Piece, Deviation]]:
+    def deviations(self) -> list[tuple[ReportedDevice, DocumentPiece, Deviation]]:
         """Return all deviations, those that need a decision first."""
         order = {weight: at for at, weight in enumerate(("deviation", "open", "robustness", "field problem", "waived"))}
         found = [(d, p, deviation) for d in self.devices for p in d.pieces for deviation in p.deviations]

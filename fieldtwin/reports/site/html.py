@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fieldtwin.reports.file import put
 from fieldtwin.reports.pages import fill
-from fieldtwin.reports.site.document import Document, Weight
+from fieldtwin.reports.site.document import SiteDocument, Weight
 
 MOST_DEVIATIONS = 1000
 HEADINGS = {"check": "Conformance check", "dump": "Dump", "comparison": "Comparison", "difference": "Difference"}
@@ -21,12 +21,12 @@ NOTED: dict[Weight, str] = {"robustness": "robustness finding", "field problem":
 """Findings that do not deviate from the standard, as counted in the result."""
 
 
-def write_html(document: Document, path: Path) -> None:
+def write_html(document: SiteDocument, path: Path) -> None:
     """Write the page. Raises `FileInvalid` if it cannot be written."""
     put(path, render_html(document))
 
 
-def render_html(document: Document) -> str:
+def render_html(document: SiteDocument) -> str:
     """Return the whole page."""
     deviations, opened, waived = document.count("deviation"), document.count("open"), document.count("waived")
     result = [plural(deviations, "deviation"), plural(opened, "open point")]
@@ -58,7 +58,7 @@ def plural(count: int, word: str) -> str:
     return f"{count or 'no'} {word}{'' if count in (0, 1) else 's'}"
 
 
-def _span(document: Document) -> str:
+def _span(document: SiteDocument) -> str:
     """Return the time from the first to the last action."""
     times = sorted(piece.when for device in document.devices for piece in device.pieces if piece.when)
     if not times:

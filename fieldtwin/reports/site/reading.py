@@ -16,7 +16,16 @@ from typing import Any
 
 from fieldtwin.conformance.core.case import Basis
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.reports.site.document import Deviation, Device, Document, Kind, Piece, Source, Table, Weight
+from fieldtwin.reports.site.document import (
+    Deviation,
+    DocumentPiece,
+    Kind,
+    ReportedDevice,
+    SiteDocument,
+    SourceFile,
+    Table,
+    Weight,
+)
 from fieldtwin.reports.site.reading_dump import dump_piece
 
 MOST_BYTES = 1 << 28
@@ -32,12 +41,12 @@ class UnknownFileKind(FileInvalid):
 
 def read_site(
     paths: Iterable[Path], *, site: str, by: str, prepared: str, customer: str = "", remarks: str = ""
-) -> tuple[Document, list[str]]:
+) -> tuple[SiteDocument, list[str]]:
     """Return the document of all files, and the files of folders that were left out, with the reason.
 
     Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` without any file.
     """
-    pieces: list[tuple[Path, Piece]] = []
+    pieces: list[tuple[Path, DocumentPiece]] = []
     left_out: list[str] = []
     for path in paths:
         if not path.is_dir():
@@ -52,21 +61,21 @@ def read_site(
         raise UsageError(
             "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="no file of these kinds"
         )
-    devices: dict[tuple[str, str, int], Device] = {}
+    devices: dict[tuple[str, str, int], ReportedDevice] = {}
     for _, piece in sorted(pieces, key=lambda each: (each[1].protocol, each[1].endpoint, each[1].address)):
         key = (piece.protocol, piece.endpoint, piece.address)
-        devices.setdefault(key, Device(len(devices) + 1, *_key(piece))).pieces.append(piece)
+        devices.setdefault(key, ReportedDevice(len(devices) + 1, *_key(piece))).pieces.append(piece)
     for device in devices.values():
         device.pieces.sort(key=lambda piece: piece.when)
     sources = [_source(path, piece) for path, piece in pieces]
-    return Document(site, by, prepared, list(devices.values()), sources, remarks, customer), left_out
+    return SiteDocument(site, by, prepared, list(devices.values()), sources, remarks, customer), left_out
 
 
-def _key(piece: Piece) -> tuple[str, int, str]:
+def _key(piece: DocumentPiece) -> tuple[str, int, str]:
     return piece.protocol, piece.address, piece.endpoint
 
 
-def _source(path: Path, piece: Piece) -> Source:
+def _source(path: Path, piece: DocumentPiece) -> SourceFile:
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -75,10 +84,10 @@ def _source(path: Path, piece: Piece) -> Source:
         size = path.stat().st_size
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    return Source(path.name, size, digest.hexdigest(), piece.kind, piece.when, piece.by, piece.command)
+    return SourceFile(path.name, size, digest.hexdigest(), piece.kind, piece.when, piece.by, piece.command)
 
 
-def read_piece(path: Path) -> Piece:
+def read_piece(path: Path) -> DocumentPiece:
     """Read one file. Raises `FileInvalid` if it does not belong into the document."""
     try:
         with path.open("rb") as file:
@@ -109,7 +118,7 @@ def read_piece(path: Path) -> Piece:
 # -- checks --------------------------------------------------------------------------------------------------------------
 
 
-def check_piece(data: dict[str, Any]) -> Piece:
+def check_piece(data: dict[str, Any]) -> DocumentPiece:
     """Read the JSON of `fieldtwin check modbus|canopen`."""
     about, cases, counts = data["about"], data["cases"], data["counts"]
     weights: dict[str, Weight] = {"failed": "deviation", "error": "deviation", "inconclusive": "open"}
@@ -146,7 +155,7 @@ def check_piece(data: dict[str, Any]) -> Piece:
         ),
         _table("Not checked", ("case", "what", "why"), [(c["id"], c["title"], c["reason"]) for c in here]),
     )
-    return Piece(
+    return DocumentPiece(
         "check", str(about["protocol"]), int(about["address"]), str(about["endpoint"]), str(about["started"]),
         str(about["by"]), "failed" if bad else "passed" if counts.get("passed") else "inconclusive",
         ", ".join(f"{shown[w]} {w}" for w in words if shown[w]),
@@ -179,7 +188,7 @@ def _case(case: dict[str, Any], weight: Weight) -> Deviation:
 # -- comparisons and differences -------------------------------------------------------------------------------------------
 
 
-def compare_piece(data: dict[str, Any]) -> Piece:
+def compare_piece(data: dict[str, Any]) -> DocumentPiece:
     """Read the JSON of `fieldtwin compare`: a device against a recording."""
     about, found = data["about"], data["differences"]
     alike_ones: dict[tuple[str, ...], list[dict[str, Any]]] = {}
@@ -229,7 +238,7 @@ def _ms(quantiles: list[float]) -> str:
     return ", ".join(f"{1000 * s:.1f}" for s in quantiles) + " ms"
 
 
-def diff_piece(data: dict[str, Any]) -> Piece:
+def diff_piece(data: dict[str, Any]) -> DocumentPiece:
     """Read the JSON of `fieldtwin diff`: a dump against another one, or against a profile or an EDS."""
     about, found = data["about"], data["found"]
     deviations = [
@@ -254,10 +263,10 @@ def _headed(
     facts: list[tuple[str, str]],
     deviations: list[Deviation],
     tables: tuple[Table, ...],
-) -> Piece:
+) -> DocumentPiece:
     """Return a piece for JSON with the header of `about.headed`."""
     where = str(about["endpoint"]) or str(about["device"])
-    return Piece(
+    return DocumentPiece(
         kind, str(about["protocol"]), int(about["address"]), where, str(about["started"]), str(about["by"]), verdict, summary,
         {}, tuple(facts), tuple(deviations), tables, str(about["command"]),
     )  # fmt: skip
@@ -268,7 +277,7 @@ def _table(title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) ->
     return Table(title, columns, shown, max(0, len(rows) - MOST_ROWS))
 
 
-READERS: dict[str, Callable[[dict[str, Any]], Piece]] = {
+READERS: dict[str, Callable[[dict[str, Any]], DocumentPiece]] = {
     "fieldtwin check": check_piece,
     "fieldtwin compare": compare_piece,
     "fieldtwin diff": diff_piece,

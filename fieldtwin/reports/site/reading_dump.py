@@ -8,7 +8,7 @@ from typing import Any
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.conformance.devices.checked import shown
 from fieldtwin.conformance.devices.modbus.session import objects_in
-from fieldtwin.reports.site.document import SERIAL, Deviation, Piece, Table
+from fieldtwin.reports.site.document import SERIAL, Deviation, DocumentPiece, Table
 
 IDENTITY = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}
 NUMBERS = {
@@ -17,7 +17,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def dump_piece(path: Path) -> Piece:
+def dump_piece(path: Path) -> DocumentPiece:
     """Read a dump. Raises `FileInvalid` like `load_dump`."""
     dump = load_dump(path)
     header = dump.header
@@ -41,7 +41,7 @@ def dump_piece(path: Path) -> Piece:
     ]
     if dump.not_asked:
         facts.append(("not asked", f"{dump.not_asked} of {asked_for} addresses; their neighbours were"))
-    return Piece(
+    return DocumentPiece(
         "dump", dump.protocol, int(header.get("address", 0)), str(header.get("endpoint", "")), str(header.get("started", "")),
         str(header.get("by", "")), _verdict(dump), f"{cells} values in {len(dump.passes)} passes",
         identity(dump), tuple(facts), tuple(deviations), _tables(dump), str(header.get("command", "")),

@@ -8,7 +8,7 @@ from pathlib import Path
 from fieldtwin.capture.decoding.decoder import frame_events
 from fieldtwin.capture.formats.pcap import captured_of
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.results.trace import Event
+from fieldtwin.results.trace import TraceEvent
 from fieldtwin.twin.site.system import System
 
 AT_ONCE = 4 << 20
@@ -33,7 +33,7 @@ class CaptureTail:
     def close(self) -> None:
         self._file.close()
 
-    def read(self, start_ns: int) -> list[Event]:
+    def read(self, start_ns: int) -> list[TraceEvent]:
         """Return the new frames on the system's buses; times in ns since `start_ns`."""
         *lines, self._rest = (self._rest + self._file.read(AT_ONCE)).split(b"\n")
         try:

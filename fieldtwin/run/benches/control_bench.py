@@ -1,6 +1,6 @@
 """The bench of a scenario for a system that runs in processes, reached by control channels, process image and capture file.
 
-This is a `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. Its abilities depend on the
+This is a `fieldtwin.scenarios.bench.WorkerBench` for the targets `local`, `compose` and `real`. Its abilities depend on the
 parts that it can reach: without field simulator it has no faults, without capture it cannot see frames. It starts and
 ends only its own connections. Where no fieldtwin gateway runs, a scenario that uses only probes tests a third-party
 controller with the field simulator alone.
@@ -35,7 +35,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import TOPSIDE, Event, Kind, Trace, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceEvent, TraceKind, refusal_data
 from fieldtwin.run.benches.capture_tail import CaptureTail
 from fieldtwin.run.benches.field_lease import FieldLease
 from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
@@ -46,7 +46,7 @@ from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.processes.with_program import environment_from
 from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
 from fieldtwin.twin.prototype.field_status import FieldStatus, StruckStatus
 from fieldtwin.twin.site.system import System
@@ -103,7 +103,7 @@ class ControlBench(AsyncResource):
         *,
         target: str,
         names: Collection[str],
-        probes: Sequence[Probe] = (),
+        probes: Sequence[ScenarioProbe] = (),
         fresh: Callable[[frozenset[Can]], bool] = lambda can: False,
         gone: Callable[[], FieldtwinError | None] = lambda: None,
     ) -> None:
@@ -338,7 +338,7 @@ class ControlBench(AsyncResource):
         answer = await self._put("fault", fault=fault, start_ns=self._start_ns)
         self._fault_numbers.add(answer["number"])
         target = fault.get("device") or fault.get("bus") or ""
-        self._note(Kind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target, "said": fault})
+        self._note(TraceKind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target, "said": fault})
 
     async def struck(self) -> list[Struck]:
         if not self._fault_numbers:
@@ -348,7 +348,7 @@ class ControlBench(AsyncResource):
 
     async def clear(self, id: str) -> None:
         await self._to_field("clear", id=id)
-        self._note(Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+        self._note(TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
         """Return the values that a device held.
@@ -384,11 +384,11 @@ class ControlBench(AsyncResource):
 
     # -- events -------------------------------------------------------------------------------------------------------
 
-    def _note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
+    def _note(self, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         self.trace.note(round(self.now_s() * NS_PER_S), kind, where, data)
 
     def _commanded(self, period_s: int) -> None:
-        self._note(Kind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
+        self._note(TraceKind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
         try:
@@ -418,7 +418,7 @@ class ControlBench(AsyncResource):
         if self._plc is not None and self.now_s() >= self._plc_due_s:
             await self._ask_plc()
 
-    async def _changed_tags(self) -> list[Event]:
+    async def _changed_tags(self) -> list[TraceEvent]:
         if self._gateway is None:
             return []
         answer = await self._gateway.call("watch", since=self._since, names=self._asked, refused=self._refused)
@@ -428,15 +428,15 @@ class ControlBench(AsyncResource):
             self._refused = entry["number"]
             t_ns = entry["t_ns"] - self._start_ns
             if t_ns >= 0 or self.target == "local" or entry["standing"]:  # before: of this run, or refused now as well
-                events.append(Event(max(0, t_ns), Kind.REFUSED, entry["tag"], refusal_data(entry)))
+                events.append(TraceEvent(max(0, t_ns), TraceKind.REFUSED, entry["tag"], refusal_data(entry)))
         for number, t_ns, tag, value, quality, reason in answer["changes"]:
             self._since = number
             self._updates[tag] = self._updates.get(tag, 0) + 1
             data = {"value": value, "quality": quality, "reason": reason.replace(" ", "_")}
-            events.append(Event(t_ns - self._start_ns, Kind.TAG, tag, data))
+            events.append(TraceEvent(t_ns - self._start_ns, TraceKind.TAG, tag, data))
         return events
 
-    def _changed_states(self) -> list[Event]:
+    def _changed_states(self) -> list[TraceEvent]:
         """Return the changes of programs' states since the last call; a value between two calls may be missed."""
         if self._outputs is None:
             return []
@@ -451,7 +451,7 @@ class ControlBench(AsyncResource):
             shown = self._words[name].get(shown, shown) if name in self._words else shown
             if name not in self._states or self._states[name] != shown:
                 self._states[name] = shown
-                events.append(Event(snapshot.t_ns - self._start_ns, Kind.STATE, name, {"value": shown}))
+                events.append(TraceEvent(snapshot.t_ns - self._start_ns, TraceKind.STATE, name, {"value": shown}))
         return events
 
     async def _ask_plc(self) -> None:

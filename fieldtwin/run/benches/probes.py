@@ -16,9 +16,9 @@ from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import TagReading
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 
 MOST_EVENTS = 50_000
 
@@ -31,7 +31,7 @@ class Probes:
 
     def __init__(
         self,
-        probes: Sequence[Probe],
+        probes: Sequence[ScenarioProbe],
         clock: Clock,
         served: Callable[[str], Endpoint],
         connector: Connector | None = None,
@@ -41,12 +41,12 @@ class Probes:
         self._tags = TagTable(clock)
         self._tags.subscribe(self._put)
         self._updates: dict[str, int] = {}
-        self.on_change: Callable[[Kind, str, dict[str, Any]], None] | None = None
+        self.on_change: Callable[[TraceKind, str, dict[str, Any]], None] | None = None
         """Called with each change as it occurs; if None, changes are kept for `changes`."""
         self._events: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=MOST_EVENTS)
         self._buses = [self._bus(probe, served, connector or OsConnector()) for probe in probes]
 
-    def _bus(self, probe: Probe, served: Callable[[str], Endpoint], connector: Connector) -> ModbusBus:
+    def _bus(self, probe: ScenarioProbe, served: Callable[[str], Endpoint], connector: Connector) -> ModbusBus:
         every_ms = max(1, round(probe.every_s * 1000))
         groups = dict.fromkeys((tag.poll for tag in probe.profile.tags.values()), every_ms)
         stale_ms = max(3 * every_ms, round(2 * probe.timeout_s * 1000))
@@ -88,9 +88,9 @@ class Probes:
         error = bus.error or next((device.error for device in bus.devices if device.error), "")
         return f"the probe {bus.config.name} at {bus.config.endpoint}: {error or 'no answer yet'}"
 
-    def changes(self, start_ns: int) -> list[Event]:
+    def changes(self, start_ns: int) -> list[TraceEvent]:
         """Return the TAG events since the last call, in ns since `start_ns`."""
-        events = [Event(t_ns - start_ns, Kind.TAG, name, data) for t_ns, name, data in self._events]
+        events = [TraceEvent(t_ns - start_ns, TraceKind.TAG, name, data) for t_ns, name, data in self._events]
         self._events.clear()
         return events
 
@@ -99,6 +99,6 @@ class Probes:
         shown = value.value.hex() if isinstance(value.value, bytes) else value.value
         data = {"value": shown, "quality": value.quality.name.lower(), "reason": value.reason.name.lower()}
         if self.on_change is not None:
-            self.on_change(Kind.TAG, name, data)
+            self.on_change(TraceKind.TAG, name, data)
         else:
             self._events.append((self._clock.monotonic_ns(), name, data))

@@ -1,6 +1,6 @@
 """A scenario's bench for a prototype in virtual time: events are traced here, and checks query it.
 
-This is a `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
+This is a `fieldtwin.scenarios.bench.WorkerBench` for the target `virtual`, inside one `VirtualLoop`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.gateway.runtime.outputs.refusals import Refusal
-from fieldtwin.plc.publishing import Change
+from fieldtwin.gateway.runtime.outputs.refusals import RefusedOutput
+from fieldtwin.plc.publishing import TagChange
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import TOPSIDE, Kind, Trace, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind, refusal_data
 from fieldtwin.run.benches.probes import Probes
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import Scripted, TopsideController
 from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.twin.site.system import System
@@ -41,7 +41,7 @@ from fieldtwin.twin.site.system import System
 ASKED_KEPT = 64
 _QUALITIES = {quality: quality.name.lower() for quality in Quality}
 _REASONS = {reason: reason.name.lower() for reason in Reason}
-_FRAME, _TAG, _SENT = Kind.FRAME, Kind.TAG, Direction.SENT  # an Enum's members are slow to look up
+_FRAME, _TAG, _SENT = TraceKind.FRAME, TraceKind.TAG, Direction.SENT  # an Enum's members are slow to look up
 
 
 class VirtualBench(AsyncResource):
@@ -62,7 +62,7 @@ class VirtualBench(AsyncResource):
         seed: int | None = None,
         commands: list[Scripted] | None = None,
         has_topside: bool = True,
-        probes: Sequence[Probe] = (),
+        probes: Sequence[ScenarioProbe] = (),
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
         super().__init__()
@@ -148,12 +148,12 @@ class VirtualBench(AsyncResource):
         """Since the run's start."""
         return self.loop.now_ns - self.run.started_ns
 
-    def note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
+    def note(self, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         """Add an event at the current time."""
         self.trace.note(self.now_ns, kind, where, data)
 
     def _commanded(self, period_s: int) -> None:
-        self.note(Kind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
+        self.note(TraceKind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     def _put(self, name: str, value: TagValue) -> None:
         self._updates[name] = self._updates.get(name, 0) + 1
@@ -163,11 +163,11 @@ class VirtualBench(AsyncResource):
         data = {"value": shown, "quality": _QUALITIES[value.quality], "reason": _REASONS[value.reason]}
         self.trace.note(self.loop.now_ns - self.run.started_ns, _TAG, name, data)
 
-    def _changed(self, change: Change) -> None:
-        self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
+    def _changed(self, change: TagChange) -> None:
+        self.note(TraceKind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
 
-    def _refused(self, entry: Refusal) -> None:
-        self.note(Kind.REFUSED, entry.tag, refusal_data(asdict(entry.status())))
+    def _refused(self, entry: RefusedOutput) -> None:
+        self.note(TraceKind.REFUSED, entry.tag, refusal_data(asdict(entry.status())))
 
     def _named(self, tag: str, value: Any) -> Any:
         """Return a value; a state is replaced by its name."""
@@ -252,14 +252,14 @@ class VirtualBench(AsyncResource):
     async def inject(self, fault: dict[str, Any]) -> None:
         id = self.run.field.faults.inject(fault)
         target = fault.get("device") or fault.get("bus") or ""
-        self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault})
+        self.note(TraceKind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault})
 
     async def struck(self) -> list[Struck]:
         return [struck_of(one) for one in self.run.field.faults.history.struck()]
 
     async def clear(self, id: str) -> None:
         self.run.field.faults.clear(id)
-        self.note(Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+        self.note(TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
         device, _, tag = name.partition(".")

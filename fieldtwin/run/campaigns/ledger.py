@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.run.campaigns.many_seeds import SeedResult
 
 
-class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One run. `what` is its `many_seeds.what_runs`; `wrong` of the `checked` values were never held by their device."""
 
     what: str
@@ -39,12 +39,12 @@ class Ledger:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.entries: list[Entry] = []
+        self.entries: list[LedgerEntry] = []
         data = read_input(path, MAX_BYTES) if path.exists() else b""
         *lines, rest = data.split(b"\n")
         for number, line in enumerate(lines, 1):
             try:
-                self.entries.append(msgspec.json.decode(line, type=Entry))
+                self.entries.append(msgspec.json.decode(line, type=LedgerEntry))
             except msgspec.DecodeError as e:
                 raise FileInvalid(f"not a line of a ledger: {e}", path=str(path), line=number) from e
         if rest:
@@ -56,7 +56,7 @@ class Ledger:
 
     def add(self, what: str, hours: float, result: SeedResult) -> None:
         """Add a result, which is on disk when the call returns."""
-        entry = Entry(
+        entry = LedgerEntry(
             what,
             __version__,
             result.seed,
@@ -90,6 +90,6 @@ class Ledger:
         return sum(e.wrong for e in self.entries)
 
     @property
-    def failed(self) -> list[Entry]:
+    def failed(self) -> list[LedgerEntry]:
         """The runs that did not end well."""
         return [e for e in self.entries if not e.ok]

@@ -56,7 +56,7 @@ LINE_PARAMS = ("mode", "echo")
 
 
 @dataclass(frozen=True)
-class Extras:
+class ModbusExtras:
     """Optional settings of a Modbus device.
 
     `values` are the initial values of its tags (None: its recording, or zeros), `faults` the faults as a fault file
@@ -81,7 +81,7 @@ async def run_device(
     unknown: NeverRecorded = NeverRecorded.EXCEPTION,
     at_end: EndOfRecording = EndOfRecording.HOLD,
     options: NodeOptions | None = None,
-    extras: Extras | None = None,
+    extras: ModbusExtras | None = None,
 ) -> int:
     """Serve until SIGINT or SIGTERM; raise the error that ended the serving.
 
@@ -89,7 +89,7 @@ async def run_device(
     reply to a request that was never recorded, and the behaviour at the end of the recording. `options` are for a
     CANopen node, `extras` for a Modbus device.
     """
-    extras = extras or Extras()
+    extras = extras or ModbusExtras()
     clock, stop = WallClock(), stop_signal()
     host = EmulatorHost(clock, OsPorts())
     wires = [Endpoint.parse(url) for url in endpoints]

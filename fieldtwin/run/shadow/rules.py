@@ -26,11 +26,11 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.run.shadow.shadow import limits_of
-from fieldtwin.twin.model.mape.plan import Planner, Rule, RulePlanner
+from fieldtwin.twin.model.mape.plan import Planner, PlanRule, RulePlanner
 from fieldtwin.twin.model.mape.what_if import Question
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.variables import Limits
-from fieldtwin.twin.site.schema import Strict, TagName
+from fieldtwin.twin.site.schema import SiteModel, TagName
 from fieldtwin.twin.site.system import System
 
 Finding = Literal["agree", "mismatch", "outside", "inside", "bad", "good", "stale", "fresh", "unreadable"]
@@ -38,7 +38,7 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Expression = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-class QuestionForm(Strict):
+class QuestionForm(SiteModel):
     """The query to a prototype before a command is sent. At least one expression must be required."""
 
     model_config = ConfigDict(validate_by_name=False)
@@ -51,7 +51,7 @@ class QuestionForm(Strict):
     )
 
 
-class RuleForm(Strict):
+class RuleForm(SiteModel):
     """The command for a finding."""
 
     when: Finding
@@ -62,7 +62,7 @@ class RuleForm(Strict):
     )
 
 
-class RulesForm(Strict):
+class RulesForm(SiteModel):
     """A planner as rules; the first that fits decides."""
 
     limits: dict[TagName, Range] = Field(
@@ -112,7 +112,7 @@ def load_planner(source: str, system: System) -> Plans:
         ask: Question | bool = rule.what_if is None
         if isinstance(rule.what_if, QuestionForm):
             ask = _question(file, ("rules", i, "what_if"), rule.what_if)
-        rules.append(Rule(rule.when, rule.of, rule.period_s, ask))
+        rules.append(PlanRule(rule.when, rule.of, rule.period_s, ask))
     question = _question(file, ("what_if",), form.what_if) if form.what_if is not None else None
     return Plans(RulePlanner(rules), question, limits)
 

@@ -22,7 +22,7 @@ from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.what_if.known import recall
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
-from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd
 from fieldtwin.twin.model.variables import Limits
@@ -66,7 +66,7 @@ class Shadowing:
         instance: Instance,
         *,
         store: str = "",
-        on_verdict: Callable[[Verdict], None],
+        on_verdict: Callable[[AnalysisFinding], None],
     ) -> None:
         self.clock = WallClock()
         self.receiving = ReceivingEnd("from the plant")

@@ -17,8 +17,8 @@ from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.run.shadow.shadow import STALE_AFTER_MS, Shadowing
 from fieldtwin.run.what_if.asking import Asking
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
-from fieldtwin.twin.model.mape.execute import Bounds
-from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.execute import CommandLimits
+from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.mape.plan import OLD_MS, Planner
 from fieldtwin.twin.model.mape.what_if import Question
 from fieldtwin.twin.model.twin import DigitalTwin
@@ -49,7 +49,7 @@ class Twinning(Shadowing):
         instance: Instance,
         *,
         store: str = "",
-        on_verdict: Callable[[Verdict], None],
+        on_verdict: Callable[[AnalysisFinding], None],
         on_command: Callable[[COMMAND], None],
         on_refusal: Callable[[str], None] = lambda why: None,
         planner: Planner,
@@ -77,7 +77,7 @@ class Twinning(Shadowing):
         return DigitalTwin(
             self.receiving, self.clock, self._planner,
             declared=declared_variables(system, self._limits), stale_after_ms=STALE_AFTER_MS,
-            bounds=Bounds(least_s, most_s, system.commands.per_minute), what_if=self._asking, question=self._question,
+            bounds=CommandLimits(least_s, most_s, system.commands.per_minute), what_if=self._asking, question=self._question,
         )  # fmt: skip
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:

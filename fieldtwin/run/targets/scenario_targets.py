@@ -32,7 +32,7 @@ from fieldtwin.run.processes.with_controller import WithController
 from fieldtwin.run.targets.virtual_scenario import prototype_of, reproduce, run_virtual
 from fieldtwin.run.virtual.group_kinds import kind_named
 from fieldtwin.scenarios.bench import Can, NothingKnown
-from fieldtwin.scenarios.judging.runner import Runner, gone
+from fieldtwin.scenarios.judging.runner import ScenarioRunner, gone
 from fieldtwin.scenarios.judging.target_limits import refusal
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario
@@ -41,7 +41,7 @@ from fieldtwin.twin.prototype.field_process import FieldConfig
 
 
 @dataclass(frozen=True)
-class Target:
+class ScenarioTarget:
     """The target of a scenario.
 
     `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the system's name,
@@ -64,7 +64,7 @@ class Target:
 
 
 def run_scenario(
-    scenario: Scenario, target: Target, trace_file: Path | None = None, retries: int = 0
+    scenario: Scenario, target: ScenarioTarget, trace_file: Path | None = None, retries: int = 0
 ) -> ScenarioResult:
     """Run the scenario, and repeat it at most `retries` times while it is INCONCLUSIVE; the first other verdict counts.
 
@@ -78,7 +78,7 @@ def run_scenario(
         earlier.append(result.why)
 
 
-def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> ScenarioResult:
+def _attempt(scenario: Scenario, target: ScenarioTarget, trace_file: Path | None) -> ScenarioResult:
     """Run the scenario once.
 
     A scenario that the target does not allow or cannot run is SKIPPED; a lost system is an ERROR with its reason.
@@ -120,7 +120,7 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
     )
 
 
-def _of_a_group(kind: str, target: Target) -> str:
+def _of_a_group(kind: str, target: ScenarioTarget) -> str:
     """Return the reason for which the target cannot run a scenario of several systems; empty if it can."""
     if target.name != "local":
         return f"a {kind} is a prototype, and the target {target.name} is none: each of its systems is a plant"
@@ -131,7 +131,7 @@ def _of_a_group(kind: str, target: Target) -> str:
     )
 
 
-def _of_a_plant(scenario: Scenario, target: Target) -> str:
+def _of_a_plant(scenario: Scenario, target: ScenarioTarget) -> str:
     """Return the reason for which a plant cannot run the scenario, found before the plant is accessed, or an empty string."""
     can = {Can.PROBE}
     if target.far:
@@ -141,7 +141,7 @@ def _of_a_plant(scenario: Scenario, target: Target) -> str:
     return refusal(scenario, target.name, can, target.allow)
 
 
-def _words(target: Target) -> list[str]:
+def _words(target: ScenarioTarget) -> list[str]:
     """Return the target as command-line options, without a token."""
     words = ["--target", target.name]
     said = {
@@ -151,12 +151,12 @@ def _words(target: Target) -> list[str]:
         "--far": target.far,
         "--capture": str(target.capture or ""),
         "--can": target.can,
-        "--allow": target.allow.value if target.name == "real" and target.allow is not Target.allow else "",
+        "--allow": target.allow.value if target.name == "real" and target.allow is not ScenarioTarget.allow else "",
     }
     return words + [word for option, value in said.items() if value for word in (option, value)]
 
 
-def _with_words(target: Target) -> str:
+def _with_words(target: ScenarioTarget) -> str:
     """Return the end of the command line for a user's controller."""
     return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
 
@@ -176,7 +176,7 @@ def _of_a_foreign_controller(scenario: Scenario) -> str:
     )
 
 
-async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResult:
+async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> ScenarioResult:
     me = asyncio.current_task()
     assert me is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
@@ -230,7 +230,7 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
             gone=gone,
         )
         async with bench:
-            result = await Runner(scenario, bench).run()
+            result = await ScenarioRunner(scenario, bench).run()
             return _with_what_was_in(result, bench)
 
 
@@ -250,7 +250,7 @@ def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioRe
     )
 
 
-def _session(scenario: Scenario, target: Target) -> RunSession:
+def _session(scenario: Scenario, target: ScenarioTarget) -> RunSession:
     """Return the run of the system for this scenario."""
     name = f"test-{os.getpid()}"
     seed = target.seed if target.seed is not None else scenario.form.seed
@@ -270,7 +270,7 @@ def _session(scenario: Scenario, target: Target) -> RunSession:
     return RunSession(options)
 
 
-def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
+def _field_config(scenario: Scenario, target: ScenarioTarget) -> FieldConfig:
     """Return the configuration of the simulated field devices for the user's program."""
     system, file = scenario.system, prototype_of(scenario)
     cans = [name for name, bus in system.buses.items() if bus.endpoint.is_can and target.can]
@@ -284,7 +284,7 @@ def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
     )
 
 
-async def _running(scenario: Scenario, target: Target) -> Where:
+async def _running(scenario: Scenario, target: ScenarioTarget) -> Where:
     """Return the access to a running instance, by its name on this host (in its container, for `compose`)."""
     plant = target.name == "real"
     run_dir = runtime_root() / (target.instance or scenario.system.name)

@@ -19,7 +19,7 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
 from fieldtwin.run.targets.run_checks import RunJudge
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
-from fieldtwin.scenarios.judging.runner import ByChance, Runner, gone
+from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.twin.prototype.file import load_prototype
@@ -50,7 +50,7 @@ def run_virtual(
         async def main() -> ScenarioResult:
             kind = virtual_kind(group)
             async with kind.virtual(group, loop, Path(folder), trace, chosen, None, scenario.probes) as running:
-                return await _judged(Runner(scenario, running.bench, by_chance), judge, running)
+                return await _judged(ScenarioRunner(scenario, running.bench, by_chance), judge, running)
 
         try:
             with seeded(chosen), sealed():
@@ -74,7 +74,7 @@ def run_virtual(
     )
 
 
-async def _judged(runner: Runner, judge: RunJudge | None, running: VirtualSystems) -> ScenarioResult:
+async def _judged(runner: ScenarioRunner, judge: RunJudge | None, running: VirtualSystems) -> ScenarioResult:
     """Run the scenario, with the checks of a run in addition if it requests them."""
     if judge is None:
         return await runner.run()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from fieldtwin.emulators.faults.fault import Kind
+from fieldtwin.emulators.faults.fault import InjectionPoint
 from fieldtwin.emulators.faults.registry import FAULTS, fault_class
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.emulators.faults.values.value_ranges import numbers
@@ -109,10 +109,12 @@ def _fitting(system: System, wanted: RandomFaults, device: str, tag: str) -> Ite
     for name, kind in FAULTS.items():
         if name in NOT_BY_CHANCE or (wanted.kinds and name not in wanted.kinds):
             continue
-        if kind.kind is Kind.VALUE:  # the device reports a wrong value: only on request
+        if kind.kind is InjectionPoint.VALUE:  # the device reports a wrong value: only on request
             if wanted.kinds and (_struck(system, name, device) if not tag else tag in _struck(system, name, device)):
                 yield name
-        elif kind.kind is (Kind.CAN if endpoint.is_can else Kind.BYTES) and _is_seen(name, endpoint):
+        elif kind.kind is (InjectionPoint.CAN if endpoint.is_can else InjectionPoint.BYTES) and _is_seen(
+            name, endpoint
+        ):
             fits = not tag or _can_aim(system, name, device, tag)
             if fits:
                 yield name
@@ -169,7 +171,7 @@ def _of_member(member: GroupMember, seed: int, last_s: float, wanted: RandomFaul
             "from": round(at_s, 3),
             "until": round(until_s, 3),
         }
-        of_values = FAULTS[fault["name"]].kind is Kind.VALUE
+        of_values = FAULTS[fault["name"]].kind is InjectionPoint.VALUE
         if tag or of_values:
             fault["register"] = tag or random.choice(_struck(system, fault["name"], device))
         if random.random() < 0.5 and not of_values:

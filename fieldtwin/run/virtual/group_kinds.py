@@ -21,7 +21,7 @@ from fieldtwin.run.virtual import one_system
 from fieldtwin.run.virtual.system_check import SystemCheck
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.language.form import Scenario
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.prototype.group import SystemGroup
 from fieldtwin.twin.site.groups import group_module
 
@@ -80,7 +80,7 @@ class VirtualKind(Protocol):
         trace: Trace,
         seed: int,
         commands: Sequence[Scripted] | None,
-        probes: Sequence[Probe] = (),
+        probes: Sequence[ScenarioProbe] = (),
     ) -> AbstractAsyncContextManager[VirtualSystems]:
         """Return the running systems; `folder` takes what they write. `commands` None: a scenario sends its own."""
 

@@ -12,7 +12,7 @@ from fieldtwin.results.trace import Trace
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.processes.topside import DEFAULT_SCRIPT, Scripted, TopsideController, script
 from fieldtwin.run.virtual.system_check import SystemCheck
-from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.prototype.group import SystemGroup
 
 
@@ -42,7 +42,7 @@ async def virtual(
     trace: Trace,
     seed: int,
     commands: Sequence[Scripted] | None,
-    probes: Sequence[Probe] = (),
+    probes: Sequence[ScenarioProbe] = (),
 ) -> AsyncIterator[OneRunning]:
     """Run the only system of `group`."""
     [member] = group.members.values()

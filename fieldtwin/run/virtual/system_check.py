@@ -23,7 +23,7 @@ from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, OutputStatus
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.plc.status import PlcStatus
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.run.benches.invariant_watch import InvariantWatch
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.live.summary import RunFacts, summarise
@@ -106,7 +106,7 @@ class SystemCheck:
             for pump in bench.run.gateway.pumps:
                 if pump.driver.config.name in self.far:
                     self.messages.watch(pump.driver.emitter)
-        bench.trace.listen(self._on_state, Kind.STATE)
+        bench.trace.listen(self._on_state, TraceKind.STATE)
         self.states.knows(bench.run.twin.ecs.layout)
         for program, state in bench.states().items():
             self.states.note(program, state, bench.loop.now_ns)
@@ -199,7 +199,7 @@ class SystemCheck:
         config = self.system.buses[bus]
         return CAN_WIRE_NS if config.endpoint.is_can else round(config.timeout_s * NS_PER_S)
 
-    def _on_state(self, event: Event) -> None:
+    def _on_state(self, event: TraceEvent) -> None:
         if event.where.endswith(".state") and isinstance(event.data["value"], str):
             self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
 

@@ -52,7 +52,7 @@ class QuestionMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class Subject:
+class ForkSubject:
     """The system to fork: the twin's system, its profiles, and its prototype file."""
 
     system: System
@@ -65,7 +65,7 @@ class Asking:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: ForkSubject,
         clock: Clock,
         timeout_s: float = TIMEOUT_S,
         on_ask: Callable[[COMMAND, Question], None] = lambda command, question: None,

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.publishing import TagChange
 from fieldtwin.plc.task import StopReason
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
@@ -188,7 +188,7 @@ class _ForkRun:
         assert self._run is not None
         return (self._run.loop.now_ns - self._run.started_ns) / NS_PER_S
 
-    def _changed(self, change: Change) -> None:
+    def _changed(self, change: TagChange) -> None:
         if self._over:
             return
         value = self._named(change.tag, change.after)

@@ -14,7 +14,7 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.scenarios.bench import Bench, TagReading
-from fieldtwin.scenarios.language.words import Bounds, Expect, WireForm
+from fieldtwin.scenarios.language.words import BoundsForm, Expect, WireForm
 from fieldtwin.twin.site.system import System
 
 Said = tuple[str, str] | None
@@ -23,7 +23,7 @@ LIKE_S = 0.5
 
 
 @dataclass
-class Watched:
+class ExpectationInput:
     """The data that an expectation can use: the bench, the start of the check, and the exchanges seen.
 
     `stimulus_s` is the time of the last stimulus to the system; exchanges count from then.
@@ -42,7 +42,7 @@ class Watched:
             self.updates[name] = reading.updates if reading is not None else 0
 
 
-async def judge_tag(expect: Expect, watched: Watched) -> Said:
+async def judge_tag(expect: Expect, watched: ExpectationInput) -> Said:
     """Check value, quality, likeness and rate of a tag now."""
     assert expect.tag is not None
     reading = watched.bench.reading(expect.tag)
@@ -66,7 +66,7 @@ def is_secret(system: System, name: str) -> bool:
     return found is not None and found.secret
 
 
-async def _judge_value(expect: Expect, watched: Watched, reading: TagReading) -> Said:
+async def _judge_value(expect: Expect, watched: ExpectationInput, reading: TagReading) -> Said:
     assert expect.tag is not None
     if expect.quality is not None and reading.value is None:  # it has not turned bad: it never had a value
         return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
@@ -80,7 +80,7 @@ async def _judge_value(expect: Expect, watched: Watched, reading: TagReading) ->
     return None
 
 
-async def _like_held(expect: Expect, watched: Watched, value: object, reading_age_s: float) -> Said:
+async def _like_held(expect: Expect, watched: ExpectationInput, value: object, reading_age_s: float) -> Said:
     """Compare the tag with what its device holds, or held when the tag was read."""
     assert expect.tag is not None
     device, _, name = expect.tag.rpartition(".")
@@ -110,7 +110,7 @@ def _near(value: object, truth: object, tolerance: float) -> bool:
     return value == truth
 
 
-def judge_wire(expect: Expect, watched: Watched) -> Said:
+def judge_wire(expect: Expect, watched: ExpectationInput) -> Said:
     """Check how often something was requested on a device's bus since the last stimulus, or its rate per second since
     the step began.
     """
@@ -127,8 +127,8 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
         if not inside(rate, expect.requests_per_s):
             return f"{bounds_text(expect.requests_per_s)} requests/s to {expect.wire}", f"{rate:.3g} in {took_s:g} s"
         return None
-    times = expect.times if expect.times is not None else Bounds(min=1)
-    wanted = times if isinstance(times, Bounds) else Bounds(min=times, max=times)
+    times = expect.times if expect.times is not None else BoundsForm(min=1)
+    wanted = times if isinstance(times, BoundsForm) else BoundsForm(min=times, max=times)
     if not inside(len(seen), wanted):
         window = f" within {seconds(expect.within):g} s" if expect.within is not None else ""
         return f"{bounds_text(wanted)} times{window}", f"{len(seen)}: " + (
@@ -153,12 +153,12 @@ def wire_matches(form: Expect | WireForm, exchange: DecodedExchange) -> bool:
     return form.value is None or exchange.tags.get(form.register_ or "") == form.value
 
 
-def inside(number: float, bounds: Bounds) -> bool:
+def inside(number: float, bounds: BoundsForm) -> bool:
     """Return whether a number is within bounds."""
     return (bounds.min is None or number >= bounds.min) and (bounds.max is None or number <= bounds.max)
 
 
-def bounds_text(bounds: Bounds) -> str:
+def bounds_text(bounds: BoundsForm) -> str:
     """Return bounds in words: ``at least 1 and at most 3``."""
     if bounds.min == bounds.max:
         return f"{bounds.min:g}" if bounds.min is not None else "any"

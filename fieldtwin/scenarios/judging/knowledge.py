@@ -11,7 +11,7 @@ from typing import Any
 
 from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.judging.expectation import is_secret
 from fieldtwin.scenarios.language.expression import Expression
@@ -32,14 +32,14 @@ class Knowledge:
         self._known = known
         self._bench = bench
         self._sent_s = float("-inf")  # no command was sent yet
-        self._last: dict[str, Event] = {}
+        self._last: dict[str, TraceEvent] = {}
         """By tag or variable: the latest event about it."""
         self._valued: set[str] = set()
         """Tags and variables that have had a value."""
 
-    def hear(self, event: Event) -> None:
+    def hear(self, event: TraceEvent) -> None:
         """Remember an event of the trace."""
-        if event.kind in (Kind.TAG, Kind.STATE):
+        if event.kind in (TraceKind.TAG, TraceKind.STATE):
             self._last[event.where] = event
             if event.data.get("value") is not None:
                 self._valued.add(event.where)
@@ -88,7 +88,7 @@ class Knowledge:
         if last is None:
             return f"never published{f' ({why})' if why else ''}"
         at = f"{last.t_ns / NS_PER_S:.3f} s"
-        if last.kind is Kind.STATE and last.data.get("value") is not None:
+        if last.kind is TraceKind.STATE and last.data.get("value") is not None:
             return f"never read back; a program set it to {SECRET if secret else repr(last.data['value'])} at {at}"
         why = why or str(last.data.get("reason", "")).replace("_", " ")
         return f"no value{f' since {at}' if name in self._valued else ' yet'}{f' ({why})' if why else ''}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 
 from fieldtwin.results.model import CheckResult, Verdict
-from fieldtwin.results.trace import Event, Kind, refusal_text
+from fieldtwin.results.trace import TraceEvent, TraceKind, refusal_text
 from fieldtwin.scenarios.judging.violation import Violation
 from fieldtwin.scenarios.language.form import Scenario
 
@@ -33,11 +33,11 @@ class RefusedOutputs:
         self._others: dict[str, str] = {}
         """The first refusal of each tag and cause that does not break the check."""
 
-    def hear(self, event: Event) -> None:
+    def hear(self, event: TraceEvent) -> None:
         """Process an event of the trace."""
-        if event.kind is Kind.FAULT:
+        if event.kind is TraceKind.FAULT:
             self._disturbed = True
-        if event.kind is not Kind.REFUSED:
+        if event.kind is not TraceKind.REFUSED:
             return
         fault, got = event.data.get("fault"), refusal_text(event.where, event.data)
         allowed = event.where in self._allowed

@@ -17,9 +17,9 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Struck, Verdict
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
-from fieldtwin.scenarios.judging.expectation import Watched, judge_tag, judge_wire, said
+from fieldtwin.scenarios.judging.expectation import ExpectationInput, judge_tag, judge_wire, said
 from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.last_exchanges import deciding, last_exchanges
 from fieldtwin.scenarios.judging.lateness import Allowance, allowance
@@ -122,7 +122,7 @@ class ByChance:
     until_s: float
 
 
-class Runner:
+class ScenarioRunner:
     """One scenario on one bench. ``await run()`` once."""
 
     def __init__(self, scenario: Scenario, bench: Bench, by_chance: ByChance | None = None) -> None:
@@ -144,7 +144,7 @@ class Runner:
         self._refused = RefusedOutputs(scenario)
         bench.trace.listen(self._on_event)
         for event in bench.trace.events:  # events from the opening of the bench, before the first step
-            if event.kind is Kind.REFUSED:
+            if event.kind is TraceKind.REFUSED:
                 self._refused.hear(event)
 
     async def run(self) -> ScenarioResult:
@@ -249,7 +249,7 @@ class Runner:
     async def _step(self, n: int, step: Step) -> CheckResult:
         word, since_s = word_of(step), self.bench.now_s()
         text = f"{word}: {said(getattr(step, word))}"
-        self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text})
+        self.bench.trace.note(self._now_ns(), TraceKind.STEP, str(n + 1), {"text": text})
         expected = got = self._remark = ""
         verdict, rule = Verdict.PASSED, None
         try:
@@ -277,7 +277,7 @@ class Runner:
             reason=self._remark,
             names=self._about(n, step),
         )
-        self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
+        self.bench.trace.note(self._now_ns(), TraceKind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
         if rule is not None:
             self.results.append(result)
             raise rule
@@ -364,7 +364,9 @@ class Runner:
             await self._wait(expression, within_s)
             await self._throughout(expression, during_s)
             return
-        watched = Watched(self.bench, self.scenario.system, self.bench.now_s(), self._stimulus_s, self.exchanges)
+        watched = ExpectationInput(
+            self.bench, self.scenario.system, self.bench.now_s(), self._stimulus_s, self.exchanges
+        )
         if expect.wire is not None:
             dropped = self._dropped
             await self._until(self.bench.now_s() + max(within_s, during_s))
@@ -497,11 +499,11 @@ class Runner:
         whole = (form.always, form.never, form.within, form.rate, form.cycle, form.judge, form.stopped, form.refused)
         return any(whole) or any(step.expect is not None or step.wait is not None for step in form.steps)
 
-    def _on_event(self, event: Event) -> None:
+    def _on_event(self, event: TraceEvent) -> None:
         self._knowledge.hear(event)
         self._whole.hear(event)
         self._refused.hear(event)
-        if event.kind is Kind.FRAME:
+        if event.kind is TraceKind.FRAME:
             for exchange in self._decoder.feed(event):
                 self._whole.requests[exchange.device] += not exchange.is_stray
                 self._dropped += len(self.exchanges) == KEPT

@@ -14,7 +14,7 @@ from typing import Any
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import CheckResult, Verdict
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.judging.expectation import bounds_text, inside
 from fieldtwin.scenarios.judging.knowledge import Knowledge
@@ -67,7 +67,7 @@ class WholeRun:
         self._bench = bench
         self._knowledge = knowledge
 
-    def hear(self, event: Event) -> None:
+    def hear(self, event: TraceEvent) -> None:
         """Process an event of the trace."""
         for cycle in self._cycles:
             cycle.hear(event)
@@ -289,14 +289,14 @@ class _Cycle:
         parts += [f"at most {self._max_s:g} s"] if self._max_s is not None else []
         return f"changes of {self.form.changes_of} {' and '.join(parts)} apart"
 
-    def hear(self, event: Event) -> None:
-        if event.where != self.form.changes_of or event.kind not in (Kind.TAG, Kind.STATE):
+    def hear(self, event: TraceEvent) -> None:
+        if event.where != self.form.changes_of or event.kind not in (TraceKind.TAG, TraceKind.STATE):
             return
         # From the first read on, only the read values count, not commanded ones.
-        if event.kind is Kind.TAG and not self._read:
+        if event.kind is TraceKind.TAG and not self._read:
             self._read, self._value, self._last_s = True, None, None
             self._between.clear()
-        elif event.kind is Kind.STATE and self._read:
+        elif event.kind is TraceKind.STATE and self._read:
             return
         value = event.data.get("value")
         if value is None or value != value:  # unknown: a gap, not a change

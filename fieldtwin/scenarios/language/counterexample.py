@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND, Quality, TagValue
 from fieldtwin.plc.program import Program
-from fieldtwin.plc.prove import Given, Proof, Result, shown
+from fieldtwin.plc.prove import Given, Proof, SearchResult, shown
 from fieldtwin.twin.site.system import System
 
 ARRIVES = "5s"
@@ -23,7 +23,7 @@ ARRIVES = "5s"
 _NEEDS = {"send": "send_command", "set": "set_value", "fault": "inject_fault", "clear": "inject_fault"}
 
 
-def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
+def scenario(system: System, program: str, proof: Proof, result: SearchResult) -> str:
     """Return a scenario file (docs/reference/scenarios.md) for the counterexample `result` of `program`."""
     steps = list(_steps(system, program, proof.make(), result.way))
     needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
@@ -49,7 +49,7 @@ def _text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def _seen(system: System, program: str, proof: Proof, result: Result) -> str:
+def _seen(system: System, program: str, proof: Proof, result: SearchResult) -> str:
     """Return the broken program's outputs under its own names.
 
     An output that is bound to a device is covered by the device's tag.

@@ -15,10 +15,10 @@ from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.language.expression import QUALITIES, Expression
 from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.language.located_expression import read_expression
-from fieldtwin.scenarios.language.probe_form import Probe, read_probe
+from fieldtwin.scenarios.language.probe_form import ScenarioProbe, read_probe
 from fieldtwin.scenarios.language.words import (
     WORDS,
-    Bounds,
+    BoundsForm,
     Cycle,
     Expect,
     Rate,
@@ -60,7 +60,7 @@ class Scenario:
     """Those of `known` that belong to the system."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """The possible words of each name whose value is a word: the states of programs."""
-    probes: tuple[Probe, ...] = ()
+    probes: tuple[ScenarioProbe, ...] = ()
     profiles: tuple[Path, ...] = ()
     group: SystemGroup | None = None
     """The systems, if the scenario's file describes several; `system` is then their `whole`."""
@@ -155,7 +155,7 @@ def _resolve(
 ) -> Scenario:
     system, group = _system(file, form, profiles, errors)
     served = [one.name for one in system.serving.serve]
-    probes: list[Probe] = []
+    probes: list[ScenarioProbe] = []
     for name, one in form.probes.items():
         with errors.collect():
             probes.append(read_probe(file, name, one, served))
@@ -381,7 +381,7 @@ def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None
     if expect.within is not None:
         _time(file, (*loc, "within"), expect.within)
     _check_bounds(file, (*loc, "requests_per_s"), expect.requests_per_s)
-    _check_bounds(file, (*loc, "times"), expect.times if isinstance(expect.times, Bounds) else None)
+    _check_bounds(file, (*loc, "times"), expect.times if isinstance(expect.times, BoundsForm) else None)
     rate = list(expect.updates_per_s or (0, 0))
     if len(rate) != 2 or rate[0] > rate[1]:
         raise file.error(
@@ -399,7 +399,7 @@ def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
     return expression
 
 
-def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -> None:
+def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: BoundsForm | None) -> None:
     if bounds is None:
         return
     if bounds.min is None and bounds.max is None:

@@ -45,7 +45,7 @@ class ProbeForm(BaseModel):
 
 
 @dataclass(frozen=True)
-class Probe:
+class ScenarioProbe:
     """A checked probe. Its registers are the tags of `profile`; expressions name them ``NAME.REGISTER``."""
 
     name: str
@@ -58,7 +58,7 @@ class Probe:
     written: str = ""
     """The endpoint as written, if it contains environment variables; `at` resolves it."""
 
-    def at(self, environ: Mapping[str, str]) -> Probe:
+    def at(self, environ: Mapping[str, str]) -> ScenarioProbe:
         """Return the probe with its endpoint resolved. Raises `UsageError` for an unset variable or an invalid endpoint."""
         if not self.written:
             return self
@@ -77,7 +77,7 @@ class Probe:
         return [f"{self.name}.{register}" for register in self.profile.tags]
 
 
-def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> Probe:
+def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> ScenarioProbe:
     """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of what the system serves."""
     loc: tuple[Key, ...] = ("probes", name)
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
@@ -102,7 +102,7 @@ def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) ->
     if every_s < MIN_EVERY_S or timeout_s <= 0:
         raise file.error(loc, "too often", expected=f"every {MIN_EVERY_S:g} s at most, and a timeout above 0")
     profile = _profile(file, loc, name, form)
-    return Probe(name, profile, endpoint, form.serve or "", form.unit, every_s, timeout_s, written)
+    return ScenarioProbe(name, profile, endpoint, form.serve or "", form.unit, every_s, timeout_s, written)
 
 
 def _modbus(endpoint: Endpoint, where: str) -> Endpoint:

@@ -16,7 +16,7 @@ class _Form(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=True)
 
 
-class Send(_Form):
+class SendStep(_Form):
     """The step `send`: the remote client commands a period."""
 
     from_: str = Field(default="shore", alias="from")
@@ -30,12 +30,12 @@ class Set(_Form):
     value: Number | bool | str | None
 
 
-class Wait(_Form):
+class WaitStep(_Form):
     until: str
     within: Time = 5
 
 
-class Bounds(_Form):
+class BoundsForm(_Form):
     min: Number | None = None
     max: Number | None = None
 
@@ -64,8 +64,8 @@ class Expect(_Form):
     access: Literal["read", "write"] | None = None
     function: int | None = None
     register_: str | None = Field(default=None, alias="register")
-    times: int | Bounds | None = None
-    requests_per_s: Bounds | None = None
+    times: int | BoundsForm | None = None
+    requests_per_s: BoundsForm | None = None
     that: str | None = None
     within: Time | None = None
     during: Time | None = None
@@ -74,11 +74,11 @@ class Expect(_Form):
 class Step(_Form):
     """A step: exactly one of these keys."""
 
-    send: Send | None = None
+    send: SendStep | None = None
     set: Set | None = None
     fault: dict[str, Any] | None = None
     clear: str | None = None
-    wait: Wait | None = None
+    wait: WaitStep | None = None
     expect: Expect | None = None
     pause: Time | None = None
 
@@ -95,9 +95,9 @@ class Rate(_Form):
     """How often a tag is published, or a device asked, in any period of `over`; `while` says when it counts."""
 
     tag: str | None = None
-    updates_per_s: Bounds | None = None
+    updates_per_s: BoundsForm | None = None
     wire: str | None = None
-    requests_per_s: Bounds | None = None
+    requests_per_s: BoundsForm | None = None
     over: Time = 10
     while_: str | None = Field(default=None, alias="while")
 

@@ -1,7 +1,7 @@
 """Turn a recorded run into a scenario: its inputs become stimuli, its outputs expectations with tolerance and window.
 
 Stimuli are the commands of the remote client, faults and, on request, device values; the emulators of the scenario's prototype
-replay their recordings without stimuli. Pure: a `Story` in, text out.
+replay their recordings without stimuli. Pure: a `RunHistory` in, text out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND
-from fieldtwin.scenarios.regression.run_history import Change, Story
+from fieldtwin.scenarios.regression.run_history import RunHistory, ValueChange
 from fieldtwin.twin.site.system import System
 
 BRIEF_NS = 200_000_000
@@ -32,7 +32,7 @@ STOPPING_NS = 2 * NS_PER_S
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ScenarioOptions:
     """The options of the scenario.
 
     `share` of a value is its tolerance, `window_s` the allowed delay. `values`: device values are set, too (for a prototype
@@ -55,13 +55,13 @@ class _Stimulus:
     step: str
 
 
-def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
+def as_scenario(system: System, history: RunHistory, wanted: ScenarioOptions) -> str:
     """Return the scenario file.
 
     Raises `UsageError` for a run without anything to expect, or with more steps than a scenario allows.
     """
-    stimuli = sorted(_stimuli(system, story, wanted), key=lambda s: s.t_ns)
-    steps = list(_steps(system, story, wanted, stimuli))
+    stimuli = sorted(_stimuli(system, history, wanted), key=lambda s: s.t_ns)
+    steps = list(_steps(system, history, wanted, stimuli))
     if not any("expect:" in step for step in steps):
         raise UsageError("this run has nothing to expect", expected="a trace with values or states")
     if len(steps) > MOST_STEPS:
@@ -79,9 +79,9 @@ def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
     return "\n".join([*lines, "steps:", *(f"  - {step}" for step in steps), ""])
 
 
-def _faults(story: Story) -> Iterator[_Stimulus]:
+def _faults(history: RunHistory) -> Iterator[_Stimulus]:
     """Return the steps that start and end faults, with all their parameters."""
-    for event in story.faults:
+    for event in history.faults:
         if not event.data.get("on"):
             yield _Stimulus(event.t_ns, f"clear: {json.dumps(event.where)}")
         else:
@@ -89,16 +89,16 @@ def _faults(story: Story) -> Iterator[_Stimulus]:
             yield _Stimulus(event.t_ns, f"fault: {json.dumps(said, ensure_ascii=False)}")
 
 
-def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus]:
-    for came in story.commands:
+def _stimuli(system: System, history: RunHistory, wanted: ScenarioOptions) -> Iterator[_Stimulus]:
+    for came in history.commands:
         try:
             yield _Stimulus(came.t_ns, f"send: {{period_s: {decode_period(COMMAND(came.payload))}}}")
         except FieldtwinError:
             continue  # not a command that a scenario can send; its effects are expected all the same
-    yield from _faults(story)
+    yield from _faults(history)
     if not wanted.values:
         return
-    for name, changes in sorted(story.tags.items()):
+    for name, changes in sorted(history.tags.items()):
         device, _, tag = name.partition(".")
         config = system.devices.get(device)
         if config is None or config.profile.inbox is not None or tag in config.writable:
@@ -109,10 +109,10 @@ def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus
                 yield _Stimulus(change.t_ns, f"set: {{tag: {name}, value: {json.dumps(value)}}}")
 
 
-def _steps(system: System, story: Story, wanted: Wanted, stimuli: list[_Stimulus]) -> Iterator[str]:
+def _steps(system: System, history: RunHistory, wanted: ScenarioOptions, stimuli: list[_Stimulus]) -> Iterator[str]:
     """Return pauses and expectations; an expectation that is met in time takes as long as in the run."""
     now_ns = 0
-    last_ns = max(0, story.end_ns - STOPPING_NS)
+    last_ns = max(0, history.end_ns - STOPPING_NS)
     bounds = [*(s.t_ns for s in stimuli), last_ns]
     for n in range(-1, len(stimuli)):
         begin_ns = stimuli[n].t_ns if n >= 0 else 0
@@ -122,7 +122,7 @@ def _steps(system: System, story: Story, wanted: Wanted, stimuli: list[_Stimulus
             now_ns = begin_ns
             yield stimuli[n].step
         end_ns = bounds[n + 1]
-        for t_ns, step in sorted(_seen(story, wanted, begin_ns, end_ns)):
+        for t_ns, step in sorted(_seen(history, wanted, begin_ns, end_ns)):
             if t_ns > now_ns:
                 yield (
                     f"pause: {_s(t_ns - now_ns)}"
@@ -137,15 +137,15 @@ def _steps(system: System, story: Story, wanted: Wanted, stimuli: list[_Stimulus
             yield f"pause: {_s(look_ns - now_ns)}"
             now_ns = look_ns
             yield from _looks(
-                system, story, wanted, begin_ns, look_ns
+                system, history, wanted, begin_ns, look_ns
             )  # of the fields that changed; at the end of all fields
 
 
-def _seen(story: Story, wanted: Wanted, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:
+def _seen(history: RunHistory, wanted: ScenarioOptions, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:
     """Return the expected values of programs that lasted long enough to be observed."""
-    for name, changes in story.states.items():
+    for name, changes in history.states.items():
         for n, change in enumerate(changes):
-            until_ns = changes[n + 1].t_ns if n + 1 < len(changes) else story.end_ns
+            until_ns = changes[n + 1].t_ns if n + 1 < len(changes) else history.end_ns
             inside = begin_ns <= change.t_ns < end_ns - AHEAD_NS
             if inside and until_ns - change.t_ns >= BRIEF_NS and isinstance(change.value, str | bool):
                 yield (
@@ -154,27 +154,27 @@ def _seen(story: Story, wanted: Wanted, begin_ns: int, end_ns: int) -> Iterator[
                 )
 
 
-def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns: int) -> Iterator[str]:
+def _looks(system: System, history: RunHistory, wanted: ScenarioOptions, begin_ns: int, look_ns: int) -> Iterator[str]:
     """Return the expectations at the end of a period: programs' numbers, tags by value, or as the device's register."""
     within = f"within: {_s(0, wanted)}"
-    last = look_ns >= story.end_ns - STOPPING_NS - AHEAD_NS
+    last = look_ns >= history.end_ns - STOPPING_NS - AHEAD_NS
 
-    def rested(changes: list[Change]) -> bool:
+    def rested(changes: list[ValueChange]) -> bool:
         return not last and not any(begin_ns <= c.t_ns <= look_ns for c in changes)
 
-    for name, changes in sorted(story.states.items()):
+    for name, changes in sorted(history.states.items()):
         now = _at(changes, look_ns)
         if rested(changes):
             continue
         if now is not None and isinstance(now.value, int | float) and not isinstance(now.value, bool):
             if "." in name and name.partition(".")[0] in system.devices:
                 continue  # an output that a device holds is a tag as well
-            slack = _slack(changes, story)
+            slack = _slack(changes, history)
             about = f"{name} == {_literal(now.value)}"
             if slack:
                 about = f"{name} >= {_literal(now.value - slack)} and {name} <= {_literal(now.value + slack)}"
             yield f"expect: {{that: {json.dumps(about)}, {within}}}"
-    for name, changes in sorted(story.tags.items()):
+    for name, changes in sorted(history.tags.items()):
         now = _at(changes, look_ns)
         if now is None or rested(changes):
             continue
@@ -185,31 +185,31 @@ def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns:
         restless = sum(begin_ns <= c.t_ns <= look_ns for c in changes) > RESTLESS
         if quality in ("good", "") and restless:
             size: float = max((abs(c.value) for c in changes if isinstance(c.value, int | float)), default=0.0)
-            tolerance = max(wanted.share * size, _slack(changes, story, counts=counts))
+            tolerance = max(wanted.share * size, _slack(changes, history, counts=counts))
             said += ["like: recording", f"tolerance: {_number(tolerance)}"]
         elif isinstance(value, bool | str):
             said += [f"value: {json.dumps(value)}"]
         elif isinstance(value, int | float) and not restless:
             said += [f"value: {_literal(value)}"]
             share = wanted.share * abs(value) if isinstance(value, float) else 0
-            tolerance = max(share, _slack(changes, story, counts=counts))
+            tolerance = max(share, _slack(changes, history, counts=counts))
             said += [f"tolerance: {_number(tolerance)}"] if tolerance else []
         yield f"expect: {{{', '.join(said)}, {within}}}"
 
 
-def _slack(changes: list[Change], story: Story, *, counts: bool = False) -> float:
+def _slack(changes: list[ValueChange], history: RunHistory, *, counts: bool = False) -> float:
     """Return how far a field may drift meanwhile: its largest step, at least two for one that `counts` in its device.
 
     0 for a field that only commands change: its value is known exactly.
     """
     numbers = [c.value for c in changes if isinstance(c.value, int | float) and not isinstance(c.value, bool)]
-    if len(changes) <= len(story.commands) + 2 and not counts:
+    if len(changes) <= len(history.commands) + 2 and not counts:
         return 0
     steps = [abs(b - a) for a, b in pairwise(numbers)]
     return max([*steps, 2.0 if counts else 0.0])
 
 
-def _at(changes: list[Change], t_ns: int) -> Change | None:
+def _at(changes: list[ValueChange], t_ns: int) -> ValueChange | None:
     place = bisect_right([change.t_ns for change in changes], t_ns)
     return changes[place - 1] if place else None
 
@@ -224,5 +224,5 @@ def _number(value: float) -> str:
     return f"{value:.6g}"
 
 
-def _s(ns: int, wanted: Wanted | None = None) -> str:
+def _s(ns: int, wanted: ScenarioOptions | None = None) -> str:
     return f"{(ns / NS_PER_S + (wanted.window_s if wanted else 0.0)):.3f}".rstrip("0").rstrip(".") + "s"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from statistics import median
 
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.scenarios.regression.run_history import Change, Story
+from fieldtwin.scenarios.regression.run_history import RunHistory, ValueChange
 
 MOST_SHOWN = 1_000
 
@@ -87,7 +87,7 @@ class RunComparison:
         return bool(self.compared) and not self.differences
 
 
-def compare(old: Story, new: Story, allowed: Allowed | None = None) -> RunComparison:
+def compare(old: RunHistory, new: RunHistory, allowed: Allowed | None = None) -> RunComparison:
     """Compare `new` with `old`. Events of the longer run after the end of the shorter one are ignored."""
     allowed = allowed or Allowed()
     end_ns = min(old.end_ns, new.end_ns)
@@ -112,12 +112,12 @@ def compare(old: Story, new: Story, allowed: Allowed | None = None) -> RunCompar
     return RunComparison(compared, tuple(found[:MOST_SHOWN]), old.end_ns / NS_PER_S, new.end_ns / NS_PER_S)
 
 
-def _until(changes: list[Change], end_ns: int) -> list[Change]:
+def _until(changes: list[ValueChange], end_ns: int) -> list[ValueChange]:
     return [change for change in changes if change.t_ns <= end_ns]
 
 
 def _states(
-    name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
+    name: str, old: list[ValueChange], new: list[ValueChange], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[RunDifference]:
     """Compare states: the same values in the same order, each in time.
 
@@ -141,7 +141,7 @@ def _states(
     return []
 
 
-def _otherwhen(name: str, one: Change, other: Change) -> RunDifference:
+def _otherwhen(name: str, one: ValueChange, other: ValueChange) -> RunDifference:
     return RunDifference(
         "time",
         name,
@@ -152,7 +152,7 @@ def _otherwhen(name: str, one: Change, other: Change) -> RunDifference:
 
 
 def _values(
-    name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
+    name: str, old: list[ValueChange], new: list[ValueChange], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[RunDifference]:
     """Compare values: each value of one run occurred in the other one within the window."""
     for one, other, swapped in ((old, new, False), (new, old, True)):
@@ -168,10 +168,10 @@ def _values(
 
 
 def _unmatched(
-    name: str, one: list[Change], other: list[Change], end_ns: int, window_ns: int, allowed: Allowed
-) -> list[tuple[Change, Change | None]]:
+    name: str, one: list[ValueChange], other: list[ValueChange], end_ns: int, window_ns: int, allowed: Allowed
+) -> list[tuple[ValueChange, ValueChange | None]]:
     times = [change.t_ns for change in other]
-    found: list[tuple[Change, Change | None]] = []
+    found: list[tuple[ValueChange, ValueChange | None]] = []
     for change in one:
         if change.t_ns > end_ns - window_ns:
             break  # the other run may have ended before it
@@ -183,12 +183,12 @@ def _unmatched(
     return found
 
 
-def _alike(name: str, one: Change, other: Change, allowed: Allowed) -> bool:
+def _alike(name: str, one: ValueChange, other: ValueChange, allowed: Allowed) -> bool:
     (value, quality), (seen, seen_quality) = one.says(), other.says()
     return quality == seen_quality and (quality == "bad" or allowed.near(name, value, seen))
 
 
-def _between(name: str, change: Change, around: Sequence[Change]) -> bool:
+def _between(name: str, change: ValueChange, around: Sequence[ValueChange]) -> bool:
     """Return whether a moving value was passed: the other run was below and above it, and sampled at different moments."""
     value = change.value
     if not isinstance(value, int | float) or isinstance(value, bool):
@@ -197,7 +197,7 @@ def _between(name: str, change: Change, around: Sequence[Change]) -> bool:
     return len(seen) >= 2 and min(seen) <= value <= max(seen)
 
 
-def _latencies(old: Story, new: Story, allowed: Allowed) -> list[RunDifference]:
+def _latencies(old: RunHistory, new: RunHistory, allowed: Allowed) -> list[RunDifference]:
     """Compare the medians of response times: only a slower one is worse."""
     found = []
     for key, before in sorted(old.latency_ns.items()):
@@ -214,7 +214,7 @@ def _latencies(old: Story, new: Story, allowed: Allowed) -> list[RunDifference]:
     return found
 
 
-def _problems(old: Story, new: Story, allowed: Allowed) -> list[RunDifference]:
+def _problems(old: RunHistory, new: RunHistory, allowed: Allowed) -> list[RunDifference]:
     """Compare requests without a good answer: a new or much more frequent problem is a difference."""
     found = []
     for key, now in sorted(new.problems.items()):

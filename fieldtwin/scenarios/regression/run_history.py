@@ -1,7 +1,7 @@
 """The history of a run from its trace or capture: tags, states and qualities over time, response times, inputs.
 
-Runs of different versions can be compared by this, and not by bytes or nanoseconds. Pure: events in, a `Story` out. The changes
-of a field are limited; the rest is counted.
+Runs of different versions can be compared by this, and not by bytes or nanoseconds. Pure: events in, a `RunHistory` out. The
+changes of a field are limited; the rest is counted.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.statemachine import encode_period
-from fieldtwin.results.trace import TOPSIDE, Event, Kind
+from fieldtwin.results.trace import TOPSIDE, TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST = 200_000
@@ -23,7 +23,7 @@ SELDOM = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ValueChange:
     """From `t_ns` on the field had `value` and `quality` ("" for a state, and for a value seen only on a bus)."""
 
     t_ns: int
@@ -41,7 +41,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Came:
+class RemoteCommand:
     """A command of the remote client of `device`: its payload as sent, or as received if the sending was not recorded."""
 
     t_ns: int
@@ -50,7 +50,7 @@ class Came:
 
 
 @dataclass
-class Story:
+class RunHistory:
     """The changes of a run.
 
     `tags` and `states`: changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` and `problems` by (device, service) and
@@ -58,13 +58,13 @@ class Story:
     """
 
     end_ns: int = 0
-    tags: dict[str, list[Change]] = field(default_factory=dict)
-    states: dict[str, list[Change]] = field(default_factory=dict)
+    tags: dict[str, list[ValueChange]] = field(default_factory=dict)
+    states: dict[str, list[ValueChange]] = field(default_factory=dict)
     latency_ns: dict[tuple[str, str], list[int]] = field(default_factory=lambda: defaultdict(list))
     asked: Counter[tuple[str, str]] = field(default_factory=Counter)
     problems: Counter[tuple[str, str, str]] = field(default_factory=Counter)
-    commands: list[Came] = field(default_factory=list)
-    faults: list[Event] = field(default_factory=list)
+    commands: list[RemoteCommand] = field(default_factory=list)
+    faults: list[TraceEvent] = field(default_factory=list)
     published: Counter[str] = field(default_factory=Counter)
     """How often each tag was published, changed or not."""
     left_out: int = 0
@@ -77,7 +77,7 @@ class Story:
         times = self.published[name]
         return self.end_ns * 3 // (2 * times) if times >= SELDOM else 0
 
-    def note(self, into: dict[str, list[Change]], name: str, change: Change) -> None:
+    def note(self, into: dict[str, list[ValueChange]], name: str, change: ValueChange) -> None:
         """Record that `name` has this value, unless it had it before."""
         changes = into.setdefault(name, [])
         if changes and changes[-1].says() == change.says():
@@ -88,45 +88,45 @@ class Story:
             changes.append(change)
 
 
-def story_of(system: System, events: Iterable[Event]) -> Story:
+def run_history(system: System, events: Iterable[TraceEvent]) -> RunHistory:
     """Return the history of events in their order. For a capture, which has only frames, tags are the devices' answers."""
-    story, decoder = Story(), Decoder(system)
-    answered: list[tuple[str, Change]] = []
-    sent: list[Came] = []
+    history, decoder = RunHistory(), Decoder(system)
+    answered: list[tuple[str, ValueChange]] = []
+    sent: list[RemoteCommand] = []
     boxes: dict[str, tuple[int, ...]] = {}
 
     def take(exchanges: Iterable[DecodedExchange]) -> None:
         for exchange in exchanges:
-            _count(story, exchange)
-            _mailbox(story, system, boxes, exchange)
+            _count(history, exchange)
+            _mailbox(history, system, boxes, exchange)
             if exchange.ok and len(answered) < MOST and not exchange.secrets:
                 answered.extend(
-                    (f"{exchange.device}.{tag}", Change(exchange.end_ns, value))
+                    (f"{exchange.device}.{tag}", ValueChange(exchange.end_ns, value))
                     for tag, value in exchange.tags.items()
                     if value is not None and _is_measured(system, exchange, tag)
                 )
 
     for event in events:
-        story.end_ns = max(story.end_ns, event.t_ns)
-        if event.kind is Kind.FRAME:
+        history.end_ns = max(history.end_ns, event.t_ns)
+        if event.kind is TraceKind.FRAME:
             take(decoder.feed(event))
-        elif event.kind is Kind.TAG:
-            change = Change(event.t_ns, event.data.get("value"), str(event.data.get("quality", "")))
-            story.note(story.tags, event.where, change)
-            story.published[event.where] += 1
-        elif event.kind is Kind.STATE:
-            story.note(story.states, event.where, Change(event.t_ns, event.data.get("value")))
-        elif event.kind is Kind.FAULT:
-            story.faults.append(event)
-        elif event.kind is Kind.NOTE and event.where == TOPSIDE and isinstance(event.data.get("period_s"), int):
-            sent.append(Came(event.t_ns, event.where, encode_period(event.data["period_s"]).data))
+        elif event.kind is TraceKind.TAG:
+            change = ValueChange(event.t_ns, event.data.get("value"), str(event.data.get("quality", "")))
+            history.note(history.tags, event.where, change)
+            history.published[event.where] += 1
+        elif event.kind is TraceKind.STATE:
+            history.note(history.states, event.where, ValueChange(event.t_ns, event.data.get("value")))
+        elif event.kind is TraceKind.FAULT:
+            history.faults.append(event)
+        elif event.kind is TraceKind.NOTE and event.where == TOPSIDE and isinstance(event.data.get("period_s"), int):
+            sent.append(RemoteCommand(event.t_ns, event.where, encode_period(event.data["period_s"]).data))
     take(decoder.finish())
-    story.commands = sent or story.commands
-    if not story.tags:
+    history.commands = sent or history.commands
+    if not history.tags:
         for name, change in answered:
-            story.note(story.tags, name, change)
-            story.published[name] += 1
-    return story
+            history.note(history.tags, name, change)
+            history.published[name] += 1
+    return history
 
 
 def _is_measured(system: System, exchange: DecodedExchange, tag: str) -> bool:
@@ -138,16 +138,16 @@ def _is_measured(system: System, exchange: DecodedExchange, tag: str) -> bool:
     return sampled is None or exchange.tags.get(sampled.count) != 0
 
 
-def _count(story: Story, exchange: DecodedExchange) -> None:
+def _count(history: RunHistory, exchange: DecodedExchange) -> None:
     key = exchange.device or f"{exchange.bus}/{exchange.unit}", exchange.service
-    story.asked[key] += 1
+    history.asked[key] += 1
     if exchange.problem:
-        story.problems[(*key, exchange.problem)] += 1
+        history.problems[(*key, exchange.problem)] += 1
     elif exchange.latency_ns is not None:
-        story.latency_ns[key].append(exchange.latency_ns)
+        history.latency_ns[key].append(exchange.latency_ns)
 
 
-def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], exchange: DecodedExchange) -> None:
+def _mailbox(history: RunHistory, system: System, boxes: dict[str, tuple[int, ...]], exchange: DecodedExchange) -> None:
     """Decode a message in an inbox: sequence, length in bytes, payload, two bytes per register.
 
     Each sequence number is one command.
@@ -164,4 +164,4 @@ def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], ex
     if number == 0 or (seen and seen[-1] == number) or len(payload) < length:
         return
     boxes[exchange.device] = (number,)
-    story.commands.append(Came(exchange.t_ns, exchange.device, payload))
+    history.commands.append(RemoteCommand(exchange.t_ns, exchange.device, payload))

@@ -1,6 +1,6 @@
 """The setup of one test: a field simulator with its own endpoints and their traffic, optionally with gateway and PLC.
 
-A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and is removed with it.
+A `WorkerBench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and is removed with it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.testing.worker.one_device import endpoint_words
-from fieldtwin.testing.worker.running_plc import RunningPlc
+from fieldtwin.testing.worker.running_plc import PlcProcesses
 from fieldtwin.testing.worker.wire_log import WireLog
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field import FieldSimulator
@@ -28,14 +28,14 @@ from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.site.system import System
 
 
-class Bench:
+class WorkerBench:
     """The field simulator of a system. Raises the errors of opening one, and those of its emulators."""
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
         self.system = system
         self.field = FieldSimulator(system, prototype, folder, clock)
         self.log = WireLog(system, clock)
-        self.plc: RunningPlc | None = None
+        self.plc: PlcProcesses | None = None
         self._clock = clock
         self._folder = folder
         self._nursery = Nursery()
@@ -61,7 +61,7 @@ class Bench:
     async def control(self, profiles: tuple[str, ...] = ()) -> None:
         """Start the system's gateway and PLC with this field simulator. Further calls have no effect."""
         if self.plc is None:
-            plc = RunningPlc(self.system, self.field, self._clock, self._folder)
+            plc = PlcProcesses(self.system, self.field, self._clock, self._folder)
             await plc.open(profiles)
             self.plc = plc
 

@@ -20,9 +20,9 @@ from fieldtwin.gateway.core.control import MAX_LINE, ControlServer
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.template import ForeignParts, agree
-from fieldtwin.testing.worker.bench import Bench, new_folder
-from fieldtwin.testing.worker.one_device import Wanted, write_system
-from fieldtwin.testing.worker.running_plc import RunningPlc
+from fieldtwin.testing.worker.bench import WorkerBench, new_folder
+from fieldtwin.testing.worker.one_device import DeviceRequest, write_system
+from fieldtwin.testing.worker.running_plc import PlcProcesses
 from fieldtwin.testing.worker.stepped_program import SteppedProgram
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve_files
 from fieldtwin.twin.prototype.file import Prototype
@@ -40,7 +40,7 @@ class Host:
         self._trust = trust
         """Foreign templates may run: the user allowed it when the tests were started."""
         self._clock = WallClock()
-        self._benches: dict[int, Bench] = {}
+        self._benches: dict[int, WorkerBench] = {}
         self._programs: dict[int, SteppedProgram] = {}
         self._number = 0
 
@@ -98,7 +98,7 @@ class Host:
         return {"fieldtwin": __version__, "pid": os.getpid()}
 
     async def _device(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Open one device: the fields of `Wanted`, `profiles` (folders), `beside` (the test's folder)."""
+        """Open one device: the fields of `DeviceRequest`, `profiles` (folders), `beside` (the test's folder)."""
         wanted = _wanted(args)
         beside = Path(args["beside"]) if args.get("beside") else None
         profiles = tuple(map(Path, args.get("profiles") or ()))
@@ -137,7 +137,7 @@ class Host:
 
     async def _open(self, folder: Path, system: System, prototype: Prototype) -> dict[str, Any]:
         number = self._next()
-        bench = Bench(system, prototype, self._clock, folder)
+        bench = WorkerBench(system, prototype, self._clock, folder)
         try:
             await bench.open()
         except BaseException:
@@ -152,7 +152,7 @@ class Host:
         self._number += 1
         return self._number
 
-    def _bench(self, args: dict[str, Any]) -> Bench:
+    def _bench(self, args: dict[str, Any]) -> WorkerBench:
         bench = self._benches.get(args.get("id", 0))
         if bench is None:
             raise UsageError(f"no field simulator {args.get('id')!r}", expected="the id that `device` or `system` gave")
@@ -196,7 +196,7 @@ class Host:
         await bench.control(tuple(args.get("profiles") or ()))
         return {"names": await self._plc(args).names()}
 
-    def _plc(self, args: dict[str, Any]) -> RunningPlc:
+    def _plc(self, args: dict[str, Any]) -> PlcProcesses:
         plc = self._bench(args).plc
         if plc is None:
             raise UsageError("no PLC is running", hint="`control` starts one")
@@ -265,13 +265,13 @@ class Host:
         return {}
 
 
-def _wanted(args: dict[str, Any]) -> Wanted:
-    known = Wanted.__dataclass_fields__
+def _wanted(args: dict[str, Any]) -> DeviceRequest:
+    known = DeviceRequest.__dataclass_fields__
     said = {key: value for key, value in args.items() if key in known and value is not None}
     unknown = set(args) - set(known) - {"profiles", "beside"}
     if unknown or not said.get("device"):
         raise UsageError("a device", expected="device=NAME, and of " + ", ".join(known), got=", ".join(sorted(unknown)))
-    return Wanted(**said)
+    return DeviceRequest(**said)
 
 
 def folder_gone(folder: Path) -> None:

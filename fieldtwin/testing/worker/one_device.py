@@ -24,7 +24,7 @@ KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
 
 
 @dataclass(frozen=True)
-class Wanted:
+class DeviceRequest:
     """A test's request for a device.
 
     `on` is one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" selects the device's usual one.
@@ -42,7 +42,9 @@ class Wanted:
     seed: int = 1
 
 
-def write_system(wanted: Wanted, folder: Path, profiles: tuple[Path, ...] = (), beside: Path | None = None) -> Path:
+def write_system(
+    wanted: DeviceRequest, folder: Path, profiles: tuple[Path, ...] = (), beside: Path | None = None
+) -> Path:
     """Write the system file and its prototype file into `folder`; return the path of the system file.
 
     `beside` is the folder of the test, which may contain its own profiles and recordings. Raises `UsageError` for a
@@ -96,7 +98,7 @@ def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
     return f"{kind}://127.0.0.1:1", f"{kind}://127.0.0.1:0"
 
 
-def _stand_in(wanted: Wanted, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
+def _stand_in(wanted: DeviceRequest, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
     """Return the device's entry in the prototype file.
 
     It replays the recording that was named; else it is a model of its profile, whose registers accept writes; else, if

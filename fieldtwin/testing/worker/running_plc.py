@@ -31,7 +31,7 @@ STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
 """Verbs of the PLC's process that a test may use; each with the arguments that it has there."""
 
 
-class RunningPlc:
+class PlcProcesses:
     """The two processes: ``await open()``, then call the methods.
 
     `aclose` ends both processes, the gateway first, which makes the outputs safe.

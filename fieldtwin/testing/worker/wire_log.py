@@ -13,7 +13,7 @@ from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import Clock
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST = 20_000
@@ -65,7 +65,7 @@ class WireLog:
                 self._take(self._lines.pop(oldest).decoder.finish())
             line = self._lines[key] = _Line(Decoder(self._system), end)  # `end` is kept, so that its id stays unique
         line.last_ns = self._clock.monotonic_ns()
-        self._take(line.decoder.feed(Event(line.last_ns - self._start_ns, Kind.FRAME, bus, data)))
+        self._take(line.decoder.feed(TraceEvent(line.last_ns - self._start_ns, TraceKind.FRAME, bus, data)))
 
     def _take(self, exchanges: list[DecodedExchange]) -> None:
         for exchange in exchanges:

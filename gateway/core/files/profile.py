@@ -130,7 +130,7 @@ class Tag:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class MessageBlock:
     """A block of registers that is passed on unaltered when the tag `when` changes."""
 
     name: str
@@ -195,7 +195,7 @@ class DeviceProfile:
     hash: str
     form: ProfileForm
     tags: dict[str, Tag]
-    messages: dict[str, Message]
+    messages: dict[str, MessageBlock]
     sampled: Sampled | None
     inbox: Box | None
     outbox: Box | None
@@ -417,8 +417,8 @@ def _gap(file: YamlFile, form: ProfileForm, i: int, text: str) -> RegisterRange:
         raise file.error(("gaps", i), str(e)) from e
 
 
-def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> Message:
-    return Message(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
+def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> MessageBlock:
+    return MessageBlock(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
 
 
 def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:

@@ -27,7 +27,7 @@ from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
 from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S, SdoDownload, SdoTransfer, SdoUpload, TransferTooLong
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
+from fieldtwin.gateway.protocols.canopen.sdo_channel import SdoChannel, SdoCounters
 
 PdoCallback = Callable[[bytes, int], None]
 """A callback with the frame's data and its time of reception (monotonic, ns)."""
@@ -66,7 +66,7 @@ class CanopenMaster:
         short_sdo: bool = False,
         on_event: EventCallback | None = None,
     ) -> None:
-        self.counters = Counters()
+        self.counters = SdoCounters()
         self.latency = response_times()  # of completed SDO transfers
         self.on_event: EventCallback = on_event or _nobody
         self.on_sync: PdoCallback = _no_one

@@ -50,7 +50,7 @@ ABORT = 0x80
 
 
 @dataclass(frozen=True, slots=True)
-class Send:
+class SendFrame:
     """The step "send this frame"; the transfer continues.
 
     With `more`, `SdoTransfer.more` returns another frame to send immediately.
@@ -61,7 +61,7 @@ class Send:
 
 
 @dataclass(frozen=True, slots=True)
-class Wait:
+class WaitForFrame:
     """The frame advanced the transfer, and there is nothing to send yet."""
 
 
@@ -88,7 +88,7 @@ class Stray:
     why: str
 
 
-Step = Send | Wait | Done | Failed | Stray
+Step = SendFrame | WaitForFrame | Done | Failed | Stray
 
 
 class TransferTooLong(ReplyTimeout):
@@ -161,8 +161,8 @@ class SdoTransfer(ABC):
             return self._go_on(self._on_reply(data), now_ns)
         return self._go_on(self._on_next(data), now_ns)
 
-    def more(self, now_ns: int) -> Send | None:
-        """Return the next frame to send without waiting for a reply, if the last `Send` announced more."""
+    def more(self, now_ns: int) -> SendFrame | None:
+        """Return the next frame to send without waiting for a reply, if the last `SendFrame` announced more."""
         return None
 
     @property
@@ -177,7 +177,7 @@ class SdoTransfer(ABC):
         """
         return self.answered and not self.over
 
-    def expire(self, now_ns: int) -> Send | Failed | None:
+    def expire(self, now_ns: int) -> SendFrame | Failed | None:
         """Return the next step, usually the end of the transfer, if the reply is overdue at `now_ns`; otherwise None."""
         if self.over or now_ns < self.deadline_ns:
             return None
@@ -185,7 +185,7 @@ class SdoTransfer(ABC):
             return self._timed_out()
         return self._recover(now_ns) or self._timed_out()
 
-    def _recover(self, now_ns: int) -> Send | None:
+    def _recover(self, now_ns: int) -> SendFrame | None:
         """Return a frame that may restart a stalled transfer, or None if there is no such frame."""
         return None
 
@@ -252,7 +252,7 @@ class SdoTransfer(ABC):
         return CanFrame(cob_id.SDO_REQUEST_BASE + self.node, data.ljust(8, b"\0"))
 
     def _go_on(self, step: Step, now_ns: int) -> Step:
-        if isinstance(step, Send | Wait):
+        if isinstance(step, SendFrame | WaitForFrame):
             self.deadline_ns = min(now_ns + self._patience_ns(), self._limit_ns)
         elif not isinstance(step, Stray):
             self.over = True
@@ -323,7 +323,7 @@ class SdoUpload(SdoTransfer):
         self._indicated = int.from_bytes(data[4:8], "little") if sized else None
         if self._indicated is not None and self._indicated > self._max_bytes:
             return self._break(abort_codes.OUT_OF_MEMORY, f"{self._indicated} bytes announced", data)
-        return Send(self._frame(b"\x60"))
+        return SendFrame(self._frame(b"\x60"))
 
     def _on_segment_reply(self, data: bytes) -> Step:
         if not self._toggled(data):
@@ -339,7 +339,7 @@ class SdoUpload(SdoTransfer):
         if indicated is not None and total > indicated:
             return self._break(abort_codes.LENGTH_TOO_HIGH, f"{indicated} bytes announced, {total} sent", data)
         if not last:
-            return Send(self._frame(bytes([0x60 | self._toggle << 4])))
+            return SendFrame(self._frame(bytes([0x60 | self._toggle << 4])))
         if indicated is not None and total < indicated:
             return self._break(abort_codes.LENGTH_TOO_LOW, f"{indicated} bytes announced, {total} sent", data)
         return Done(bytes(self._received))
@@ -393,4 +393,4 @@ class SdoDownload(SdoTransfer):
         self._sent += len(segment)
         self._last_sent = self._sent == len(self._data)
         command = self._toggle << 4 | (7 - len(segment)) << 1 | self._last_sent
-        return Send(self._frame(bytes([command]) + segment))
+        return SendFrame(self._frame(bytes([command]) + segment))

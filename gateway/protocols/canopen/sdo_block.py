@@ -18,7 +18,15 @@ from binascii import crc_hqx
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.protocols.canopen import abort_codes
-from fieldtwin.gateway.protocols.canopen.sdo import MAX_BYTES, Done, SdoDownload, SdoUpload, Send, Step, Wait
+from fieldtwin.gateway.protocols.canopen.sdo import (
+    MAX_BYTES,
+    Done,
+    SdoDownload,
+    SdoUpload,
+    SendFrame,
+    Step,
+    WaitForFrame,
+)
 
 UPLOAD_BLOCK = 63
 BLOCK_MAX = 127
@@ -91,7 +99,7 @@ class SdoBlockUpload(SdoUpload):
         self._indicated = int.from_bytes(data[4:8], "little") if data[0] & 0x02 else None
         if self._indicated is not None and self._indicated > self._max_bytes:
             return self._break(abort_codes.OUT_OF_MEMORY, f"{self._indicated} bytes announced", data)
-        return Send(self._frame(b"\xa3"))
+        return SendFrame(self._frame(b"\xa3"))
 
     def _on_next(self, data: bytes) -> Step:
         if not self._in_blocks:
@@ -106,13 +114,13 @@ class SdoBlockUpload(SdoUpload):
             self._surplus += 1
             if self._surplus > 2 * BLOCK_MAX:
                 return self._break(abort_codes.INVALID_SEQUENCE, "segments, but never the expected one", data)
-            return self._again(data) if last or number == self._block else Wait()
+            return self._again(data) if last or number == self._block else WaitForFrame()
         self._good, self._surplus, self._repeats, self._nudged = number, 0, 0, False
         self._received += data[1:]
         if len(self._received) > self._max_bytes + _SEGMENT:
             return self._break(abort_codes.OUT_OF_MEMORY, f"more than {self._max_bytes} bytes", data)
         self._last_seen = last
-        return self._acknowledge() if last or number == self._block else Wait()
+        return self._acknowledge() if last or number == self._block else WaitForFrame()
 
     def _again(self, data: bytes) -> Step:
         """Acknowledge a sub-block that ended with a part missing."""
@@ -121,9 +129,9 @@ class SdoBlockUpload(SdoUpload):
             return self._break(abort_codes.INVALID_SEQUENCE, "blocks without new segments", data)
         return self._acknowledge()
 
-    def _acknowledge(self) -> Send:
+    def _acknowledge(self) -> SendFrame:
         acknowledged, self._good = self._good, 0
-        return Send(self._frame(bytes([0xA0 | _ACKNOWLEDGE, acknowledged, self._block])))
+        return SendFrame(self._frame(bytes([0xA0 | _ACKNOWLEDGE, acknowledged, self._block])))
 
     def _on_end(self, data: bytes) -> Step:
         if data[0] >> 5 != _UPLOAD_REPLY or data[0] & 3 != _END:
@@ -149,7 +157,7 @@ class SdoBlockUpload(SdoUpload):
         safe = self._good > 0 or (self._indicated is not None and not self._nudged)
         return self._in_blocks and not self._last_seen and safe
 
-    def _recover(self, now_ns: int) -> Send | None:
+    def _recover(self, now_ns: int) -> SendFrame | None:
         """Acknowledge the segments that have arrived, because the last segments of the sub-block were lost (CO-017)."""
         if not self._may_recover():
             return None
@@ -218,27 +226,27 @@ class SdoBlockDownload(SdoDownload):
         self._block, self._in_block, self._resent = size, 0, False
         return self._segment()
 
-    def _segment(self) -> Send:
+    def _segment(self) -> SendFrame:
         position = self._done + self._in_block
         part = self._data[position * _SEGMENT : (position + 1) * _SEGMENT]
         self._in_block += 1
         last = position + 1 == self._segments
         command = self._in_block | (_LAST if last else 0)
-        return Send(self._frame(bytes([command]) + part), more=not last and self._in_block < self._block)
+        return SendFrame(self._frame(bytes([command]) + part), more=not last and self._in_block < self._block)
 
-    def more(self, now_ns: int) -> Send | None:
+    def more(self, now_ns: int) -> SendFrame | None:
         if self.over or self._in_block >= self._block or self._done + self._in_block >= self._segments:
             return None
         step = self._segment()
         self._go_on(step, now_ns)
         return step
 
-    def _end(self) -> Send:
+    def _end(self) -> SendFrame:
         unused = self._segments * _SEGMENT - len(self._data)
         crc = crc16(self._data) if self._crc else 0
-        return Send(self._frame(bytes([0xC0 | unused << 2 | _END]) + crc.to_bytes(2, "little")))
+        return SendFrame(self._frame(bytes([0xC0 | unused << 2 | _END]) + crc.to_bytes(2, "little")))
 
-    def _recover(self, now_ns: int) -> Send | None:
+    def _recover(self, now_ns: int) -> SendFrame | None:
         """Send the last segment of the sub-block again, but only once: it may be lost, and the node waits for it (CO-017)."""
         if not self.answered or self._done == self._segments or self._resent:
             return None

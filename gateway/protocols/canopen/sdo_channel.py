@@ -18,7 +18,17 @@ from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAbort
 from fieldtwin.gateway.core.histogram import Histogram, response_times
 from fieldtwin.gateway.protocols.canopen import abort_codes
 from fieldtwin.gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
-from fieldtwin.gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
+from fieldtwin.gateway.protocols.canopen.sdo import (
+    ABORT,
+    Done,
+    Failed,
+    SdoTransfer,
+    SdoUpload,
+    SendFrame,
+    Step,
+    Stray,
+    WaitForFrame,
+)
 
 MAX_ANSWERS = 16
 """The number of answered requests of one node whose replies are kept, to detect a second reply."""
@@ -32,7 +42,7 @@ class NodeRestarted(ReplyTimeout):
 
 
 @dataclass(slots=True)
-class Counters:
+class SdoCounters:
     """Counters of a master since it was created.
 
     Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent,
@@ -85,7 +95,7 @@ class SdoChannel:
         node: int,
         send: Callable[[CanFrame], Awaitable[None]],
         clock: Clock,
-        counters: Counters,
+        counters: SdoCounters,
         latency: Histogram | None = None,
     ) -> None:
         self._node = node
@@ -237,10 +247,10 @@ class SdoChannel:
             self._owed = None
 
     async def _drive(self, transfer: SdoTransfer) -> bytes:
-        step: Step | None = Send(transfer.start(self._clock.monotonic_ns()))
+        step: Step | None = SendFrame(transfer.start(self._clock.monotonic_ns()))
         while True:
             match step:
-                case Send(frame, more):
+                case SendFrame(frame, more):
                     await self._request(frame, transfer)
                     step = await self._after_send(transfer) if more else None
                     if step is not None:
@@ -250,7 +260,7 @@ class SdoChannel:
                     return data
                 case Failed() as failed:
                     await self._fail(failed, transfer)
-                case Stray() | Wait() | None:
+                case Stray() | WaitForFrame() | None:
                     pass
             step = await self._next_step(transfer)
 
@@ -267,7 +277,7 @@ class SdoChannel:
         step = transfer.feed(frame, self._clock.monotonic_ns())
         if not isinstance(step, Stray):
             self._reply = frame.data
-        if isinstance(step, Send | Wait | Done):
+        if isinstance(step, SendFrame | WaitForFrame | Done):
             self._counters.sdo_replies += 1
         if isinstance(step, Stray):  # not a reply: continue sending
             self._counters.ignored += 1

@@ -20,7 +20,7 @@ _DAYS_TO_1984 = 5113
 COUNTER_MAX = 240
 
 
-class Producer(Protocol):
+class FrameProducer(Protocol):
     """A producer of periodic frames."""
 
     name: str

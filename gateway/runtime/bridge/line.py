@@ -23,7 +23,7 @@ from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 
 
 @dataclass
-class LineCounters:
+class BridgeLineCounters:
     """Counters: all frames, requests to our units, answers that came too late, and bytes that were not part of a frame."""
 
     frames: int = 0
@@ -42,7 +42,7 @@ class LineFront:
         self, endpoint: Endpoint, connector: Connector, ask: Ask, ours: Callable[[int], bool], clock: Clock
     ) -> None:
         self.endpoint = endpoint
-        self.counters = LineCounters()
+        self.counters = BridgeLineCounters()
         self.connected = False
         self.error = ""
         self._connector = connector

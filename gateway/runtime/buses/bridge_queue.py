@@ -40,7 +40,7 @@ class BridgeRequest:
 
 
 @dataclass
-class BridgeCounters:
+class BridgeQueueCounters:
     """Counters of requests that were not carried out on one bus.
 
     `full`: the queue was full; `gone`: the client had disconnected; `stale`: the request had waited too long."""
@@ -57,7 +57,7 @@ class BridgeQueue:
 
     limit: int = 64
     on_put: Callable[[], None] = lambda: None
-    counters: BridgeCounters = field(default_factory=BridgeCounters)
+    counters: BridgeQueueCounters = field(default_factory=BridgeQueueCounters)
     _waiting: dict[str, deque[BridgeRequest]] = field(default_factory=dict)
     size: int = 0
     """How many requests wait."""

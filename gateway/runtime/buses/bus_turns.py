@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import GroupReading, RegisterDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot, spread
 from fieldtwin.gateway.runtime.buses.probing import MARGIN_NS, Probing
 
 FOREVER_NS = 2**62
@@ -72,7 +72,7 @@ def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]
     return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
 
 
-def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, Rate]]:
+def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, PollSlot]]:
     """Return the rates of the groups of one bus's devices, by device name."""
     groups: list[tuple[tuple[str, str], int]] = []
     stated: dict[tuple[str, str], int] = {}
@@ -83,7 +83,7 @@ def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, 
     return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
 
 
-def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> DeviceState:
+def _state(driver: RegisterDriver, rates: dict[str, PollSlot], alone: bool) -> DeviceState:
     config, known = driver.config, driver.config.expect
     once = [
         group
@@ -94,7 +94,7 @@ def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> Devic
     return DeviceState(driver, PollSchedule(rates, once), backoff, alone=alone)
 
 
-def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
+def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, PollSlot], now_ns: int) -> None:
     """Apply a new configuration to a device while no group of it is being read."""
     device.driver.reconfigure(config)
     device.backoff.restate(config.backoff_first_s, config.backoff_limit_s)

@@ -41,7 +41,7 @@ from fieldtwin.gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
 from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from fieldtwin.gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
+from fieldtwin.gateway.protocols.canopen.sync import FrameProducer, SyncProducer, TimeProducer
 from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
@@ -337,17 +337,17 @@ class CanopenBus:
                 self.connected = False
                 await connection.aclose()
 
-    def _producers(self) -> list[Producer]:
+    def _producers(self) -> list[FrameProducer]:
         """Return the SYNC and TIME producers that the system file configures, if writing is allowed."""
         wanted, now_ns = self.config.canopen, self._clock.monotonic_ns()
-        made: list[Producer] = []
+        made: list[FrameProducer] = []
         if wanted.sync_ms and self._allow_writes:
             made.append(SyncProducer(wanted.sync_ms * 1000, now_ns, overflow=wanted.sync_counter))
         if wanted.time_ms and self._allow_writes:
             made.append(TimeProducer(wanted.time_ms, now_ns))
         return made
 
-    async def _produce(self, producer: Producer, master: CanopenMaster) -> None:
+    async def _produce(self, producer: FrameProducer, master: CanopenMaster) -> None:
         """Send each message when it is due. A message that the bus does not take within one period is dropped and
         counted."""
         while True:

@@ -25,7 +25,7 @@ MOST_BYTES = 4_000_000
 """Our files are never larger; a larger file is not read."""
 
 
-class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LearntGapsEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file's entry for one device.
 
     `gaps` have the form of a profile. `borders`, which have no registers, are given by the address of the first register after
@@ -56,7 +56,7 @@ class LearntFile:
         """Pass to every driver what earlier runs learnt about its device."""
         try:
             with self._path.open("rb") as file:
-                entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, Entry])
+                entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, LearntGapsEntry])
         except (OSError, msgspec.DecodeError):
             # there is no file yet, or it is not one of ours: the gaps are learnt again and the file is written anew
             return
@@ -82,16 +82,16 @@ class LearntFile:
             raise Unreachable(f"cannot store the learnt gaps: {e.strerror}", where=str(self._path)) from e
         self._saved = changes
 
-    def _same(self, driver: RegisterDriver, entry: Entry) -> bool:
+    def _same(self, driver: RegisterDriver, entry: LearntGapsEntry) -> bool:
         return entry.profile == driver.profile.hash and (entry.endpoint, entry.unit) == self._place(driver)
 
     def _place(self, driver: RegisterDriver) -> tuple[str, int]:
         return str(self._buses[driver.config.bus].endpoint), driver.config.address
 
-    def _entry(self, driver: RegisterDriver) -> Entry:
+    def _entry(self, driver: RegisterDriver) -> LearntGapsEntry:
         learnt = driver.learnt
         endpoint, unit = self._place(driver)
-        return Entry(
+        return LearntGapsEntry(
             driver.profile.hash,
             endpoint,
             unit,
@@ -101,7 +101,7 @@ class LearntFile:
         )
 
 
-def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
+def _learnt(driver: RegisterDriver, entry: LearntGapsEntry) -> Learnt | None:
     """Return the content of an entry, or None if it is invalid."""
     try:
         gaps = [resolve_gap(text, "sent") for text in entry.gaps]

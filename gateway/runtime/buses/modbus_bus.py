@@ -34,7 +34,7 @@ from fieldtwin.gateway.core.errors import (
 from fieldtwin.gateway.core.histogram import response_times
 from fieldtwin.gateway.core.values import COMMAND, Reason
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.gateway.devices.register_device import Progress, RegisterDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver, WriteProgress
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.framings import framing_of
@@ -73,7 +73,7 @@ STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
 
 
 @dataclass
-class Job:
+class BusJob:
     """A request to carry out on the bus before the next poll. `done` is called once, with None or the error."""
 
     driver: RegisterDriver
@@ -124,7 +124,7 @@ class ModbusBus:
         self._on_offline = on_offline
         self._offset = offset
         self._coming: PendingConfig | None = None
-        self._jobs: deque[Job] = deque()
+        self._jobs: deque[BusJob] = deque()
         self._awake = False
         """Set when the bus has new work to look at, whether `_serve` sleeps or not."""
         self._sleeper: asyncio.Future[None] | None = None
@@ -165,9 +165,9 @@ class ModbusBus:
         if len(writes) == 1:
             [(tag, command)] = writes
             driver.consumer.observe(command)
-            self.submit(Job(driver, driver.send, partial(ended, tag)))
+            self.submit(BusJob(driver, driver.send, partial(ended, tag)))
             return
-        progress = Progress()
+        progress = WriteProgress()
 
         def done(error: FieldtwinError | None) -> None:
             for tag, _ in writes:
@@ -178,9 +178,9 @@ class ModbusBus:
                     ended(tag, not_sent(driver.config.where) if unsent else error)
 
         commands = [command for _, command in writes]
-        self.submit(Job(driver, partial(driver.write_together, commands, progress), done))
+        self.submit(BusJob(driver, partial(driver.write_together, commands, progress), done))
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: BusJob) -> None:
         """Queue a job ahead of all polls. If the queue is full or there is no connection, the job fails immediately."""
         if not self.connected:
             job.done(Unreachable(f"not connected: {self.error}", where=f"{self.config.name} {self.config.endpoint}"))
@@ -358,7 +358,7 @@ class ModbusBus:
             else:
                 await self._sleep(min(at_ns, wake_ns))
 
-    def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
+    def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[BusJob | None, int]:
         """Return the first queued job whose unit needs no more pause, or None, and the time at which to check again."""
         wake_ns = now_ns + NS_PER_S
         for place, job in enumerate(self._jobs):
@@ -573,7 +573,7 @@ class ModbusBus:
         if was_online:
             self._on_offline(device.driver)
 
-    async def _run_job(self, job: Job) -> None:
+    async def _run_job(self, job: BusJob) -> None:
         device = next((d for d in self.devices if d.driver is job.driver), None)
         if device is not None and device.tried and not device.online:
             job.done(Unreachable(f"the device is lost: {device.error}", where=job.driver.config.where))

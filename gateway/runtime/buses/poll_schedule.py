@@ -17,7 +17,7 @@ SOONER = 8
 """A group that is moving to its phase moves by at most 1/`SOONER` of its period each time that it is read."""
 
 
-class Rate(NamedTuple):
+class PollSlot(NamedTuple):
     """A group's period, and the phase at which the group is read (0 to less than the period), in nanoseconds."""
 
     period_ns: int
@@ -26,7 +26,7 @@ class Rate(NamedTuple):
 
 def spread(
     groups: Sequence[tuple[K, int]], stated_ms: Mapping[K, int] | None = None, offset: float = 0.0
-) -> dict[K, Rate]:
+) -> dict[K, PollSlot]:
     """Return a phase for each of `groups` (key, period in ms), which are all on one bus.
 
     The k-th of the n groups of one period P is at P x (k + offset) / n. `offset`, 0 to less than 1, keeps several buses
@@ -37,11 +37,13 @@ def spread(
     for key, period_ms in groups:
         if key not in stated:
             members.setdefault(period_ms, []).append(key)
-    rates = {key: Rate(period_ms * NS_PER_MS, stated.get(key, 0) % period_ms * NS_PER_MS) for key, period_ms in groups}
+    rates = {
+        key: PollSlot(period_ms * NS_PER_MS, stated.get(key, 0) % period_ms * NS_PER_MS) for key, period_ms in groups
+    }
     for period_ms, keys in members.items():
         period_ns = period_ms * NS_PER_MS
         for k, key in enumerate(keys):
-            rates[key] = Rate(period_ns, min(int(period_ns * (k + offset) / len(keys)), period_ns - 1))
+            rates[key] = PollSlot(period_ns, min(int(period_ns * (k + offset) / len(keys)), period_ns - 1))
     return rates
 
 
@@ -52,7 +54,7 @@ class PollSchedule:
     group the periods in which the device was online but not read.
     """
 
-    def __init__(self, rates: Mapping[str, Rate], once: Sequence[str]) -> None:
+    def __init__(self, rates: Mapping[str, PollSlot], once: Sequence[str]) -> None:
         self._rates = dict(rates)
         self._once = tuple(once)
         self._epoch_ns = 0
@@ -65,7 +67,7 @@ class PollSchedule:
         """Set the start of the grid to `epoch_ns`."""
         self._epoch_ns = epoch_ns
 
-    def restate(self, rates: Mapping[str, Rate], stated: Collection[str], now_ns: int, *, there: bool) -> None:
+    def restate(self, rates: Mapping[str, PollSlot], stated: Collection[str], now_ns: int, *, there: bool) -> None:
         """Use `rates` from now on; it holds all groups that are read cyclically. `stated` are those with a configured
         phase.
 
@@ -91,14 +93,14 @@ class PollSchedule:
                     due_ns = self._place(rate, max(now_ns, last_ns + rate.period_ns // 2))
                 elif group not in stated:
                     due_ns = due_ns if due_ns <= now_ns else max(now_ns, last_ns + rate.period_ns)
-                    self._rates[group] = Rate(rate.period_ns, (due_ns - self._epoch_ns) % rate.period_ns)
+                    self._rates[group] = PollSlot(rate.period_ns, (due_ns - self._epoch_ns) % rate.period_ns)
                 self.due_ns[group] = due_ns
             if self._rates[group] != rate:
                 self._goal_ns[group] = rate.phase_ns
         for group in kept.keys() - rates.keys():
             self.due_ns.pop(group, None)
 
-    def _place(self, rate: Rate, after_ns: int) -> int:
+    def _place(self, rate: PollSlot, after_ns: int) -> int:
         """Return the first slot on the grid of `rate` after `after_ns`."""
         start_ns = self._epoch_ns + rate.phase_ns
         return start_ns + ((after_ns - start_ns) // rate.period_ns + 1) * rate.period_ns
@@ -127,7 +129,7 @@ class PollSchedule:
         if group in self._goal_ns:
             self._go_sooner(group, rate, now_ns)
 
-    def _go_sooner(self, group: str, rate: Rate, now_ns: int) -> None:
+    def _go_sooner(self, group: str, rate: PollSlot, now_ns: int) -> None:
         """Move a group that is read now one step towards its target phase."""
         step_ns, most_ns = (rate.phase_ns - self._goal_ns[group]) % rate.period_ns, rate.period_ns // SOONER
         if self.due_ns[group] - now_ns < rate.period_ns - most_ns:
@@ -137,7 +139,7 @@ class PollSchedule:
         else:
             step_ns = most_ns
         self.due_ns[group] -= step_ns
-        self._rates[group] = Rate(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
+        self._rates[group] = PollSlot(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
 
     def free_until_ns(self) -> int | None:
         """Return the time until which another task may use the bus without making a group miss its period.

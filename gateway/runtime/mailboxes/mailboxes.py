@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 
 ASK_EVERY_NS = 50 * NS_PER_MS
 """How often a full outbox is checked."""
@@ -122,7 +122,7 @@ class Mailboxes:
 
     def _submit(self, run: Callable[[], Awaitable[None]]) -> None:
         self.busy = True
-        self._bus.submit(Job(self.driver, run, self._done))
+        self._bus.submit(BusJob(self.driver, run, self._done))
 
     def _done(self, error: FieldtwinError | None) -> None:
         self.busy = False

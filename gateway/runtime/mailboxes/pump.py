@@ -20,7 +20,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Mailboxes
-from fieldtwin.gateway.runtime.outputs.refusals import Cause, Refusals, cause_of
+from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause, Refusals, cause_of
 
 RETRY_NS = 1000 * NS_PER_MS
 
@@ -109,10 +109,10 @@ class MailboxPump:
                         result="the plant is switched to local",
                         payload=item.data.hex(),
                     )
-                self._tell("inbox", item.data.hex(), Cause.LOCAL, "the plant is switched to local", "far side")
+                self._tell("inbox", item.data.hex(), RefusalCause.LOCAL, "the plant is switched to local", "far side")
 
     def _tell(
-        self, tag: str, value: object, cause: Cause, reason: str, by: str = "plc", *, audit: bool = False
+        self, tag: str, value: object, cause: RefusalCause, reason: str, by: str = "plc", *, audit: bool = False
     ) -> None:
         if self._journal is not None:
             name = self.driver.config.name
@@ -124,7 +124,9 @@ class MailboxPump:
             waits = ("outbox", self.driver.consumer.queue[0].data.hex())
             if waits != self._withheld:
                 self._withheld = waits
-                self._tell(*waits, Cause.READ_ONLY, "this plant is read-only (start with --allow-writes)", audit=True)
+                self._tell(
+                    *waits, RefusalCause.READ_ONLY, "this plant is read-only (start with --allow-writes)", audit=True
+                )
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next exchange. `all_consumed` says that the PLC has consumed all messages that it got."""

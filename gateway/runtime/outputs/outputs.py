@@ -20,7 +20,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.outputs.first_reading import is_known, waits_for_reading
 from fieldtwin.gateway.runtime.outputs.output import SAFE, Output, as_sent
 from fieldtwin.gateway.runtime.outputs.output_groups import OutputGroup, groups_of
-from fieldtwin.gateway.runtime.outputs.refusals import Cause, Refusals, cause_of
+from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause, Refusals, cause_of
 from fieldtwin.gateway.runtime.tags import TagTable
 
 MIN_SPACING_NS = 100 * NS_PER_MS
@@ -75,7 +75,7 @@ class OutputWriter:
             if output.tag == tag and not output.not_a_number:
                 output.not_a_number, output.by = True, "plc"
                 error = NotAllowed(f"{output.local}: not a number", expected="a finite number", got="nan")
-                self._note(output, "nan", Cause.LIMIT, error, "plc")
+                self._note(output, "nan", RefusalCause.LIMIT, error, "plc")
                 self.refusals += 1
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
@@ -100,23 +100,23 @@ class OutputWriter:
             output.wanted, output.by, output.asked = value, by, done
             self._start(output, value)
 
-    def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[Cause, FieldtwinError | None]:
+    def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[RefusalCause, FieldtwinError | None]:
         """Return the cause and the error if a client's write of a tag must not be started; the error is None if it may."""
         if output is None or output.by == "plc":
-            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded by this client", where=where)
+            return RefusalCause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded by this client", where=where)
         if output.tag in self._group_of:
             group = self._group_of[output.tag].name
-            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} is written with its group {group!r} only", where=where)
+            return RefusalCause.NOT_WRITABLE, NotAllowed(f"{tag} is written with its group {group!r} only", where=where)
         if self.safe_active and output.safe is not None:
-            return Cause.NOT_NOW, EndpointBusy("the outputs are in their safe state", where=where)
+            return RefusalCause.NOT_NOW, EndpointBusy("the outputs are in their safe state", where=where)
         if output.pending or self._now_ns < output.next_try_ns:
-            return Cause.NOT_NOW, EndpointBusy("another write has just been made, or is under way", where=where)
+            return RefusalCause.NOT_NOW, EndpointBusy("another write has just been made, or is under way", where=where)
         if not output.ready:
             wrong = output.driver.identity_error
             if wrong:
-                return Cause.WRONG_DEVICE, Unreachable(f"writes are blocked: {wrong}", where=where)
-            return Cause.AWAY, Unreachable("the device does not answer", where=where)
-        return Cause.NOT_NOW, None
+                return RefusalCause.WRONG_DEVICE, Unreachable(f"writes are blocked: {wrong}", where=where)
+            return RefusalCause.AWAY, Unreachable("the device does not answer", where=where)
+        return RefusalCause.NOT_NOW, None
 
     def make_safe(self, why: str) -> None:
         """Command every output's safe value; outputs without one keep their value."""
@@ -257,7 +257,7 @@ class OutputWriter:
         group.told = told
         for output in held:
             error = NotAllowed(f"held back: {why}, and the group {group.name!r} is written whole or not at all")
-            self._note(output, output.wanted, Cause.GROUP, error, output.by)
+            self._note(output, output.wanted, RefusalCause.GROUP, error, output.by)
 
     def _start_group(self, group: OutputGroup) -> None:
         """Check every member, then record every member, then write them all."""
@@ -296,12 +296,12 @@ class OutputWriter:
             config, wrong = output.driver.config, output.driver.identity_error
             if wrong:
                 error: FieldtwinError = NotAllowed(f"writes are blocked: {wrong}", where=config.where)
-                self._note(output, value, Cause.WRONG_DEVICE, error, output.by)
+                self._note(output, value, RefusalCause.WRONG_DEVICE, error, output.by)
             else:
                 error = Unreachable(
                     "the device accepts no writes now; the value is written when it does", where=config.where
                 )
-                self._note(output, value, Cause.AWAY, error, output.by)
+                self._note(output, value, RefusalCause.AWAY, error, output.by)
 
     def _waiting_frames(self, now_ns: int) -> set[object]:
         """Return the frames that contain an output that has to wait.
@@ -353,16 +353,16 @@ class OutputWriter:
         self.refusals += 1
         self._note(output, value, self._cause(output), error, output.by)
 
-    def _cause(self, output: Output) -> Cause:
+    def _cause(self, output: Output) -> RefusalCause:
         """Return why a check refused a value of this output."""
         if not self.allow_writes:
-            return Cause.READ_ONLY
+            return RefusalCause.READ_ONLY
         if output.local not in output.driver.config.writable:
-            return Cause.NOT_WRITABLE
-        return Cause.WRONG_DEVICE if output.driver.identity_error else Cause.LIMIT
+            return RefusalCause.NOT_WRITABLE
+        return RefusalCause.WRONG_DEVICE if output.driver.identity_error else RefusalCause.LIMIT
 
     def _note(
-        self, output: Output, value: object, cause: Cause, error: FieldtwinError, by: str, *, audit: bool = True
+        self, output: Output, value: object, cause: RefusalCause, error: FieldtwinError, by: str, *, audit: bool = True
     ) -> None:
         name, old = output.driver.config.name, self._tags.current(output.tag, self._now_ns).value
         self.journal.note(
@@ -394,7 +394,7 @@ class OutputWriter:
         except Unreachable as e:
             self.failures += 1
             output.next_try_ns = self._now_ns + RETRY_NS
-            self._note(output, value, Cause.FAILED, e, output.by, audit=False)
+            self._note(output, value, RefusalCause.FAILED, e, output.by, audit=False)
             return self.safe_active and output.asked is None
         return True
 

@@ -41,7 +41,7 @@ LATER = frozenset({5, 6, 10, 11})
 """Modbus exception codes that mean "not now" or come from a gateway on the path: the same write may succeed later."""
 
 
-class Cause(Enum):
+class RefusalCause(Enum):
     """Why a write did not reach its device."""
 
     LIMIT = "limit"
@@ -66,27 +66,27 @@ class Cause(Enum):
     """A client requested a write while another was under way or the outputs were in their safe state."""
 
 
-OF_PROGRAM = frozenset({Cause.LIMIT, Cause.NOT_WRITABLE})
+OF_PROGRAM = frozenset({RefusalCause.LIMIT, RefusalCause.NOT_WRITABLE})
 """Causes that require a change to the program or the configuration, whatever happens in the plant."""
-OF_DEVICE = frozenset({Cause.WRONG_DEVICE, Cause.DEVICE})
+OF_DEVICE = frozenset({RefusalCause.WRONG_DEVICE, RefusalCause.DEVICE})
 """Causes that a disturbed device may also produce."""
 
 
-def cause_of(error: FieldtwinError) -> Cause:
+def cause_of(error: FieldtwinError) -> RefusalCause:
     """Return the cause of a write that a driver or a bus ended with `error`."""
     if isinstance(error, HeldBack):
-        return Cause.GROUP
+        return RefusalCause.GROUP
     if isinstance(error, WrongDevice):
-        return Cause.WRONG_DEVICE
+        return RefusalCause.WRONG_DEVICE
     if isinstance(error, ModbusExceptionReply) and error.code in LATER:
-        return Cause.FAILED
+        return RefusalCause.FAILED
     if isinstance(error, DeviceRefused):
-        return Cause.DEVICE
-    return Cause.WRONG_DEVICE if isinstance(error, NotAllowed) else Cause.FAILED
+        return RefusalCause.DEVICE
+    return RefusalCause.WRONG_DEVICE if isinstance(error, NotAllowed) else RefusalCause.FAILED
 
 
 @dataclass(slots=True)
-class Refusal:
+class RefusedOutput:
     """One entry. `first` is the value of the first refusal, `value` that of the newest; `t_ns` and `last_ns` are
     monotonic.
 
@@ -98,7 +98,7 @@ class Refusal:
     tag: str
     first: object
     value: object
-    cause: Cause
+    cause: RefusalCause
     reason: str
     by: str
     t_ns: int
@@ -148,19 +148,19 @@ class Refusals:
     """The journal of one gateway. `on_new` is called with each new entry; it must not raise."""
 
     def __init__(self, audit: AuditLog) -> None:
-        self.counts: Counter[Cause] = Counter()
+        self.counts: Counter[RefusalCause] = Counter()
         self.faults: Counter[str] = Counter()
-        """How many entries of programs there were by `Refusal.fault`, including those that are no longer kept."""
-        self.on_new: Callable[[Refusal], None] | None = None
+        """How many entries of programs there were by `RefusedOutput.fault`, including those that are no longer kept."""
+        self.on_new: Callable[[RefusedOutput], None] | None = None
         self.looks_up = False
         """Whether the place of each entry of a program is being looked up and reported with `placed`."""
         self.unrecorded = 0
         """How many refusals could not be written into the audit log."""
         self._audit = audit
-        self._entries: deque[Refusal] = deque(maxlen=KEPT)
-        self._newest: dict[str, Refusal] = {}
+        self._entries: deque[RefusedOutput] = deque(maxlen=KEPT)
+        self._newest: dict[str, RefusedOutput] = {}
         self._number = 0
-        self._audited: dict[tuple[str, str, Cause], tuple[int, int]] = {}
+        self._audited: dict[tuple[str, str, RefusalCause], tuple[int, int]] = {}
         """By tag, client and cause: when the last line was written, and how many refusals came since."""
 
     @property
@@ -173,7 +173,7 @@ class Refusals:
         device: str,
         tag: str,
         value: object,
-        cause: Cause,
+        cause: RefusalCause,
         reason: str,
         by: str,
         now_ns: int,
@@ -196,7 +196,7 @@ class Refusals:
         if before is not None:
             before.standing = False
         self._number += 1
-        entry = Refusal(self._number, tag, value, value, cause, reason, by, now_ns, now_ns)
+        entry = RefusedOutput(self._number, tag, value, value, cause, reason, by, now_ns, now_ns)
         entry.standing = entry.of_program  # a client's request was for one write, so it does not stand
         entry.known = not (self.looks_up and by == "plc")
         if entry.of_program:
@@ -212,7 +212,7 @@ class Refusals:
             self._newest[tag].standing = False
 
     def _record(
-        self, device: str, tag: str, value: object, cause: Cause, reason: str, by: str, now_ns: int, old: object
+        self, device: str, tag: str, value: object, cause: RefusalCause, reason: str, by: str, now_ns: int, old: object
     ) -> None:
         key = (tag, by.partition(" (")[0].rpartition(":")[0] or by, cause)
         last_ns, more = self._audited.pop(key, (None, 0))
@@ -226,7 +226,7 @@ class Refusals:
         details = {"more_refused_since": more} if more else {}
         self._write(device, by, reason, tag=tag, old=old, new=value, cause=cause.value, **details)
 
-    def _write_rest(self, key: tuple[str, str, Cause], more: int) -> None:
+    def _write_rest(self, key: tuple[str, str, RefusalCause], more: int) -> None:
         if more:
             tag, by, cause = key
             self._write(
@@ -252,9 +252,9 @@ class Refusals:
                 entry.program, entry.place, entry.known = program, place, True
                 return
 
-    def since(self, number: int) -> list[Refusal]:
+    def since(self, number: int) -> list[RefusedOutput]:
         """Return the kept entries after `number`, oldest first, up to the first entry whose place is still being looked up."""
-        found: list[Refusal] = []
+        found: list[RefusedOutput] = []
         for entry in self._entries:
             if entry.number > number:
                 if not entry.known:

@@ -17,13 +17,13 @@ from fieldtwin.conformance.clients.habits import (
 from fieldtwin.conformance.clients.modbus.cases import CASES
 from fieldtwin.conformance.core.case import CheckFunction
 from fieldtwin.conformance.core.observation import (
-    Came,
     Ended,
     Event,
     Garbled,
     Habit,
     Left,
     Observation,
+    ObservedConnection,
     ReplySent,
     RequestSeen,
     Sent,
@@ -66,7 +66,7 @@ def _good() -> list[Event]:
         ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
         ([Ended(_at(0.7), 3)], "the master ended, exit code 3, 0.70 s"),
         ([RequestSeen(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
-        ([Came(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
+        ([ObservedConnection(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
     ],
 )
 def test_forbidden_actions_of_a_client_fail(more: list[Event], says: str) -> None:
@@ -180,17 +180,22 @@ def test_every_row_of_the_list_has_a_case_or_does_not_concern_clients(
 
 
 def test_a_master_that_gives_the_connection_up_needs_no_quarantine() -> None:
-    events: list[Event] = [RequestSeen(_at(0), 1, READ), Left(_at(0.2), 1), Came(_at(0.3), 2), *_good()[2:]]
+    events: list[Event] = [
+        RequestSeen(_at(0), 1, READ),
+        Left(_at(0.2), 1),
+        ObservedConnection(_at(0.3), 2),
+        *_good()[2:],
+    ]
     assert judges.late_same_shape(_seen(*events)).verdict is Verdict.PASSED
     events[1] = Left(_at(0.2), 1, by_us=True)
     assert judges.late_same_shape(_seen(*events)).verdict is Verdict.INCONCLUSIVE
 
 
 def test_connections_that_pile_up_are_counted() -> None:
-    some = [Came(_at(n), n) for n in range(4)]
+    some = [ObservedConnection(_at(n), n) for n in range(4)]
     assert few_connections(_seen(*some)).reason == "at most 4 at once"
-    assert few_connections(_seen(*some, Left(_at(5), 1), Came(_at(5), 9))).verdict is Verdict.PASSED
-    assert few_connections(_seen(*some, Came(_at(5), 9))).verdict is Verdict.FAILED
+    assert few_connections(_seen(*some, Left(_at(5), 1), ObservedConnection(_at(5), 9))).verdict is Verdict.PASSED
+    assert few_connections(_seen(*some, ObservedConnection(_at(5), 9))).verdict is Verdict.FAILED
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import TypeVar
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 def make_unit() -> ModbusUnit:
     """Registers 0 to 199, coils 0 to 36, eight input registers, a queue, a name."""
-    bank = MapBank([Span("coil", 0, 37), Span("holding", 0, 200), Span("input", 0, 8)])
+    bank = MapBank([CellSpan("coil", 0, 37), CellSpan("holding", 0, 200), CellSpan("input", 0, 8)])
     bank.poke("holding", 0, 0xAA, 0xBB)
     bank.poke("coil", 3, 1)
     fifos = FifoQueues([0x04DE], capacity=40)

@@ -14,7 +14,7 @@ from fieldtwin.cli.test.check_device_command import _cell
 from fieldtwin.conformance.core.case import CasePlan
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.errors import UsageError
@@ -40,7 +40,7 @@ def test_an_invalid_address_is_refused_with_an_example(text: str) -> None:
 
 
 def test_cases_of_bits_run_on_the_writable_coil() -> None:
-    unit = ModbusUnit(MapBank([Span("holding", 0, 10), Span("coil", 500, 8)]))
+    unit = ModbusUnit(MapBank([CellSpan("holding", 0, 10), CellSpan("coil", 500, 8)]))
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, str]:
         plan = CasePlan(frozenset({"MB-036c", "MB-049"}), has=frozenset({"coil"}))

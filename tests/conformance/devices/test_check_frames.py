@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.conformance.devices.modbus.frames import Answer, framed, mbap, replies
+from fieldtwin.conformance.devices.modbus.frames import ReceivedReply, framed, mbap, replies
 
 FRAMINGS = ("rtu", "ascii", "mbap")
 units = st.integers(0, 255)
@@ -38,11 +38,11 @@ def test_garbage_stays_garbage(framing: str, data: bytes) -> None:
 @given(noise=st.binary(min_size=1, max_size=3).filter(lambda b: 0x3A not in b), unit=st.integers(1, 247), pdu=pdus)
 @settings(max_examples=40, deadline=None)
 def test_noise_before_an_ascii_frame_is_rest(noise: bytes, unit: int, pdu: bytes) -> None:
-    assert replies("ascii", noise + framed("ascii", unit, pdu)) == ([Answer(unit, pdu)], noise)
+    assert replies("ascii", noise + framed("ascii", unit, pdu)) == ([ReceivedReply(unit, pdu)], noise)
 
 
 def test_an_exception_is_five_bytes_although_its_first_four_fit() -> None:
-    assert replies("rtu", bytes.fromhex("01 80 01 80 00")) == ([Answer(1, b"\x80\x01")], b"")
+    assert replies("rtu", bytes.fromhex("01 80 01 80 00")) == ([ReceivedReply(1, b"\x80\x01")], b"")
     assert replies("rtu", bytes.fromhex("01 80 01 80"))[0] == []
 
 

@@ -13,7 +13,14 @@ from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.service import NmtState
 from fieldtwin.emulators.models.drive import Drive
-from fieldtwin.emulators.models.drive_states import STATE_MASK, TRANSITIONS, Cause, DriveState, command_of, transition
+from fieldtwin.emulators.models.drive_states import (
+    STATE_MASK,
+    TRANSITIONS,
+    DriveState,
+    TransitionCause,
+    command_of,
+    transition,
+)
 from fieldtwin.emulators.models.motion import Motion, to_place, to_speed
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
@@ -415,19 +422,21 @@ def test_recorded_objects_are_replayed_and_never_computed() -> None:
 def test_the_table_has_every_number_once_a_pair_and_no_other_way_out_of_a_fault() -> None:
     assert {t.number for t in TRANSITIONS} == set(range(1, 17))
     assert len({(t.source, t.cause) for t in TRANSITIONS}) == len(TRANSITIONS)
-    assert [t for t in TRANSITIONS if t.source is S.FAULT and t.cause is not Cause.FAULT_RESET] == []
-    for state, cause in product(S, Cause):
+    assert [t for t in TRANSITIONS if t.source is S.FAULT and t.cause is not TransitionCause.FAULT_RESET] == []
+    for state, cause in product(S, TransitionCause):
         found = transition(state, cause)
         assert found is None or (found.source, found.cause) == (state, cause)
 
 
 @pytest.mark.parametrize(
     ("word", "cause"),
-    [(0x00, Cause.DISABLE_VOLTAGE), (0x0D, Cause.DISABLE_VOLTAGE), (0x02, Cause.QUICK_STOP), (0x0B, Cause.QUICK_STOP),
-     (0x06, Cause.SHUTDOWN), (0x0E, Cause.SHUTDOWN), (0x07, Cause.SWITCH_ON), (0x0F, Cause.ENABLE_OPERATION),
-     (0x80, Cause.FAULT_RESET), (0x8F, Cause.FAULT_RESET)],
+    [(0x00, TransitionCause.DISABLE_VOLTAGE), (0x0D, TransitionCause.DISABLE_VOLTAGE),
+     (0x02, TransitionCause.QUICK_STOP), (0x0B, TransitionCause.QUICK_STOP),
+     (0x06, TransitionCause.SHUTDOWN), (0x0E, TransitionCause.SHUTDOWN),
+     (0x07, TransitionCause.SWITCH_ON), (0x0F, TransitionCause.ENABLE_OPERATION),
+     (0x80, TransitionCause.FAULT_RESET), (0x8F, TransitionCause.FAULT_RESET)],
 )  # fmt: skip
-def test_command_coding(word: int, cause: Cause) -> None:
+def test_command_coding(word: int, cause: TransitionCause) -> None:
     assert command_of(word, 0) is cause
     assert command_of(word | 0x80, 0x80) is None
 

@@ -17,11 +17,11 @@ from test_drive_model import ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, Rig, S
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.models.drive import Drive
-from fieldtwin.emulators.models.drive_homing import METHODS, Axis, Speeds, plan
+from fieldtwin.emulators.models.drive_homing import METHODS, DriveAxis, Speeds, plan
 from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
 from fieldtwin.emulators.models.motion import Motion, by_torque
 
-AXIS = Axis()
+AXIS = DriveAxis()
 PLACES = st.floats(-250_000, 250_000)
 SPEED = st.floats(-50_000, 50_000)
 BIT_10, BIT_11, BIT_12, BIT_13 = 1 << 10, 1 << 11, 1 << 12, 1 << 13

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local, var_output
-from fieldtwin.results.trace import Event, Kind
+from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
@@ -186,9 +186,9 @@ class _Run(VirtualRun):
 
     def attach(self, running: VirtualSystems) -> None:
         super().attach(running)
-        running.systems[""].trace.listen(self._on_tag, Kind.TAG)
+        running.systems[""].trace.listen(self._on_tag, TraceKind.TAG)
 
-    def _on_tag(self, event: Event) -> None:
+    def _on_tag(self, event: TraceEvent) -> None:
         """States shorter than a scan count as well."""
         if event.data["quality"] != "good":
             for row in self.rows:

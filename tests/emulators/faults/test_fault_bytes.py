@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Aim, FaultEffect, Hang, Piece, ValueFault, WireFault
-from fieldtwin.emulators.faults.frames import Assembler, Frame, Framing, Way, understood
+from fieldtwin.emulators.faults.fault import Active, Aim, DelayedBytes, FaultEffect, Hang, ValueFault, WireFault
+from fieldtwin.emulators.faults.frames import Assembler, FaultFrame, FrameDirection, Framing, understood
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -54,7 +54,7 @@ def made(name: str, **said: Any) -> Any:
 def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: Any) -> FaultEffect:
     fault = made(name, **said)
     assert isinstance(fault, WireFault)
-    frame = understood(Way.REPLY, framing, data)
+    frame = understood(FrameDirection.REPLY, framing, data)
     assert frame.pdu, "the frame of a test is a whole one"
     return fault.strike(frame, Random(7))
 
@@ -158,11 +158,11 @@ def test_random_choices_of_faults() -> None:
 
 
 def test_an_echo_goes_back_first() -> None:
-    assert struck("echo", ON_LINE).pieces == (Piece(ON_LINE, back=True), Piece(ON_LINE))
+    assert struck("echo", ON_LINE).pieces == (DelayedBytes(ON_LINE, back=True), DelayedBytes(ON_LINE))
 
 
 def test_faults_of_a_connection() -> None:
-    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect((Piece(ON_TCP[:4]),), Hang.RESET)
+    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect((DelayedBytes(ON_TCP[:4]),), Hang.RESET)
     assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(hang=Hang.HALF_OPEN)
     assert made("disconnect").appears() is Hang.CLOSE
     assert made("disconnect").refuses
@@ -170,7 +170,7 @@ def test_faults_of_a_connection() -> None:
 
 def test_the_next_frame_goes_before_the_reordered() -> None:
     fault = made("reorder", most_ms=50)
-    first, second = (understood(Way.REPLY, Framing.RTU, line(f"1103 02 000{n}")) for n in (1, 2))
+    first, second = (understood(FrameDirection.REPLY, Framing.RTU, line(f"1103 02 000{n}")) for n in (1, 2))
     (held,) = fault.strike(first, Random(1)).pieces
     assert [piece.data for piece in fault.strike(second, Random(1)).pieces] == [second.data, first.data]
     assert held.gone is not None
@@ -247,7 +247,7 @@ def test_late_frames_on_a_can_bus() -> None:
     (beat,) = made("heartbeat-late", most_ms=300).strike(CanFrame(0x705, b"\5"), NODE, Random(1))
     assert 0 < beat.delay_s <= 0.3
     sync = made("sync-jitter", most_ms=5)
-    assert sync.ways == frozenset((Way.REQUEST,))
+    assert sync.ways == frozenset((FrameDirection.REQUEST,))
     assert sync.aims_at(CanFrame(0x80, b""), NODE)
     (heard,) = sync.strike(CanFrame(0x80, b""), NODE, Random(1))
     assert 0 < heard.delay_s <= 0.005
@@ -301,10 +301,10 @@ def active(**aim: Any) -> Active:
     )
 
 
-REQUEST = understood(Way.REQUEST, Framing.RTU, line("1103 0010 0002"))
+REQUEST = understood(FrameDirection.REQUEST, Framing.RTU, line("1103 0010 0002"))
 
 
-def hits(fault: Active, times: int = 8, frame: Frame = REQUEST) -> list[int]:
+def hits(fault: Active, times: int = 8, frame: FaultFrame = REQUEST) -> list[int]:
     """Return which frames out of so many, one second apart, the fault changes; counted from 1."""
     return [n for n in range(1, times + 1) if fault.strikes(frame, n * 1_000_000_000)]
 
@@ -345,10 +345,10 @@ def test_faults_strike_one_after_the_other() -> None:
     for name, said in (("wrong-unit", {"unit_id": 9}), ("delay", {"by_ms": 10}), ("truncate", {"count": 1})):
         fault = made(name, **said)
         faults.put_in(Active(name, fault, Aim(), Random(1), 0, 5))
-    outcome = faults.decide(understood(Way.REPLY, Framing.RTU, ON_LINE), 1)
+    outcome = faults.decide(understood(FrameDirection.REPLY, Framing.RTU, ON_LINE), 1)
     assert outcome is not None
     assert pieces(outcome) == [(line("0903 04 000A 0102")[:-1], 0.01)]
-    assert faults.decide(understood(Way.REPLY, Framing.RTU, ON_LINE), 5) is None
+    assert faults.decide(understood(FrameDirection.REPLY, Framing.RTU, ON_LINE), 5) is None
     assert not faults.active, "what is over is forgotten"
 
 
@@ -358,7 +358,7 @@ def test_a_fault_that_divides_a_frame_acts_after_all_others(divides: type[WireFa
     faults = WireFaults(Framing.MBAP)
     for fault in (divides(divides.form()), made("garbage", data="FFFF")):
         faults.put_in(Active(fault.name, fault, Aim(), Random(1), 0, 5))
-    frame = understood(Way.REPLY, Framing.MBAP, bytes.fromhex("000700000007010304000A0102"))
+    frame = understood(FrameDirection.REPLY, Framing.MBAP, bytes.fromhex("000700000007010304000A0102"))
     outcome = faults.decide(frame, 1)
     assert outcome is not None
     assert len(outcome.pieces) == 2
@@ -378,7 +378,7 @@ def test_frames_are_found_however_they_are_cut(pdus: list[bytes], framing: Frami
         for pdu in pdus
     ]
     stream = b"".join(frames)
-    assembler, found = Assembler(Way.REPLY, framing), []
+    assembler, found = Assembler(FrameDirection.REPLY, framing), []
     while stream:
         n = random.randint(1, len(stream))
         found += assembler.feed(stream[:n])
@@ -410,7 +410,7 @@ def test_frames_of_a_stream_are_found_however_they_are_cut(
 ) -> None:
     frames = [publish(p) if framing is Framing.MQTT else len(p).to_bytes(2) + p for p in payloads]
     stream = b"".join(frames)
-    assembler, found = Assembler(Way.REPLY, framing), []
+    assembler, found = Assembler(FrameDirection.REPLY, framing), []
     while stream:
         n = random.randint(1, len(stream))
         found += assembler.feed(stream[:n])
@@ -424,7 +424,7 @@ def test_only_mqtt_packets_without_delivery_guarantee_are_dropped() -> None:
     faults.put_in(Active("drop", made("drop"), Aim(), Random(1), 0, None))
 
     def struck_first(first: int) -> bool:
-        return faults.decide(understood(Way.REPLY, Framing.MQTT, publish(b"x", first)), 1) is not None
+        return faults.decide(understood(FrameDirection.REPLY, Framing.MQTT, publish(b"x", first)), 1) is not None
 
     assert [first for first in range(0x10, 0x100) if struck_first(first)] == [0x30, 0x31, 0x38, 0x39]
 
@@ -432,7 +432,7 @@ def test_only_mqtt_packets_without_delivery_guarantee_are_dropped() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=700), max_size=5), st.sampled_from(Framing))
 def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:
-    assembler = Assembler(Way.REQUEST, framing)
+    assembler = Assembler(FrameDirection.REQUEST, framing)
     frames = [f for chunk in chunks for f in assembler.feed(chunk)] + assembler.flush()
     assert b"".join(f.data for f in frames) == b"".join(chunks)
 
@@ -446,7 +446,7 @@ def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:
 )
 def test_every_fault_takes_every_frame(data: bytes, framing: Framing, kind: type[WireFault]) -> None:
     fault = kind(kind.form())
-    for way in Way:
+    for way in FrameDirection:
         outcome = fault.strike(understood(way, framing, data), Random(1))
         assert all(isinstance(piece.data, bytes) and piece.delay_s >= 0 for piece in outcome.pieces)
 

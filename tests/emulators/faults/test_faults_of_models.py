@@ -15,7 +15,7 @@ from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.faults.fault import Active, Aim
 from fieldtwin.emulators.faults.registry import fault_class
-from fieldtwin.emulators.modbus.bank import IllegalAddress
+from fieldtwin.emulators.modbus.bank import NoSuchAddress
 from fieldtwin.emulators.models.emulated_node import EmulatedNode, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
 from fieldtwin.emulators.models.register_device import ProfileRegisters
@@ -95,7 +95,7 @@ def test_a_read_of_a_distorted_tag_has_its_effects_once(tank: tuple[ProfileRegis
     assert list(seen.read("holding", 10, 1, 5 * NS_PER_S)) == [5]  # 0 since it was read, plus five seconds of drift
     put(seen.distortions, "nan", "mode")
     assert list(seen.read("holding", 11, 1, 0)) == [0x8002]  # no bit pattern means "not a number"
-    with pytest.raises(IllegalAddress):
+    with pytest.raises(NoSuchAddress):
         seen.check_read("holding", 9, 1, 0)
 
 

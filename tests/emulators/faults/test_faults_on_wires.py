@@ -17,8 +17,8 @@ from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.on_link import wire_faults
-from fieldtwin.emulators.link import Link
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.link import EmulatedLink
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -156,7 +156,7 @@ async def linked(stranger: Any, faults: Any) -> Any:
     """A client of the server `stranger`, through a link with `faults`."""
     server = await asyncio.start_server(stranger, "127.0.0.1", 0)
     far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
-    link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
+    link = EmulatedLink(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
     await link.open()
     serving = asyncio.create_task(link.serve())
     try:
@@ -195,7 +195,7 @@ def test_a_link_puts_faults_between_two_programs_with_serial_ports(tmp_path: Pat
     async def main() -> None:
         near, far = (Endpoint("pty", path=str(tmp_path / name)) for name in ("master", "device"))
         faults = at_once({"name": "drop", "direction": "request", "nth": 1}, {"name": "truncate"}, framing=Framing.RAW)
-        link = Link(near, far, faults=faults)
+        link = EmulatedLink(near, far, faults=faults)
         await link.open()
         serving = asyncio.create_task(link.serve())
         with (
@@ -254,7 +254,7 @@ def test_datagrams() -> None:
             {"name": "duplicate", "every": 2},
         )
         device = FaultyDatagrams(await OsPorts().datagrams(Endpoint.parse("udp://127.0.0.1:0")), faults)
-        slave = MbapSlave({1: ModbusUnit(MapBank([Span("holding", 0, 1)]))})
+        slave = MbapSlave({1: ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))})
         serving = asyncio.create_task(serve_udp(device, slave, WallClock()))
         heard: asyncio.Queue[bytes] = asyncio.Queue()
 

@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.results.model import Verdict
-from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.prototype.fault_aims import target
@@ -99,7 +99,7 @@ def test_the_default_is_outside_of_the_range_and_carried_by_the_type(tmp_path: P
         )
         steps += f"  - expect: {{tag: tank.{name}, quality: {quality}}}\n"
     steps += "".join(f"  - expect: {{tag: tank.{name}, value: 0, quality: good}}\n" for name in NEVER)
-    result = run_scenario(load_scenario(scenario(tmp_path, steps)), Target())
+    result = run_scenario(load_scenario(scenario(tmp_path, steps)), ScenarioTarget())
     assert result.verdict is Verdict.PASSED, result.checks[-1]
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -26,7 +26,7 @@ READ, READ_REPLY = framed("01 03 0000 0002"), framed("01 03 04 00AA 00BB")
 def make_units(*unit_ids: int) -> dict[int, ModbusUnit]:
     units = {}
     for unit_id in unit_ids or (1,):
-        bank = MapBank([Span("holding", 0, 126)])
+        bank = MapBank([CellSpan("holding", 0, 126)])
         bank.poke("holding", 0, 0xAA, 0xBB)
         units[unit_id] = ModbusUnit(bank)
     return units

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import pytest
 
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.line import LineSlave
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
@@ -49,7 +49,7 @@ def bounded_memory() -> Iterator[None]:
 
 
 def make_units() -> dict[int, ModbusUnit]:
-    return {1: ModbusUnit(MapBank([Span("holding", 0, 4)]))}
+    return {1: ModbusUnit(MapBank([CellSpan("holding", 0, 4)]))}
 
 
 def make_line(kind: str) -> tuple[LineSlave, bytes]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.bank import Acknowledge, CellHooks, IllegalValue, MapBank, NegativeAcknowledge, Span
+from fieldtwin.emulators.modbus.bank import Acknowledge, CellHooks, CellSpan, IllegalValue, MapBank, NegativeAcknowledge
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import MAX_OBJECT, Identification
@@ -17,7 +17,7 @@ BASIC = {0: b"fieldtwin", 1: b"FT-1", 2: b"V2.11"}
 
 
 def make_unit(**parts: object) -> ModbusUnit:
-    bank = MapBank([Span("holding", 0, 16), Span("coil", 0, 8)])
+    bank = MapBank([CellSpan("holding", 0, 16), CellSpan("coil", 0, 8)])
     return ModbusUnit(bank, server_id=b"ft", **parts)  # type: ignore[arg-type]
 
 
@@ -318,7 +318,7 @@ def test_only_the_functions_of_the_profile() -> None:
 
 
 def test_registers_with_side_effects() -> None:
-    bank = MapBank([Span("holding", 0, 8)])
+    bank = MapBank([CellSpan("holding", 0, 8)])
     unit = ModbusUnit(bank)
 
     def clearing(value: int, now_ns: int) -> int:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import UsageError
@@ -25,7 +25,7 @@ VALUES = "03 04 00AA 00BB"
 def make_slave(*unit_ids: int, max_in_flight: int = 16) -> MbapSlave:
     units = {}
     for unit_id in unit_ids or (1,):
-        bank = MapBank([Span("holding", 0, 125)])
+        bank = MapBank([CellSpan("holding", 0, 125)])
         bank.poke("holding", 0, 0xAA, 0xBB)
         units[unit_id] = ModbusUnit(bank)
     return MbapSlave(units, max_in_flight)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.rtu_receiver import RtuReceiver
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -35,7 +35,7 @@ READ_REPLY = crc("01 03 04 00AA 00BB")
 def make_slave(*unit_ids: int) -> RtuSlave:
     units = {}
     for unit_id in unit_ids or (1,):
-        bank = MapBank([Span("holding", 0, 300), Span("coil", 0, 64)])
+        bank = MapBank([CellSpan("holding", 0, 300), CellSpan("coil", 0, 64)])
         bank.poke("holding", 0, 0xAA, 0xBB)
         units[unit_id] = ModbusUnit(bank)
     return RtuSlave(units)

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.bank import (
     Acknowledge,
-    Busy,
-    IllegalAddress,
+    CellSpan,
+    DeviceIsBusy,
     IllegalValue,
     MapBank,
+    NoSuchAddress,
     Refusal,
-    Span,
     Table,
 )
 from fieldtwin.emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
@@ -23,15 +23,15 @@ from fieldtwin.gateway.core.errors import UsageError
 def make_bank() -> MapBank:
     bank = MapBank(
         [
-            Span("coil", 0, 37),
-            Span("coil", 40, 8),  # a gap from 37 to 39
-            Span("discrete", 0xC4, 22),
-            Span("holding", 0, 200),
-            Span("holding", 300, 1, access="ro"),
-            Span("holding", 301, 1, access="wo"),
-            Span("holding", 0xFFF0, 16),
-            Span("input", 0, 200),
-            Span("input", 0xFFFF, 1),
+            CellSpan("coil", 0, 37),
+            CellSpan("coil", 40, 8),  # a gap from 37 to 39
+            CellSpan("discrete", 0xC4, 22),
+            CellSpan("holding", 0, 200),
+            CellSpan("holding", 300, 1, access="ro"),
+            CellSpan("holding", 301, 1, access="wo"),
+            CellSpan("holding", 0xFFF0, 16),
+            CellSpan("input", 0, 200),
+            CellSpan("input", 0xFFFF, 1),
         ]
     )
     # AP 6.1: coils 20 to 38 are CD 6B 05
@@ -186,11 +186,11 @@ def test_mb_041_a_veto_of_the_device_changes_nothing() -> None:
 
     seen: list[object] = []
     refusing: list[Refusal] = []
-    bank = MapBank([Span("holding", 0, 4)], on_write=veto)
+    bank = MapBank([CellSpan("holding", 0, 4)], on_write=veto)
     unit = ModbusUnit(bank)
     for refusal, code in (
         (IllegalValue("99"), 3),
-        (Busy("later"), 6),
+        (DeviceIsBusy("later"), 6),
         (Acknowledge("slow"), 5),
         (Refusal("broken"), 4),
     ):
@@ -268,15 +268,15 @@ def test_counters_add_up() -> None:
 
 def test_bank_refuses_impossible_values() -> None:
     with pytest.raises(UsageError, match="same cell"):
-        MapBank([Span("coil", 0, 2), Span("coil", 1, 1)])
+        MapBank([CellSpan("coil", 0, 2), CellSpan("coil", 1, 1)])
     with pytest.raises(UsageError, match="addresses"):
-        Span("coil", 0xFFFF, 2)
-    bank = MapBank([Span("coil", 0, 2), Span("input", 0, 1)])
+        CellSpan("coil", 0xFFFF, 2)
+    bank = MapBank([CellSpan("coil", 0, 2), CellSpan("input", 0, 1)])
     with pytest.raises(IllegalValue):
         bank.poke("coil", 0, 2)
     with pytest.raises(IllegalValue):
         bank.poke("input", 0, 0x10000)
-    with pytest.raises(IllegalAddress):
+    with pytest.raises(NoSuchAddress):
         bank.poke("coil", 1, 1, 1)
     assert bank.peek("coil", 1) == 0
 

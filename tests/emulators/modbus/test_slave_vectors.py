@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.line import LineSlave
@@ -33,12 +33,12 @@ def make_unit(even_only: bool) -> ModbusUnit:
     """The device of the vectors."""
     bank = MapBank(
         [
-            Span("coil", 0, 37),
-            Span("coil", 40, 8),
-            Span("holding", 0, 200),
-            Span("holding", 299, 1),
-            Span("holding", 300, 1, access="ro"),
-            Span("input", 0, 8),
+            CellSpan("coil", 0, 37),
+            CellSpan("coil", 40, 8),
+            CellSpan("holding", 0, 200),
+            CellSpan("holding", 299, 1),
+            CellSpan("holding", 300, 1, access="ro"),
+            CellSpan("input", 0, 8),
         ]
     )
     bank.poke("holding", 0, 0xAA, 0xBB)

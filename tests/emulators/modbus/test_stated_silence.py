@@ -9,7 +9,7 @@ import pytest
 from modbus_virtual import VirtualLoop, run_virtually
 from virtual_bus import VirtualLine
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -31,7 +31,7 @@ def test_the_next_request_goes_after_the_stated_silence(query: str, silence_us: 
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)
         endpoint = Endpoint.parse(f"rtu:/dev/ttyVIRT?{query}")
-        line = VirtualLine(loop, {1: ModbusUnit(MapBank([Span("holding", 0, 10)]))})
+        line = VirtualLine(loop, {1: ModbusUnit(MapBank([CellSpan("holding", 0, 10)]))})
         client = ModbusClient.at(endpoint, await line.open_bytes(endpoint), loop)
         first = await client.read_registers(1, "holding", 0, 1)
         await client.read_registers(1, "holding", 0, 1)

@@ -12,7 +12,7 @@ from sdo_block_peer import BlockServer
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from fieldtwin.gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, Send, Stray, Wait
+from fieldtwin.gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SendFrame, Stray, WaitForFrame
 from fieldtwin.gateway.protocols.canopen.sdo_block import MAX_REPEATS, SdoBlockDownload, SdoBlockUpload, crc16
 
 MS = 1_000_000
@@ -30,8 +30,8 @@ def feed(transfer: SdoTransfer, data: str, now_ns: int = 0) -> object:
     return transfer.feed(frame("585#" + data), now_ns)
 
 
-def sent(data: str, *, more: bool = False) -> Send:
-    return Send(frame("605#" + data), more)
+def sent(data: str, *, more: bool = False) -> SendFrame:
+    return SendFrame(frame("605#" + data), more)
 
 
 def refused(step: object, code: int) -> None:
@@ -50,7 +50,7 @@ def test_upload_frame_by_frame() -> None:
     transfer = SdoBlockUpload(5, 0x2000, 0, TIMEOUT, block=2, switch_bytes=4)
     assert transfer.start(0) == frame("605#A4 00 20 00 02 04 00 00")
     assert feed(transfer, "C6 00 20 00 11 00 00 00") == sent("A3 00 00 00 00 00 00 00")
-    assert feed(transfer, "01 61 62 63 64 65 66 67") == Wait()
+    assert feed(transfer, "01 61 62 63 64 65 66 67") == WaitForFrame()
     assert feed(transfer, "02 68 69 6A 6B 6C 6D 6E") == sent("A2 02 02 00 00 00 00 00")
     assert feed(transfer, "81 6F 70 71 00 00 00 00") == sent("A2 01 02 00 00 00 00 00")
     crc = crc16(b"abcdefghijklmnopq").to_bytes(2, "little").hex()
@@ -134,7 +134,7 @@ def test_blocks_that_never_bring_anything_come_to_an_end() -> None:
     down.start(0)
     feed(down, "A4 00 20 00 04 00 00 00")
     steps = [feed(down, "A2 00 04 00 00 00 00 00") for _ in range(MAX_REPEATS + 1)]
-    assert all(isinstance(step, Send) for step in steps[:-1])
+    assert all(isinstance(step, SendFrame) for step in steps[:-1])
     refused(steps[-1], 0x0504_0003)
     up = upload(block=2)
     feed(up, "C0 00 20 00 00 00 00 00")
@@ -145,7 +145,7 @@ def test_blocks_that_never_bring_anything_come_to_an_end() -> None:
 def test_an_abort_ends_it_in_every_state_and_a_segment_never_passes_for_one() -> None:
     transfer = upload()
     feed(transfer, "C0 00 20 00 00 00 00 00")
-    assert feed(transfer, "01 00 20 00 61 62 63 64") == Wait()
+    assert feed(transfer, "01 00 20 00 61 62 63 64") == WaitForFrame()
     assert isinstance(feed(transfer, "80 00 20 01 00 00 04 05"), Stray)  # another object's
     step = feed(transfer, "80 00 20 00 00 00 00 08")
     assert isinstance(step, Failed)
@@ -198,7 +198,7 @@ def drive(transfer: SdoTransfer, server: BlockServer, fates: list[int], delays: 
         elif now >= transfer.deadline_ns:
             step = transfer.expire(now)
         match step:
-            case Send(request, more):
+            case SendFrame(request, more):
                 put(to_server, request.data, False)
                 burst = more
             case Failed(_, abort):
@@ -265,7 +265,7 @@ def test_any_bytes_are_survived(frames: list[bytes], size: int) -> None:
         transfer.start(0)
         for data in [bytes.fromhex("C400200000000000"), bytes.fromhex("A400200004000000"), *frames]:
             step = transfer.feed(CanFrame(0x585, data), 0)
-            assert isinstance(step, Send | Stray | Wait) or transfer.over
+            assert isinstance(step, SendFrame | Stray | WaitForFrame) or transfer.over
 
 
 @pytest.mark.parametrize("lost", [3, 11])

@@ -17,7 +17,7 @@ from fieldtwin.gateway.protocols.canopen.sdo import (
     SdoDownload,
     SdoTransfer,
     SdoUpload,
-    Send,
+    SendFrame,
     Step,
     Stray,
 )
@@ -63,8 +63,8 @@ def test_expedited_upload(reply: str, data: str) -> None:
 
 def test_segmented_upload() -> None:
     transfer = upload()
-    assert feed(transfer, "41 08 10 00 09 00 00 00") == Send(frame("605#60 00 00 00 00 00 00 00"))
-    assert feed(transfer, "00 61 62 63 64 65 66 67") == Send(frame("605#70 00 00 00 00 00 00 00"))
+    assert feed(transfer, "41 08 10 00 09 00 00 00") == SendFrame(frame("605#60 00 00 00 00 00 00 00"))
+    assert feed(transfer, "00 61 62 63 64 65 66 67") == SendFrame(frame("605#70 00 00 00 00 00 00 00"))
     assert feed(transfer, "1B 68 69 00 00 00 00 00") == Done(b"abcdefghi")
 
 
@@ -80,15 +80,15 @@ def test_expedited_download(size: int) -> None:
 def test_segmented_download() -> None:
     transfer = SdoDownload(5, 0x2000, 1, TIMEOUT, b"abcdefghi")
     assert transfer.start(0) == frame("605#21 00 20 01 09 00 00 00")
-    assert feed(transfer, "60 00 20 01 00 00 00 00") == Send(frame("605#00 61 62 63 64 65 66 67"))
-    assert feed(transfer, "20 00 00 00 00 00 00 00") == Send(frame("605#1B 68 69 00 00 00 00 00"))
+    assert feed(transfer, "60 00 20 01 00 00 00 00") == SendFrame(frame("605#00 61 62 63 64 65 66 67"))
+    assert feed(transfer, "20 00 00 00 00 00 00 00") == SendFrame(frame("605#1B 68 69 00 00 00 00 00"))
     assert feed(transfer, "30 00 00 00 00 00 00 00") == Done(b"")
 
 
 def test_co030_nothing_at_all_is_one_empty_segment() -> None:
     down = SdoDownload(5, 0x2000, 1, TIMEOUT, b"")
     assert down.start(0) == frame("605#21 00 20 01 00 00 00 00")
-    assert feed(down, "60 00 20 01 00 00 00 00") == Send(frame("605#0F 00 00 00 00 00 00 00"))
+    assert feed(down, "60 00 20 01 00 00 00 00") == SendFrame(frame("605#0F 00 00 00 00 00 00 00"))
     assert feed(down, "20 00 00 00 00 00 00 00") == Done(b"")
     up = upload()
     feed(up, "41 08 10 00 00 00 00 00")
@@ -124,7 +124,7 @@ def test_no_such_object_is_the_callers_fault(index: int, sub: int, node: int) ->
 def test_co001_repeated_toggle_aborts() -> None:
     transfer = upload()
     feed(transfer, "40 08 10 00 00 00 00 00")
-    assert isinstance(feed(transfer, "00 61 62 63 64 65 66 67"), Send)
+    assert isinstance(feed(transfer, "00 61 62 63 64 65 66 67"), SendFrame)
     refused(feed(transfer, "00 61 62 63 64 65 66 67"), 0x0503_0000)
     assert isinstance(feed(transfer, "1B 68 69 00 00 00 00 00"), Stray)
 
@@ -279,4 +279,4 @@ def test_any_bytes_are_survived(frames: list[bytes], size: int) -> None:
         transfer.start(0)
         for data in frames:
             step = transfer.feed(CanFrame(0x585, data), 0)
-            assert isinstance(step, Send | Stray) or transfer.over
+            assert isinstance(step, SendFrame | Stray) or transfer.over

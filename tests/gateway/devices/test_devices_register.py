@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from support import run
 
 from fieldtwin.emulators import codec as emulated
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
@@ -320,7 +320,7 @@ def test_binary_coded_decimals_are_the_digits_that_one_reads(
 def test_a_coil_is_written_with_0fh_if_the_device_has_no_05() -> None:
     async def main(functions: str, expected: int) -> None:
         p = profile(f'limits: {{functions: {functions}}}\ntags:\n  c: {{at: "coil:3", type: bool, access: rw}}\n')
-        bank = MapBank([Span("coil", 0, 8)])
+        bank = MapBank([CellSpan("coil", 0, 8)])
         field = FieldBus({1: ModbusUnit(bank)})
         connection = await field.open_bytes(LINE)
         client = ModbusClient(connection, WallClock(), framing="rtu", serial=LINE.serial, timeout_s=0.3)

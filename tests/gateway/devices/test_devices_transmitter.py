@@ -27,7 +27,7 @@ from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver, next_sequence
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
@@ -53,7 +53,7 @@ class Station:
         count = len(self.errors)
         driver = self.driver
         actions = {"send": driver.send, "acknowledge": driver.acknowledge, "ask": self._ask, "read": self._read}
-        self.bus.submit(Job(driver, actions[what], self.errors.append))
+        self.bus.submit(BusJob(driver, actions[what], self.errors.append))
         await eventually(lambda: len(self.errors) > count)
         return self.errors[-1]
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -41,7 +41,7 @@ KINDS = ["rtu", "ascii", "mbap", "udp"]
 
 
 def make_unit(cells: int = 500) -> ModbusUnit:
-    bank = MapBank([Span(table, 0, cells) for table in ("coil", "discrete", "holding", "input")])
+    bank = MapBank([CellSpan(table, 0, cells) for table in ("coil", "discrete", "holding", "input")])
     bank.poke("holding", 0, *(FIRST + i for i in range(200)))
     bank.poke("input", 0, *(2 * FIRST + i for i in range(200)))
     bank.poke("coil", 0, *(i % 3 == 0 for i in range(64)))

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import pytest
 
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -39,7 +39,7 @@ GARBAGE = {
 
 
 def units() -> dict[int, ModbusUnit]:
-    return {1: ModbusUnit(MapBank([Span("holding", 0, 4)]))}
+    return {1: ModbusUnit(MapBank([CellSpan("holding", 0, 4)]))}
 
 
 def flood(feed: Callable[[bytes, int], object], kept: Callable[[], int], kind: str, chunks: int = CHUNKS) -> int:

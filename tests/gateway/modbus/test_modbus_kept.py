@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fieldtwin.emulators.modbus.bank import CellHooks, IllegalAddress, MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellHooks, CellSpan, MapBank, NoSuchAddress
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.memory_stream import MemoryWire
@@ -44,7 +44,7 @@ def test_a_changed_timeout_counts_from_the_next_request_on() -> None:
 
 
 def test_a_cell_that_is_hooked_after_a_read_is_read_through_its_hook() -> None:
-    bank = MapBank([Span("holding", 10, 4)])
+    bank = MapBank([CellSpan("holding", 10, 4)])
     bank.poke("holding", 10, 1, 2, 3, 4)
     assert list(bank.read("holding", 10, 4, 0)) == [1, 2, 3, 4]
     bank.hook("holding", 12, CellHooks(reading=lambda value, now_ns: value + now_ns))
@@ -53,5 +53,5 @@ def test_a_cell_that_is_hooked_after_a_read_is_read_through_its_hook() -> None:
     assert list(bank.read("holding", 12, 1, 40)) == [45]
     bank.hook("holding", 12, CellHooks())
     assert list(bank.read("holding", 10, 4, 50)) == [1, 2, 5, 4]
-    with pytest.raises(IllegalAddress):
+    with pytest.raises(NoSuchAddress):
         bank.read("holding", 11, 4, 0)

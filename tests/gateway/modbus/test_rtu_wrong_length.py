@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.rtu_receiver import FRAME_GAP_NS
@@ -32,7 +32,7 @@ WRONG = {
 
 
 def make_unit() -> ModbusUnit:
-    return ModbusUnit(MapBank([Span("holding", 0, 10), Span("coil", 0, 10)]))
+    return ModbusUnit(MapBank([CellSpan("holding", 0, 10), CellSpan("coil", 0, 10)]))
 
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)

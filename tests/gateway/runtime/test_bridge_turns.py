@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.server import examine
 from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
 from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, BridgeQueue, BridgeRequest
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 READ = bytes.fromhex("03 0064 0001")
@@ -40,7 +40,7 @@ def make(tags: TagTable) -> list[RegisterDriver]:
 
 
 def field() -> FieldBus:
-    return FieldBus({1: unit(MapBank([Span("holding", 0, 201)]))}, latency_s=0.003)
+    return FieldBus({1: unit(MapBank([CellSpan("holding", 0, 201)]))}, latency_s=0.003)
 
 
 def flood(bus: ModbusBus, results: list[Result], clients: int, each: int) -> None:
@@ -76,7 +76,7 @@ def test_mb_063_a_write_of_the_plc_goes_before_clients_and_polls() -> None:
             ended: list[FieldtwinError | None] = []
             before = len(r.field.heard)
             driver.consumer.observe(driver.command("out", 7))
-            r.bus.submit(Job(driver, driver.send, ended.append))
+            r.bus.submit(BusJob(driver, driver.send, ended.append))
             await eventually(lambda: bool(ended))
             assert ended == [None]
             functions = [adu[1] for adu in r.field.heard[before:]]

@@ -12,7 +12,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
@@ -64,7 +64,7 @@ class Watched:
 
 def test_mb_066_an_adapter_pulled_and_plugged_in_again_goes_on(tmp_path: Path) -> None:
     async def main() -> None:
-        watched, cells = Watched(tmp_path), MapBank([Span("holding", 0, 1)])
+        watched, cells = Watched(tmp_path), MapBank([CellSpan("holding", 0, 1)])
         cells.poke("holding", 0, 7)
         async with Nursery() as nursery:
             nursery.start(watched.bus.run(), "bus")
@@ -81,7 +81,7 @@ def test_mb_066_an_adapter_pulled_and_plugged_in_again_goes_on(tmp_path: Path) -
 
 def test_mb_067_a_port_that_is_held_is_told_and_tried_again(tmp_path: Path) -> None:
     async def main() -> None:
-        watched, cells = Watched(tmp_path), MapBank([Span("holding", 0, 1)])
+        watched, cells = Watched(tmp_path), MapBank([CellSpan("holding", 0, 1)])
         cells.poke("holding", 0, 7)
         async with plugged(tmp_path, cells):
             holder = await SerialConnection.open(plant(tmp_path))

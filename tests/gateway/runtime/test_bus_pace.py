@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from modbus_virtual import run_virtually
 from virtual_bus import LINE, VirtualBus, run_bus
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
@@ -20,8 +20,8 @@ from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.client import UnitPace
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job
-from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot, spread
 from fieldtwin.gateway.runtime.tags import TagTable
 
 ONE = profile('tags:\n  level: {at: "holding:0"}\n')
@@ -34,7 +34,7 @@ FAR_APART = profile(
 
 
 def unit() -> ModbusUnit:
-    return ModbusUnit(MapBank([Span("holding", 0, 100)]))
+    return ModbusUnit(MapBank([CellSpan("holding", 0, 100)]))
 
 
 def one(address: int, tags: TagTable, every_ms: int = 100, p=ONE, **more: object) -> SensorDriver:  # type: ignore[no-untyped-def]
@@ -201,7 +201,7 @@ def test_a_write_goes_between_two_transactions_of_one_group() -> None:
             ended: list[FieldtwinError | None] = []
             before = len(v.line.heard)
             driver.consumer.observe(driver.command("out", 7))
-            v.bus.submit(Job(driver, driver.send, ended.append))
+            v.bus.submit(BusJob(driver, driver.send, ended.append))
             await wait(0.5)
             assert ended == [None]
             functions = [h.pdu[0] for h in v.line.heard[before:]]
@@ -223,7 +223,7 @@ def test_a_write_to_a_unit_in_its_pause_lets_one_to_another_unit_go_first() -> N
             slow, quick = (d.driver for d in v.bus.devices)
             for n, driver in enumerate((slow, slow, quick)):
                 driver.consumer.observe(driver.command("out", n))
-                v.bus.submit(Job(driver, driver.send, lambda e, n=n: ended.append((n, bool(e)))))  # type: ignore[misc]
+                v.bus.submit(BusJob(driver, driver.send, lambda e, n=n: ended.append((n, bool(e)))))  # type: ignore[misc]
             await wait(4.0)
             assert ended == [(0, False), (2, False), (1, False)]  # and those of one unit stay in order
             writes = v.line.times(1, 4.0, 99)
@@ -247,7 +247,7 @@ def test_a_write_to_a_disconnected_unit_takes_no_time_of_the_line() -> None:
             driver = v.bus.devices[1].driver
             ended: list[FieldtwinError | None] = []
             driver.consumer.observe(driver.command("out", 7))
-            v.bus.submit(Job(driver, driver.send, ended.append))
+            v.bus.submit(BusJob(driver, driver.send, ended.append))
             await wait(0.1)
             assert isinstance(ended[0], Unreachable)
             assert len(v.line.times(2)) == asked
@@ -325,7 +325,7 @@ def test_phases_are_spread_evenly_in_order_and_within_the_period(periods: list[i
 )
 def test_every_period_is_read_or_counted_as_missed(period_ms: int, phase_ms: int, steps: list[int]) -> None:
     period_ns, phase_ns = period_ms * NS_PER_MS, (phase_ms % period_ms) * NS_PER_MS
-    schedule = PollSchedule({"g": Rate(period_ns, phase_ns)}, [])
+    schedule = PollSchedule({"g": PollSlot(period_ns, phase_ns)}, [])
     start_ns = 3 * NS_PER_S
     schedule.anchor(start_ns)
     now_ns = start_ns + 7

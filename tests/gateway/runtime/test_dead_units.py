@@ -15,7 +15,7 @@ from gateway_rig import profile
 from modbus_virtual import run_virtually
 from virtual_bus import VirtualBus, run_bus
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -37,7 +37,7 @@ TWO_BLOCKS = profile(
 
 
 def unit() -> ModbusUnit:
-    return ModbusUnit(MapBank([Span("holding", 0, 100)]))
+    return ModbusUnit(MapBank([CellSpan("holding", 0, 100)]))
 
 
 def device(address: int, tags: TagTable, every_s: float = PERIOD_S, p=LEVEL, **more: object) -> RegisterDriver:  # type: ignore[no-untyped-def]

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.bank import DeviceFailure, MapBank, Span, Table
+from fieldtwin.emulators.modbus.bank import CellSpan, DeviceFailure, MapBank, Table
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.modbus_bus import MAX_JOBS, Job
+from fieldtwin.gateway.runtime.buses.modbus_bus import MAX_JOBS, BusJob
 from fieldtwin.gateway.runtime.tags import TagTable
 
 TWO_GROUPS = """
@@ -34,7 +34,7 @@ def config(name: str, p: DeviceProfile, address: int, every_ms: int = 20, **more
 
 
 def bank() -> MapBank:
-    made = MapBank([Span("holding", 0, 1), Span("holding", 10, 1), Span("holding", 20, 2)])
+    made = MapBank([CellSpan("holding", 0, 1), CellSpan("holding", 10, 1), CellSpan("holding", 20, 2)])
     made.poke("holding", 20, 0x6162, 0x6300)
     return made
 
@@ -82,7 +82,7 @@ def test_a_write_goes_before_every_due_poll() -> None:
     async def main() -> None:
         lines = "".join(f"  t{i}: {{at: 'holding:{20 * i}', poll: g{i}}}\n" for i in range(10))
         p = profile("tags:\n" + lines + "  out: {at: 'holding:500', access: rw, poll: never}\n")
-        cells = MapBank([Span("holding", 0, 501)])
+        cells = MapBank([CellSpan("holding", 0, 501)])
         poll = {f"g{i}": 1 for i in range(10)}
 
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -94,7 +94,7 @@ def test_a_write_goes_before_every_due_poll() -> None:
             ended: list[FieldtwinError | None] = []
             before = len(r.field.heard)
             driver.consumer.observe(driver.command("out", 7))
-            r.bus.submit(Job(driver, driver.send, ended.append))
+            r.bus.submit(BusJob(driver, driver.send, ended.append))
             await eventually(lambda: bool(ended))
             assert ended == [None]
             functions = [adu[1] for adu in r.field.heard[before:]]
@@ -120,7 +120,7 @@ def test_a_lost_connection_is_reopened_with_growing_pauses_and_the_values_show_i
             assert r.lost == [r.bus.devices[0].driver]
             refused: list[FieldtwinError | None] = []
             driver = r.bus.devices[0].driver
-            r.bus.submit(Job(driver, driver.send, refused.append))  # no connection: it fails at once
+            r.bus.submit(BusJob(driver, driver.send, refused.append))  # no connection: it fails at once
             assert isinstance(refused[0], Unreachable)
             await eventually(lambda: len(r.field.tries) >= 4)
             tries = r.field.tries
@@ -146,7 +146,7 @@ def test_a_job_that_waits_when_the_connection_is_lost_gets_an_error() -> None:
             driver = r.bus.devices[0].driver
             ended: list[FieldtwinError | None] = []
             for _ in range(MAX_JOBS + 5):
-                r.bus.submit(Job(driver, driver.send, ended.append))
+                r.bus.submit(BusJob(driver, driver.send, ended.append))
             assert len(ended) == 5  # there is a bound, and a caller beyond it gets an error
             assert all(isinstance(e, EndpointBusy) for e in ended)
             driver.consumer.observe(driver.command("slow", 1))
@@ -170,7 +170,7 @@ class Refusing(MapBank):
 def test_a_refused_group_is_bad_and_the_others_continue() -> None:
     async def main() -> None:
         p = profile(TWO_GROUPS)
-        refusing = Refusing([Span("holding", 0, 1), Span("holding", 10, 1)])
+        refusing = Refusing([CellSpan("holding", 0, 1), CellSpan("holding", 10, 1)])
 
         def make(tags: TagTable) -> list[RegisterDriver]:
             return [SensorDriver(config("d", p, 1), tags)]

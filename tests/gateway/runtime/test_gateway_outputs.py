@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import NotAllowed, Unreachable
 from fieldtwin.gateway.core.values import COMMAND
@@ -78,7 +78,7 @@ async def rig(
     groups: dict[str, tuple[str, ...]] | None = None,
 ) -> AsyncIterator[Rig]:
     p = profile(text)
-    cells = bank([Span("holding", 0, 200), Span("coil", 0, 8)])
+    cells = bank([CellSpan("holding", 0, 200), CellSpan("coil", 0, 8)])
     cells.poke("holding", 100, 0x6162, 0x6300)
     config = DeviceConfig(
         "d",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from modbus_virtual import run_virtually
 from virtual_bus import LINE, VirtualBus, run_bus
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.register_functions import UnitLimits
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -33,7 +33,7 @@ tags:
   d: {at: "holding:10"}
   gone: {at: "holding:12"}
 """
-HERE = [Span("holding", 0, 2), Span("holding", 5, 6)]
+HERE = [CellSpan("holding", 0, 2), CellSpan("holding", 5, 6)]
 """2 to 4 are a gap, 7 and 9 exist, 12 does not."""
 
 
@@ -50,7 +50,7 @@ class Site:
         self.requests = 0
         self.driver: RegisterDriver
 
-    def run(self, seconds: float = 2.05, spans: list[Span] = HERE) -> LearntStatus | None:
+    def run(self, seconds: float = 2.05, spans: list[CellSpan] = HERE) -> LearntStatus | None:
         async def main() -> None:
             def make(tags: TagTable) -> list[RegisterDriver]:
                 config = DeviceConfig("meter", self.profile, "line", self.unit, poll={"values": 1000})
@@ -70,7 +70,7 @@ class Site:
         return learnt_statuses([self.driver]).get("meter")
 
 
-def learnt(site: Site, spans: list[Span] = HERE) -> LearntStatus:
+def learnt(site: Site, spans: list[CellSpan] = HERE) -> LearntStatus:
     """Run the site, and return what it has learnt: something."""
     found = site.run(spans=spans)
     assert found is not None
@@ -121,7 +121,7 @@ def test_a_different_device_is_asked_again(site: Site, change: str) -> None:
 
 def test_a_gap_that_answers_again_is_forgotten(site: Site) -> None:
     site.run()
-    assert learnt(site, [Span("holding", 0, 2), Span("holding", 5, 8)]).missing == []
+    assert learnt(site, [CellSpan("holding", 0, 2), CellSpan("holding", 5, 8)]).missing == []
     assert site.exceptions == 0
 
 
@@ -154,9 +154,9 @@ def test_a_disk_that_refuses_is_reported(site: Site, tmp_path: Path) -> None:
 def test_a_device_that_accepts_less_than_its_profile_states_keeps_its_limits(site: Site) -> None:
     site.profile = profile('tags:\n  x1..9: {at: "holding:0"}\n')
     site.limits = UnitLimits(read_registers=4)
-    known = learnt(site, [Span("holding", 0, 9)])
+    known = learnt(site, [CellSpan("holding", 0, 9)])
     assert (known.gaps, known.missing, known.line) == ([], [], "")
     assert known.borders
     assert site.exceptions >= 1
-    site.run(spans=[Span("holding", 0, 9)])
+    site.run(spans=[CellSpan("holding", 0, 9)])
     assert site.exceptions == 0

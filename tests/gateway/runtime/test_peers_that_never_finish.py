@@ -22,7 +22,7 @@ from support import eventually, run
 from test_gateway_modbus_bus import TWO_GROUPS, bank, config
 
 from fieldtwin.emulators.endpoints import bus_server
-from fieldtwin.emulators.endpoints.bus_hello import Hello
+from fieldtwin.emulators.endpoints.bus_hello import BusHello
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.tcp import TcpConnection
 from fieldtwin.gateway.core import control
@@ -40,8 +40,8 @@ from fieldtwin.gateway.protocols.canopen.sdo import (
     SdoDownload,
     SdoTransfer,
     SdoUpload,
-    Send,
-    Wait,
+    SendFrame,
+    WaitForFrame,
 )
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
@@ -386,7 +386,7 @@ def test_a_client_with_a_slow_hello_is_refused_and_the_bus_continues(monkeypatch
         server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=False)
         one, other = server.attach("one"), server.attach("other")
         hostile = await TcpConnection.open(Endpoint.parse(f"tcp://127.0.0.1:{server.bound.address[1]}"))
-        drip = asyncio.ensure_future(dripping(hostile.write, Hello(0).pack()[:23], 0.05))
+        drip = asyncio.ensure_future(dripping(hostile.write, BusHello(0).pack()[:23], 0.05))
         number = 0
         while not server.turned_away:
             number += 1
@@ -444,7 +444,7 @@ def test_an_sdo_transfer_that_drips_ends_within_its_limit(
         if isinstance(step, Failed):
             break
         step = made.feed(CanFrame(0x585, answer(frame.data)), now_ns)
-        assert isinstance(step, Send), step
+        assert isinstance(step, SendFrame), step
         frame = step.frame
     assert isinstance(step.error, ReplyTimeout)
     assert "not complete after" in str(step.error)
@@ -465,7 +465,7 @@ def test_a_block_upload_that_drips_ends_within_its_limit() -> None:
             break
         number, moved = number % 63 + 1, moved + 7
         step = made.feed(CanFrame(0x585, bytes([number]) + bytes(7)), now_ns)
-        assert isinstance(step, Send | Wait), step
+        assert isinstance(step, SendFrame | WaitForFrame), step
     assert isinstance(step.error, ReplyTimeout)
     assert now_ns <= WHOLE_TIMEOUTS * TIMEOUT + moved * WHOLE_NS_PER_BYTE
 
@@ -475,7 +475,7 @@ def test_an_object_of_known_length_is_not_read_beyond_it() -> None:
     made, now_ns = SdoUpload(5, 0x2000, 0, TIMEOUT, length=4), 0
     made.start(now_ns)
     step = made.feed(CanFrame(0x585, b"\x40" + MUX + bytes(4)), now_ns)
-    while isinstance(step, Send):
+    while isinstance(step, SendFrame):
         now_ns += NS // 20
         step = made.feed(CanFrame(0x585, segment(step.frame.data)), now_ns)
     assert isinstance(step, Failed)
@@ -488,7 +488,7 @@ def test_a_long_object_of_an_ordinary_node_is_read_whole() -> None:
     made.start(now_ns)
     step = made.feed(CanFrame(0x585, b"\x40" + MUX + bytes(4)), now_ns)
     for _ in range(2000):
-        assert isinstance(step, Send)
+        assert isinstance(step, SendFrame)
         now_ns += NS // 20
         assert made.expire(now_ns) is None
         step = made.feed(CanFrame(0x585, bytes([step.frame.data[0] & 0x10]) + bytes(7)), now_ns)

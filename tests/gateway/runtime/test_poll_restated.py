@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.runtime.buses.poll_schedule import SOONER, PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.poll_schedule import SOONER, PollSchedule, PollSlot, spread
 
 PERIODS = st.integers(50, 5000)
 
@@ -24,8 +24,8 @@ def times(schedule: PollSchedule, group: str, begin_ns: int, end_ns: int) -> lis
     return found
 
 
-def rate(period_ms: int, phase_ms: int = 0) -> Rate:
-    return Rate(period_ms * NS_PER_MS, phase_ms % period_ms * NS_PER_MS)
+def rate(period_ms: int, phase_ms: int = 0) -> PollSlot:
+    return PollSlot(period_ms * NS_PER_MS, phase_ms % period_ms * NS_PER_MS)
 
 
 @settings(max_examples=60)

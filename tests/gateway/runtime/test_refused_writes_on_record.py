@@ -14,7 +14,7 @@ from test_serve_writes import rig
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.outputs.refusals import KEPT, Cause, Refusals
+from fieldtwin.gateway.runtime.outputs.refusals import KEPT, RefusalCause, Refusals
 from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()
@@ -60,7 +60,7 @@ def test_an_output_that_waits_for_a_device_is_reported_once_and_written_when_it_
             r.writer.want("d.level", 9)
             await eventually(lambda: bool(r.writer.journal.since(0)))
             (told,) = r.writer.journal.since(0)
-            assert (told.cause, told.fault, told.count) == (Cause.AWAY, "", 1)
+            assert (told.cause, told.fault, told.count) == (RefusalCause.AWAY, "", 1)
             r.bus.field.plugged = True
             await eventually(lambda: r.cells.peek("holding", 0) == 9)
             await eventually(lambda: not told.standing)
@@ -76,7 +76,7 @@ def journal(path: Path) -> tuple[Refusals, AuditLog]:
 def test_a_program_that_asks_for_another_impossible_value_in_each_scan_floods_nothing(tmp_path: Path) -> None:
     kept, audit = journal(tmp_path / "a")
     for n in range(6000):  # a minute of scans
-        kept.note("d", "d.speed", 100.0 + n, Cause.LIMIT, "too fast", "plc", n * 10 * NS_PER_MS)
+        kept.note("d", "d.speed", 100.0 + n, RefusalCause.LIMIT, "too fast", "plc", n * 10 * NS_PER_MS)
     kept.flush()
     audit.close()
     lines = [json.loads(line) for line in (tmp_path / "a").read_text(encoding="ascii").splitlines()]
@@ -95,7 +95,7 @@ def test_a_program_that_asks_for_another_impossible_value_in_each_scan_floods_no
 def test_the_journal_keeps_the_newest_entries_and_counts_all(tmp_path: Path) -> None:
     kept, audit = journal(tmp_path / "a")
     for n in range(KEPT + 50):
-        kept.note("d", f"d.tag{n}", 1.0, Cause.LIMIT, "too fast", "plc", n * NS_PER_S)
+        kept.note("d", f"d.tag{n}", 1.0, RefusalCause.LIMIT, "too fast", "plc", n * NS_PER_S)
     audit.close()
     entries = kept.since(0)
     assert (len(entries), entries[0].number, entries[-1].number) == (KEPT, 51, KEPT + 50)
@@ -105,8 +105,8 @@ def test_the_journal_keeps_the_newest_entries_and_counts_all(tmp_path: Path) -> 
 def test_an_entry_whose_line_is_being_looked_up_delays_the_later_ones(tmp_path: Path) -> None:
     kept, audit = journal(tmp_path / "a")
     kept.looks_up = True
-    kept.note("d", "d.speed", 60.0, Cause.LIMIT, "too fast", "plc", 0)
-    kept.note("d", "d.level", 60.0, Cause.AWAY, "away", "10.0.0.1:5", 0)
+    kept.note("d", "d.speed", 60.0, RefusalCause.LIMIT, "too fast", "plc", 0)
+    kept.note("d", "d.level", 60.0, RefusalCause.AWAY, "away", "10.0.0.1:5", 0)
     assert kept.since(0) == []
     kept.placed(1, "pump", "pump.st:5")
     assert [(e.tag, e.place) for e in kept.since(0)] == [("d.speed", "pump.st:5"), ("d.level", "")]
@@ -115,6 +115,6 @@ def test_an_entry_whose_line_is_being_looked_up_delays_the_later_ones(tmp_path: 
 
 def test_a_full_disk_is_counted_and_the_write_is_refused_all_the_same() -> None:
     kept, audit = journal(Path("/dev/full"))
-    kept.note("d", "d.speed", 60.0, Cause.LIMIT, "too fast", "plc", 0)
+    kept.note("d", "d.speed", 60.0, RefusalCause.LIMIT, "too fast", "plc", 0)
     audit.close()
     assert (kept.unrecorded, len(kept.since(0))) == (1, 1)

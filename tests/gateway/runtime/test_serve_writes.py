@@ -12,7 +12,7 @@ import pytest
 from gateway_rig import FieldBus, RunningBus, profile, running_bus, unit
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.connections.tcp import TcpConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -52,7 +52,7 @@ class Rig:
 
 @asynccontextmanager
 async def rig(path: Path, *, allow_writes: bool = True, safe: float | None = None) -> AsyncIterator[Rig]:
-    cells = MapBank([Span("holding", 0, 2)])
+    cells = MapBank([CellSpan("holding", 0, 2)])
     p = profile(PROFILE)
 
     def make(tags: TagTable) -> list[RegisterDriver]:

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job
+from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
@@ -91,7 +91,7 @@ async def command(modems: ModemPair, payload: bytes) -> None:
         await eventually(lambda: r.bus.online(drivers[0]))
         drivers[0].consumer.observe(COMMAND(payload))
         done: list[object] = []
-        r.bus.submit(Job(drivers[0], drivers[0].send, done.append))
+        r.bus.submit(BusJob(drivers[0], drivers[0].send, done.append))
         await eventually(lambda: done == [None])
 
 

@@ -14,7 +14,7 @@ from st_bench import scan
 from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for, load_program
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.runner import TaskRunner
 
 MS = 1_000_000
 TEXT = """
@@ -34,7 +34,7 @@ END_PROGRAM
 """
 
 
-def plc(folder: Path, tasks: tuple[TaskSpec, ...], where: dict[str, str]) -> tuple[Runner, list[int]]:
+def plc(folder: Path, tasks: tuple[TaskSpec, ...], where: dict[str, str]) -> tuple[TaskRunner, list[int]]:
     (folder / "two.st").write_text(TEXT)
     programs = tuple(ProgramConfig(name, f"two.st:{name[0]}", task=task) for name, task in where.items())
     layout = image_for([p.bind((str(folder),)) for p in programs], {})
@@ -44,10 +44,10 @@ def plc(folder: Path, tasks: tuple[TaskSpec, ...], where: dict[str, str]) -> tup
     now = [0]
     image.writer(INPUTS).publish([], 0)
     config = PlcConfig("", layout.describe(), "", programs, python_path=(str(folder),), tasks=tasks)
-    return Runner(config, image, lambda: now[0]), now
+    return TaskRunner(config, image, lambda: now[0]), now
 
 
-def until(runner: Runner, now: list[int], ms: int) -> dict[str, Any]:
+def until(runner: TaskRunner, now: list[int], ms: int) -> dict[str, Any]:
     while runner.running and runner.deadline_ns <= ms * MS:
         now[0] = max(now[0], runner.deadline_ns)
         runner.run_once()

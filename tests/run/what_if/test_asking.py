@@ -17,9 +17,9 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.shadow.rules import load_planner, questions_of
 from fieldtwin.run.what_if.asked import objection
-from fieldtwin.run.what_if.asking import Asking, QuestionMessage, Subject
+from fieldtwin.run.what_if.asking import Asking, ForkSubject, QuestionMessage
 from fieldtwin.run.what_if.last_known import LastKnown
-from fieldtwin.twin.model.mape.execute import Bounds, Execute
+from fieldtwin.twin.model.mape.execute import CommandLimits, Execute
 from fieldtwin.twin.model.mape.messages import verdict
 from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question
 from fieldtwin.twin.model.model import DigitalModel
@@ -77,8 +77,8 @@ def test_a_twin_queries_in_a_separate_process_and_an_unanswered_command_is_refus
 
     async def main() -> tuple[list[str], list[bytes], list[int]]:
         told: list[int] = []
-        asking = Asking(Subject(OBSERVATORY), WallClock(), 30.0, on_ask=lambda c, q: told.append(c.data[-1]))
-        execute = Execute(DigitalModel(), WallClock(), bounds=Bounds(), what_if=asking, question=STAYS_ACTIVE)
+        asking = Asking(ForkSubject(OBSERVATORY), WallClock(), 30.0, on_ask=lambda c, q: told.append(c.data[-1]))
+        execute = Execute(DigitalModel(), WallClock(), bounds=CommandLimits(), what_if=asking, question=STAYS_ACTIVE)
         sent: list[bytes] = []
         execute.transmitter.emit = lambda command: sent.append(command.data)  # type: ignore[method-assign]
         with pytest.raises(UsageError, match=r"did you mean 'ctd\.pressure'"):
@@ -122,7 +122,7 @@ def test_nothing_is_forked_from_nothing() -> None:
             await asyncio.sleep(0)
 
     async def main() -> str | None:
-        asking = Asking(Subject(OBSERVATORY), Late())
+        asking = Asking(ForkSubject(OBSERVATORY), Late())
         async with Nursery() as nursery:
             nursery.start(asking.run(), "what if")
             asking.ask(encode_period(1), STAYS_ACTIVE)
@@ -195,7 +195,7 @@ def test_output_of_control_logic_is_not_an_answer_and_its_crash_is_reported(tmp_
     )
 
     async def main() -> str:
-        asking = Asking(Subject(load_system(str(tmp_path / "quiet.yaml"))), WallClock())
+        asking = Asking(ForkSubject(load_system(str(tmp_path / "quiet.yaml"))), WallClock())
         await asking.check([Question(1.0, ("modem.link_state == 1",))])
         (tmp_path / "dies").touch()
         with pytest.raises(Unreachable) as caught:

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.run.shadow.twin import Twinning
-from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.execute import CommandLimits
 from fieldtwin.twin.model.mape.messages import verdict
 from fieldtwin.twin.model.mape.plan import Plan, RulePlanner
 from fieldtwin.twin.model.model import DigitalModel
@@ -40,7 +40,7 @@ class Hands:
         raise AssertionError("nobody waits here")
 
 
-def gate(*, remote: bool = True, bounds: Bounds = Bounds(0, 3600, 5)) -> CommandGate:  # noqa: B008
+def gate(*, remote: bool = True, bounds: CommandLimits = CommandLimits(0, 3600, 5)) -> CommandGate:  # noqa: B008
     return CommandGate(remote=remote, bounds=bounds, clock=Hands())
 
 
@@ -63,7 +63,7 @@ def test_an_admitted_command_is_forwarded_bit_by_bit_and_recorded() -> None:
 
 def test_a_command_from_before_the_start_of_the_plants_log_is_not_obeyed() -> None:
     """A plant that lost its store does not know its earlier commands; its twin sends everything again."""
-    made = CommandGate(remote=True, bounds=Bounds(0, 3600, 5), clock=Hands(), since_ms=NOW_MS - 1000)
+    made = CommandGate(remote=True, bounds=CommandLimits(0, 3600, 5), clock=Hands(), since_ms=NOW_MS - 1000)
     assert made.admit("twin:1", number(1, t_ms=NOW_MS - 1001)) is None
     assert refusals(made) == [
         "number 1 of twin:1: it is from before this plant's log began, and may have been obeyed then"
@@ -73,7 +73,7 @@ def test_a_command_from_before_the_start_of_the_plants_log_is_not_obeyed() -> No
 
 @given(numbers=st.lists(st.integers(1, 8), max_size=30))
 def test_each_number_is_taken_once_and_never_after_a_later_one(numbers: list[int]) -> None:
-    made = gate(bounds=Bounds(per_minute=1000))
+    made = gate(bounds=CommandLimits(per_minute=1000))
     taken = [n for n in numbers if made.admit("twin:1", number(n)) is not None]
     assert taken == sorted(set(taken))
     assert len(refusals(made)) == len(numbers) - len(taken)
@@ -106,16 +106,16 @@ def test_the_rate_is_bounded_and_recovers() -> None:
 
 
 def test_switch_and_limits_may_change_and_earlier_commands_count() -> None:
-    made = gate(bounds=Bounds(0, 3600, 3))
+    made = gate(bounds=CommandLimits(0, 3600, 3))
     assert all(made.admit("t", number(n)) is not None for n in (1, 2))
-    made.restate(remote=False, bounds=Bounds(0, 3600, 3))
+    made.restate(remote=False, bounds=CommandLimits(0, 3600, 3))
     assert made.admit("t", number(3)) is None
-    made.restate(remote=True, bounds=Bounds(0, 60, 2))
+    made.restate(remote=True, bounds=CommandLimits(0, 60, 2))
     assert made.admit("t", number(4, 10)) is None
     assert [why.partition(": ")[2] for why in refusals(made)] == [
         "the plant is switched to local", "more than 2 commands in a minute",
     ]  # fmt: skip
-    made.restate(remote=True, bounds=Bounds(0, 60, 4))
+    made.restate(remote=True, bounds=CommandLimits(0, 60, 4))
     assert made.admit("t", number(5, 61)) is None
     assert [made.admit("t", number(n, 10)) is not None for n in (6, 7, 8)] == [True, True, False]
 

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.run.template import system_file
 from fieldtwin.twin.template import software
 from fieldtwin.twin.template.check import differences, examine, software_difference
-from fieldtwin.twin.template.pack import Extras
+from fieldtwin.twin.template.pack import TemplateExtras
 from fieldtwin.twin.template.package import Content, FolderPackage, ZipPackage, open_package
 from fieldtwin.twin.template.software import modules_hash, wheel_hash
 from fieldtwin.twin.template.template import MANIFEST
@@ -37,7 +37,7 @@ def good(dam: Path, tmp_path: Path) -> Path:
 def test_a_template_has_everything_that_its_system_names(dam: Path, tmp_path: Path) -> None:
     manual = tmp_path / "manual.pdf"
     manual.write_bytes(b"%PDF-")
-    manifest = packed(dam, tmp_path / "T.zip", Extras({"technical-manual": (manual,)}))
+    manifest = packed(dam, tmp_path / "T.zip", TemplateExtras({"technical-manual": (manual,)}))
     assert {(f.path, f.kind) for f in manifest.files} == {
         ("systems/dam.yaml", "system"), ("systems/dam.prototype.yaml", "prototype"), ("devices/tilt.yaml", "profile"),
         ("devices/tilt.eds", "eds"), ("systems/tilt.jsonl", "recording"), ("systems/logic/count.st", "program"),
@@ -110,7 +110,7 @@ def test_a_wheel_of_other_software_is_refused(dam: Path, tmp_path: Path) -> None
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("fieldtwin/twin/__init__.py", "")
     with pytest.raises(FileInvalid, match="different software from the running one"):
-        packed(dam, tmp_path / "T.zip", Extras(wheel=wheel))
+        packed(dam, tmp_path / "T.zip", TemplateExtras(wheel=wheel))
 
 
 def test_a_wheel_has_the_hash_of_the_installed_files(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Pa
             for path in (Path(parent, file) for file in files):
                 if path.suffix != ".pyc":
                     archive.write(path, path.relative_to(CHECKOUT).as_posix())
-    packed(dam, tmp_path / "T", Extras(wheel=wheel))
+    packed(dam, tmp_path / "T", TemplateExtras(wheel=wheel))
     manifest = FolderPackage(tmp_path / "T").manifest
     assert examine(tmp_path / "T", manifest).name == "dam"
     inside = tmp_path / "T" / manifest.software.wheel

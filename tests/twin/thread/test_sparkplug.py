@@ -13,10 +13,10 @@ from fieldtwin.gateway.core.errors import Desync, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind, Value
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from fieldtwin.twin.thread.sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, Message
+from fieldtwin.twin.thread.sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, MqttMessage
 from fieldtwin.twin.thread.sparkplug_payloads import (
-    DataType,
     Metric,
+    MetricType,
     Payload,
     decode_payload,
     encode_payload,
@@ -114,13 +114,13 @@ HELLO = Hello("plant:5f3a91c2", SCHEMA.id, 1, 9, True)
 
 
 def sides() -> tuple[EdgeNode, HostApplication]:
-    types = {"ctd.serial": DataType.STRING, "relay": DataType.INT64}
+    types = {"ctd.serial": MetricType.STRING, "relay": MetricType.INT64}
     return EdgeNode("plants", "observatory", "shore", SCHEMA, types, 3), HostApplication(
         "plants", "observatory", "shore"
     )
 
 
-def over(messages: list[Message], to: EdgeNode | HostApplication) -> list[Frame]:
+def over(messages: list[MqttMessage], to: EdgeNode | HostApplication) -> list[Frame]:
     frames = (to.frame(m.topic, m.payload) for m in messages if m.topic in to.subscriptions)
     return [frame for frame in frames if frame is not None]
 
@@ -194,7 +194,7 @@ def test_a_host_that_comes_online_is_informed_at_once() -> None:
     assert over(host.hello()[:1], edge) == [Ask(HELLO.tag)]
     assert over([host.will()], edge) == []
     for said in (b'{ "timestamp": 5, "online" : true }', b"ONLINE", b"\xff", b"[]", b'{"online": 1}'):
-        assert bool(over([Message("spBv1.0/STATE/shore", said)], edge)) is said.startswith(b"{ ")
+        assert bool(over([MqttMessage("spBv1.0/STATE/shore", said)], edge)) is said.startswith(b"{ ")
 
 
 def test_birth_and_death_of_a_host_have_the_time_of_its_session() -> None:
@@ -227,7 +227,7 @@ def test_missing_messages_are_counted() -> None:
 def test_third_party_commands_are_not_taken() -> None:
     edge, _ = sides()
     edge.messages(HELLO, 5)
-    write = encode_payload(Payload(5, (Metric("ctd.sample_period_s", None, 5, DataType.INT64, 1),)))
+    write = encode_payload(Payload(5, (Metric("ctd.sample_period_s", None, 5, MetricType.INT64, 1),)))
     assert edge.frame("spBv1.0/plants/NCMD/observatory", write) is None
     assert edge.not_taken == 1
 

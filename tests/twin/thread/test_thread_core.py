@@ -13,7 +13,7 @@ from thread_frames_rig import EVENTS, SCHEMA
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.store.event import Event, Kind, merged, without
-from fieldtwin.twin.thread.core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread.core import WINDOW, Effect, IncomingLogs, Keep, NoteLost, Open, OutgoingLog
 from fieldtwin.twin.thread.frames import (
     Ack,
     Ask,
@@ -56,8 +56,8 @@ class Side:
         self.codec = FrameCodec([SCHEMA], self.mtu)
         log = self.store.logs.get(self.origin, {})
         first, last = min(log, default=1), max(log, default=0)
-        self.out = Outgoing(self.origin, SCHEMA.id, first, last, prototype=True, fit=self.codec.fit)
-        self.into = Incoming(self.codec.knows, self.ack_delay_ms * NS_PER_MS)
+        self.out = OutgoingLog(self.origin, SCHEMA.id, first, last, prototype=True, fit=self.codec.fit)
+        self.into = IncomingLogs(self.codec.knows, self.ack_delay_ms * NS_PER_MS)
         self.out.connected(now_ns)
         self.pending: list[Effect] = []
         """Requested but unfinished operations of the store: lost when the side dies."""
@@ -316,7 +316,7 @@ def test_an_unknown_schema_is_reported_on_both_sides_and_nothing_is_lost_until_i
     net = Net(5)
     plant, shore = net.sides
     shore.codec = FrameCodec([], 64)
-    shore.into = Incoming(shore.codec.knows, 0)
+    shore.into = IncomingLogs(shore.codec.knows, 0)
     for n in range(20):
         plant.log(value(n))
     net.run(30)

@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.execute import CommandLimits
 from fieldtwin.twin.plant.command_gate import OLD_MS, CommandGate
 from fieldtwin.twin.thread import tcp as thread_tcp
 from fieldtwin.twin.thread.frames import Ack, Data, Frame, Hello, tag_of
@@ -239,7 +239,7 @@ def test_a_follower_that_drips_gives_its_place_up_to_an_honest_one(
 def test_a_command_with_a_time_far_ahead_is_refused_so_that_it_does_not_stay_young_for_ever() -> None:
     """The plant's age limit protects a plant whose store was lost; a forged time would defeat it."""
     now_ms = CLOCK.utc_ns() // 1_000_000
-    gate = CommandGate(remote=True, bounds=Bounds(), clock=CLOCK)
+    gate = CommandGate(remote=True, bounds=CommandLimits(), clock=CLOCK)
     ahead = Event(1, now_ms + OLD_MS + 60_000, Kind.COMMAND, "shore", bytes(2))
     assert gate.admit("twin:x", ahead) is None
     assert gate.admit("twin:x", Event(2, now_ms + 60_000, Kind.COMMAND, "shore", bytes(2))) is not None

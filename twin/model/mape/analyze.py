@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Desync
 from fieldtwin.gateway.core.values import DATA, Quality
 from fieldtwin.gateway.store.event import Kind
-from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding, SeenMeasurement, SeenStatus, verdict
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.status import decode_status
 from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
@@ -40,7 +40,7 @@ class Analyze(DTDigitalThreadProcess):
     def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
         super().__init__("analyze", clock)
         self.consumer: Consumer[DATA] = Consumer("monitored", CAPACITY)
-        self.emitter: Producer[Verdict] = Producer("analyzed")
+        self.emitter: Producer[AnalysisFinding] = Producer("analyzed")
         self.digital_model = model
         self.compared = self.equal = 0
         self.measurements = self.backfilled = 0

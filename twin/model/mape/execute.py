@@ -24,7 +24,7 @@ MINUTE_NS = 60 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class CommandLimits:
     """The limits of commands: periods from `least_s` to `most_s`, and the number of commands in any minute."""
 
     least_s: int = PERIOD_MIN
@@ -38,12 +38,12 @@ class CommandCheck:
     Plant and twin each have their own check: the plant does not rely on the twin that commands it.
     """
 
-    def __init__(self, bounds: Bounds, clock: Clock) -> None:
+    def __init__(self, bounds: CommandLimits, clock: Clock) -> None:
         self.bounds = bounds
         self._clock = clock
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
-    def restate(self, bounds: Bounds) -> None:
+    def restate(self, bounds: CommandLimits) -> None:
         """Use new bounds from now on. Commands that were taken before still count towards the rate."""
         if bounds != self.bounds:
             self.bounds = bounds
@@ -79,7 +79,7 @@ class Execute(DTDigitalThreadProcess):
         model: DigitalModel,
         clock: Clock,
         *,
-        bounds: Bounds,
+        bounds: CommandLimits,
         what_if: WhatIf | None = None,
         question: Question | None = None,
     ) -> None:

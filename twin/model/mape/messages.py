@@ -41,7 +41,7 @@ class SeenMeasurement(MEASUREMENT):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict(DATA):
+class AnalysisFinding(DATA):
     """A finding of an analysis about `subject`.
 
     `finding` is a key of `FINDINGS`, `text` a sentence, and `data` the text as UTF-8.
@@ -74,5 +74,5 @@ FINDINGS = {
 }
 
 
-def verdict(finding: str, subject: str, text: str, t_ms: int, *, again: bool = False) -> Verdict:
-    return Verdict(text.encode(), finding, subject, text, t_ms, again)
+def verdict(finding: str, subject: str, text: str, t_ms: int, *, again: bool = False) -> AnalysisFinding:
+    return AnalysisFinding(text.encode(), finding, subject, text, t_ms, again)

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.store.event import Kind
-from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
@@ -45,7 +45,7 @@ class Planner(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class PlanRule:
     """A rule: when `finding` is reported for `subject` (empty: for any subject), command `period_s`.
 
     `ask` is the question for a prototype before the command is sent. True stands for the twin's default question, if there is
@@ -68,11 +68,11 @@ class Rule:
 class RulePlanner:
     """A planner that applies the first rule that matches. A period that the model already has is not commanded again."""
 
-    def __init__(self, rules: Iterable[Rule]) -> None:
+    def __init__(self, rules: Iterable[PlanRule]) -> None:
         self.rules = tuple(rules)
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None:
-        if not isinstance(data, Verdict):
+        if not isinstance(data, AnalysisFinding):
             return None
         for rule in self.rules:
             if rule.finding == data.finding and rule.subject in ("", data.subject):
@@ -89,12 +89,12 @@ class Plan(DTDigitalThreadProcess):
 
     def __init__(self, model: DigitalModel, planner: Planner, clock: Clock) -> None:
         super().__init__("plan", clock)
-        self.consumer: Consumer[Verdict] = Consumer("analyzed", CAPACITY)
+        self.consumer: Consumer[AnalysisFinding] = Consumer("analyzed", CAPACITY)
         self.emitter: Producer[COMMAND] = Producer("planned")
         self.digital_model = model
         self.planned = self.too_old = self.overtaken = self.failed = 0
         self._planner = planner
-        self._waiting: deque[Verdict] = deque()
+        self._waiting: deque[AnalysisFinding] = deque()
 
     def take(self) -> None:
         """Consume findings. Findings older than `OLD_MS` are counted and dropped."""
@@ -109,7 +109,7 @@ class Plan(DTDigitalThreadProcess):
         """Keep only the newest waiting finding of each subject and property, so that no command is planned for an outdated
         finding.
         """
-        kept: dict[tuple[str, str], Verdict] = {}
+        kept: dict[tuple[str, str], AnalysisFinding] = {}
         for message in self._waiting:
             about = (message.subject, _ABOUT.get(message.finding, message.finding))
             self.overtaken += kept.pop(about, None) is not None  # and move the newer one to the end

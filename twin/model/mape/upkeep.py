@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.values import DATA
-from fieldtwin.twin.model.mape.messages import SeenMeasurement, Verdict
+from fieldtwin.twin.model.mape.messages import AnalysisFinding, SeenMeasurement
 from fieldtwin.twin.model.model import DigitalModel
 
 CAPACITY = 10_000
@@ -23,7 +23,7 @@ class Upkeep:
 
     def __init__(self, model: DigitalModel, measured: str, analyzed: str) -> None:
         self.measured: Consumer[DATA] = Consumer(measured, CAPACITY)
-        self.analyzed: Consumer[Verdict] = Consumer(analyzed, CAPACITY)
+        self.analyzed: Consumer[AnalysisFinding] = Consumer(analyzed, CAPACITY)
         self.digital_model = model
 
     def keep_up(self) -> None:

@@ -25,7 +25,7 @@ from fieldtwin.conformance.clients.canopen.checks import (
     waits_for_each,
 )
 from fieldtwin.conformance.clients.canopen.setup import CanopenCase, SdoReplyFunction
-from fieldtwin.conformance.core.case import OWN, Basis, Case, CheckFunction, Impact
+from fieldtwin.conformance.core.case import OWN, Basis, CheckFunction, ClientCase, Impact
 
 REQUIRED, ROBUST, FIELD = Basis.STANDARD, Basis.ROBUSTNESS, Basis.FIELD
 READ, CUT, LOOK = Impact.READ, Impact.DISRUPT, Impact.OBSERVE
@@ -42,7 +42,7 @@ def _case(
     does: str,
     must: str,
 ) -> CanopenCase:
-    return CanopenCase(Case(id, title, clause, danger, does, must, judge, basis=basis), play)
+    return CanopenCase(ClientCase(id, title, clause, danger, does, must, judge, basis=basis), play)
 
 
 def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction, must: str) -> CanopenCase:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from fieldtwin.conformance.core.case import TRAIL_S, Case
+from fieldtwin.conformance.core.case import TRAIL_S, ClientCase
 from fieldtwin.gateway.core.canframe import CanFrame
 
 SDO_REPLY = 0x580
@@ -67,7 +67,7 @@ class CanopenCase:
     delay of its next heartbeat.
     """
 
-    about: Case
+    about: ClientCase
     play: SdoReplyFunction
     wants: CanWants = "upload"
     strikes: int = 2

@@ -21,7 +21,7 @@ from fieldtwin.conformance.clients.habits import (
 from fieldtwin.conformance.clients.modbus import line_replies as line_plays
 from fieldtwin.conformance.clients.modbus import tcp_replies as tcp_plays
 from fieldtwin.conformance.clients.modbus.setup import ModbusCase, ReplyFunction
-from fieldtwin.conformance.core.case import OWN, Basis, Case, CheckFunction, Impact
+from fieldtwin.conformance.core.case import OWN, Basis, CheckFunction, ClientCase, Impact
 
 REQUIRED, ROBUST, FIELD = Basis.STANDARD, Basis.ROBUSTNESS, Basis.FIELD
 READ, WRITE, CUT, LOOK = Impact.READ, Impact.WRITE, Impact.DISRUPT, Impact.OBSERVE
@@ -39,7 +39,7 @@ def _case(
     does: str,
     must: str,
 ) -> ModbusCase:
-    return ModbusCase(Case(id, title, clause, danger, does, must, judge, basis=basis), play)
+    return ModbusCase(ClientCase(id, title, clause, danger, does, must, judge, basis=basis), play)
 
 
 def _bad(

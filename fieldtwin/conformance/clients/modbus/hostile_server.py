@@ -18,9 +18,9 @@ from fieldtwin.conformance.clients.modbus.device import (
     ModbusWire,
     RtuWire,
 )
-from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, ModbusCase, Move, RequestContext, Say, Unplug
+from fieldtwin.conformance.clients.modbus.setup import Deaf, HangUp, ModbusCase, Move, RequestContext, Say, Unplug
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.observation import Came, Garbled, Left, ReplySent, RequestSeen, Word
+from fieldtwin.conformance.core.observation import Garbled, Left, ObservedConnection, ReplySent, RequestSeen, Word
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
@@ -81,7 +81,7 @@ class HostileServer:
         self.clients += 1
         number, wire = self.clients, self._make_wire()
         client = _Client(self, connection, wire, number)
-        self.note(Came(self.now_ns(), number, plugged_in_again))
+        self.note(ObservedConnection(self.now_ns(), number, plugged_in_again))
         try:
             async with Nursery() as nursery:
                 client.nursery = nursery
@@ -91,7 +91,7 @@ class HostileServer:
         finally:
             self.note(Left(self.now_ns(), number, client.hung_up))
 
-    def note(self, event: RequestSeen | ReplySent | Garbled | Came | Left) -> None:
+    def note(self, event: RequestSeen | ReplySent | Garbled | ObservedConnection | Left) -> None:
         self.recorder.add(event)
         self.on_event()
 
@@ -202,7 +202,7 @@ class _Client:
             self.hung_up = True
             self._stage.unplug(move)
             return
-        if isinstance(move, Hang):
+        if isinstance(move, HangUp):
             self._stage.last_ns = now_ns
             self.hung_up = True
             await _hang_up(self._connection, reset=move.reset)

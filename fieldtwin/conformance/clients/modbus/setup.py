@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from fieldtwin.conformance.clients.modbus.device import ModbusWire
-from fieldtwin.conformance.core.case import TRAIL_S, Basis, Case, Elsewhere
+from fieldtwin.conformance.core.case import TRAIL_S, Basis, ClientCase, Elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Say:
 
 
 @dataclass(frozen=True, slots=True)
-class Hang:
+class HangUp:
     """Close the connection, by a reset if the transport has one."""
 
     after_s: float = 0.0
@@ -43,7 +43,7 @@ class Unplug:
     after_s: float = 0.0
 
 
-Move = Say | Hang | Deaf | Unplug
+Move = Say | HangUp | Deaf | Unplug
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class ModbusCase:
     the recovery.
     """
 
-    about: Case
+    about: ClientCase
     play: ReplyFunction
     wants: Wants = "register read"
     strikes: int = 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.clients.modbus.device import mbap
-from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, Move, ReplyFunction, RequestContext, Say
+from fieldtwin.conformance.clients.modbus.setup import Deaf, HangUp, Move, ReplyFunction, RequestContext, Say
 
 BYTE_S = 0.002
 
@@ -43,11 +43,11 @@ def other_tag_first(scene: RequestContext) -> list[Move]:
 
 def reset(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
-    return [Say(frame[: len(frame) // 2]), Hang(0.005, reset=True)]
+    return [Say(frame[: len(frame) // 2]), HangUp(0.005, reset=True)]
 
 
 def hang_up(scene: RequestContext) -> list[Move]:
-    return [Hang()]
+    return [HangUp()]
 
 
 def half_open(scene: RequestContext) -> list[Move]:
@@ -56,4 +56,4 @@ def half_open(scene: RequestContext) -> list[Move]:
 
 def closed_while_unused(scene: RequestContext) -> list[Move]:
     """Answer, and then close the connection while the master is idle."""
-    return [scene.good(), Hang(0.050)]
+    return [scene.good(), HangUp(0.050)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.core.case import Finding, failed, passed
-from fieldtwin.conformance.devices.canopen.connection import Key, NodeConnection, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere
 from fieldtwin.gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
 
 
-def aborted(reply: Reply, *codes: int) -> str:
+def aborted(reply: SdoReply, *codes: int) -> str:
     """Return an empty string if `reply` is an abort with one of `codes`, else a description of the difference."""
     if reply.abort and reply.abort in codes:
         return ""
@@ -48,11 +48,11 @@ async def begin_upload(wire: NodeConnection, key: Key) -> None:
 async def present(wire: NodeConnection, key: Key) -> bytes:
     """Return the object's value. Raises `NotHere` if the object cannot be read."""
     value = await wire.upload(key)
-    if isinstance(value, Reply):
+    if isinstance(value, SdoReply):
         raise NotHere(f"{shown(key)}: {value}")
     return value
 
 
-def lacks(reply: Reply) -> bool:
+def lacks(reply: SdoReply) -> bool:
     """Return whether an abort means that the node has no such service."""
     return reply.abort in (UNKNOWN_SPECIFIER, 0x0601_0000, 0x0800_0000)

@@ -40,7 +40,7 @@ def shown(key: Key) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class SdoReply:
     """The reply of the node's SDO server: `data` is the frame's, empty for silence."""
 
     data: bytes = b""
@@ -167,22 +167,22 @@ class NodeConnection:
         """Send an SDO frame to the server; short ones unchanged."""
         await self.send(CanFrame(SDO_REQUEST + self.node, data), at_once=at_once)
 
-    async def ask(self, data: bytes, within_s: float | None = None) -> Reply:
+    async def ask(self, data: bytes, within_s: float | None = None) -> SdoReply:
         """Send an SDO request, padded to 8 bytes, and return the reply."""
         self.forget()
         await self.tell(data.ljust(8, b"\0"))
         return await self.reply(within_s)
 
-    async def reply(self, within_s: float | None = None) -> Reply:
+    async def reply(self, within_s: float | None = None) -> SdoReply:
         """Return the next frame of the server."""
         frame = await self.hear(SDO_REPLY + self.node, within_s)
-        return Reply(frame.data if frame is not None else b"")
+        return SdoReply(frame.data if frame is not None else b"")
 
     async def abandon(self, key: Key, code: int = 0x0800_0000) -> None:
         """Send the client's abort, which ends a transfer and is not answered."""
         await self.tell(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
-    async def upload(self, key: Key) -> bytes | Reply:
+    async def upload(self, key: Key) -> bytes | SdoReply:
         """Return the value by an ordinary upload, or the reply that ended a failed upload."""
         reply = await self.ask(b"\x40" + mux(*key))
         if reply.specifier != 2 or reply.data[1:4] != mux(*key):
@@ -202,7 +202,7 @@ class NodeConnection:
         await self.abandon(key)
         return value
 
-    async def download(self, key: Key, value: bytes) -> Reply:
+    async def download(self, key: Key, value: bytes) -> SdoReply:
         """Make an ordinary download; return the last reply."""
         if 0 < len(value) <= 4:
             return await self.ask(bytes((0x23 | (4 - len(value)) << 2,)) + mux(*key) + value)
@@ -240,7 +240,7 @@ class NodeConnection:
         found = await self.upload((0x1000, 0))
         if found == self.device_type:
             return ""
-        return str(found) if isinstance(found, Reply) else f"1000h is {found.hex(' ').upper()}"
+        return str(found) if isinstance(found, SdoReply) else f"1000h is {found.hex(' ').upper()}"
 
     async def settle(self) -> bool:
         """End any open transfer, and return whether the node answers normally."""

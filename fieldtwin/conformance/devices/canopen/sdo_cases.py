@@ -12,7 +12,7 @@ from fieldtwin.conformance.devices.canopen.checks import (
     present,
     verdict,
 )
-from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
@@ -70,10 +70,10 @@ async def begun_anew(wire: NodeConnection) -> Finding:
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
     found = await wire.upload((0x1000, 0))
-    if isinstance(found, Reply) and found.abort:
+    if isinstance(found, SdoReply) and found.abort:
         return await verdict(wire, "", f"{found}, then normal service")
     if found != wire.device_type:
-        said = str(found) if isinstance(found, Reply) else found.hex(" ").upper()
+        said = str(found) if isinstance(found, SdoReply) else found.hex(" ").upper()
         return failed(f"{said} instead of 1000h")
     return await verdict(wire, "")
 
@@ -116,7 +116,7 @@ async def subindex_beyond(wire: NodeConnection) -> Finding:
 async def empty_history(wire: NodeConnection) -> Finding:
     """CO-012: the first entry of an error history that is empty."""
     count = await wire.upload((0x1003, 0))
-    if isinstance(count, Reply):
+    if isinstance(count, SdoReply):
         raise NotHere(f"it has no error history, 1003h: {count}")
     if count != b"\0":
         raise NotHere(f"its error history holds {count[0]} errors")
@@ -144,7 +144,7 @@ async def extended_identifier(wire: NodeConnection) -> Finding:
 # -- block upload (7.2.4.3.13 to 15) ---------------------------------------------------------------------------------
 
 
-async def _begin_block(wire: NodeConnection, key: Key, size: int, switch: int = 0) -> Reply:
+async def _begin_block(wire: NodeConnection, key: Key, size: int, switch: int = 0) -> SdoReply:
     return await wire.ask(b"\xa4" + mux(*key) + bytes((size, switch)))
 
 
@@ -234,7 +234,7 @@ async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool
     return b"", "no end"
 
 
-async def _block_end(wire: NodeConnection, value: bytes, begun: Reply) -> tuple[bytes, str]:
+async def _block_end(wire: NodeConnection, value: bytes, begun: SdoReply) -> tuple[bytes, str]:
     end = await wire.reply()
     if end.specifier != 6 or end.data[0] & 3 != 1:
         return b"", f"{end} instead of the end"

@@ -9,7 +9,7 @@ from pathlib import Path
 from fieldtwin.commissioning.access.connection import frames_at
 from fieldtwin.conformance.core.case import CasePlan
 from fieldtwin.conformance.devices.canopen.cases import CASES
-from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, Reply
+from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, SdoReply
 from fieldtwin.conformance.devices.checked import Checked, shown
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.run import Transcript, play
@@ -99,12 +99,12 @@ async def check_canopen(
 
 async def learn(wire: NodeConnection) -> dict[str, str]:
     """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
-    found: bytes | Reply = Reply()
+    found: bytes | SdoReply = SdoReply()
     for _ in range(2):  # a single loss may be a lost frame
         found = await wire.upload((0x1000, 0))
         if isinstance(found, bytes):
             break
-    if isinstance(found, Reply):
+    if isinstance(found, SdoReply):
         if found.abort:
             raise Unreachable(f"node {wire.node} has no 1000h: {found}", hint="every CANopen node has one (7.5.2.1)")
         stopped = "; its heartbeat reports STOPPED: start it first" if wire.state == 0x04 else ""

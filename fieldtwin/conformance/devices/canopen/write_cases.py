@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 
 from fieldtwin.conformance.core.case import Finding, Impact
 from fieldtwin.conformance.devices.canopen.checks import aborted, must_abort, present, verdict
-from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, Key, NodeConnection, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.gateway.protocols.canopen.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
@@ -76,9 +76,9 @@ async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
     raise NotHere(f"needs an object of more than 14 bytes by --write: {', '.join(why_not)}")
 
 
-def _instead(key: Key, value: bytes | Reply) -> str:
+def _instead(key: Key, value: bytes | SdoReply) -> str:
     """Describe a given object that a case cannot use."""
-    if isinstance(value, Reply):
+    if isinstance(value, SdoReply):
         return f"{shown(key)} could not be read ({value})"
     return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
 
@@ -103,14 +103,14 @@ async def segment_alone(wire: NodeConnection) -> Finding:
 
 async def history_set(wire: NodeConnection) -> Finding:
     """CO-011: 1003h:00 can only be cleared."""
-    if isinstance(there := await wire.upload((0x1003, 0)), Reply):
+    if isinstance(there := await wire.upload((0x1003, 0)), SdoReply):
         raise NotHere(f"it has no error history, 1003h: {there}")
     return await must_abort(wire, b"\x2f" + mux(0x1003) + b"\x01", 0x0609_0030, 0x0800_0000)
 
 
 async def store_signature(wire: NodeConnection) -> Finding:
     """CO-031: write an invalid signature to 1010h."""
-    if isinstance(there := await wire.upload((0x1010, 1)), Reply):
+    if isinstance(there := await wire.upload((0x1010, 1)), SdoReply):
         raise NotHere(f"it stores no parameters, 1010h: {there}")
     return await must_abort(wire, b"\x23" + mux(0x1010, 1) + b"none", 0x0800_0020, 0x0800_0022)
 
@@ -208,7 +208,7 @@ async def toggle_repeated(wire: NodeConnection) -> Finding:
 # -- block download (7.2.4.3.9 to 11) ----------------------------------------------------------------------------------
 
 
-async def _begin_block(wire: NodeConnection, key: Key, size: int) -> Reply:
+async def _begin_block(wire: NodeConnection, key: Key, size: int) -> SdoReply:
     reply = await wire.ask(b"\xc6" + mux(*key) + size.to_bytes(4, "little"))
     if reply.specifier != 5 or not 1 <= reply.data[4] <= 127:
         raise NotHere(f"it has no block download: {reply}")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere
 from fieldtwin.conformance.devices.modbus.connection import DeviceConnection, Received
-from fieldtwin.conformance.devices.modbus.frames import Answer
+from fieldtwin.conformance.devices.modbus.frames import ReceivedReply
 
 NAMES = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure", 6: "busy"}
 
@@ -17,7 +17,7 @@ def named(code: int) -> str:
     return f"exception {code:02X}" + (f" ({NAMES[code]})" if code in NAMES else "")
 
 
-def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
+def refused(pdu: bytes, answer: ReceivedReply, *codes: int) -> str:
     """Return an empty string if `answer` refuses the request `pdu` with one of `codes`, else a description."""
     wanted = " or ".join(f"{code:02X}" for code in codes)
     if answer.refusal and answer.pdu[0] != pdu[0] | 0x80:

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from fieldtwin.conformance.core.case import Impact
-from fieldtwin.conformance.devices.modbus.frames import Answer, framed, replies, short
+from fieldtwin.conformance.devices.modbus.frames import ReceivedReply, framed, replies, short
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, Unreachable
@@ -39,12 +39,12 @@ Open = Callable[[], Awaitable[ByteConnection]]
 class Received:
     """The received data: whole replies, other bytes, and whether the device closed the connection."""
 
-    answers: tuple[Answer, ...]
+    answers: tuple[ReceivedReply, ...]
     rest: bytes = b""
     closed: bool = False
 
     @property
-    def first(self) -> Answer | None:
+    def first(self) -> ReceivedReply | None:
         return self.answers[0] if self.answers else None
 
     @property
@@ -218,7 +218,7 @@ class DeviceConnection:
 
     # -- normal behaviour -----------------------------------------------------------------------------------------
 
-    def is_good(self, answer: Answer | None) -> bool:
+    def is_good(self, answer: ReceivedReply | None) -> bool:
         """Return whether an answer is the unit's reply to `good`, of the usual shape; the values may have changed."""
         if answer is None or answer.unit != self.unit:
             return False

@@ -20,7 +20,7 @@ _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ReceivedReply:
     """A whole reply. `transaction` is `NO_TRANSACTION` on a line."""
 
     unit: int
@@ -65,7 +65,7 @@ def mbap(body: bytes, transaction: int, protocol: int = 0, length: int | None = 
     return transaction.to_bytes(2) + protocol.to_bytes(2) + said.to_bytes(2) + body
 
 
-def replies(framing: str, data: bytes) -> tuple[list[Answer], bytes]:
+def replies(framing: str, data: bytes) -> tuple[list[ReceivedReply], bytes]:
     """Return all whole replies in `data`, in order, and the bytes that form no reply or an incomplete one."""
     if framing == "rtu":
         return _rtu_replies(data)
@@ -74,14 +74,14 @@ def replies(framing: str, data: bytes) -> tuple[list[Answer], bytes]:
     return _mbap_replies(data)
 
 
-def _rtu_replies(data: bytes) -> tuple[list[Answer], bytes]:
-    answers: list[Answer] = []
+def _rtu_replies(data: bytes) -> tuple[list[ReceivedReply], bytes]:
+    answers: list[ReceivedReply] = []
     rest = bytearray()
     at = 0
     while at < len(data):
         length = _rtu_length(data[at : at + MAX_FRAME])
         if length:
-            answers.append(Answer(data[at], data[at + 1 : at + length - 2]))
+            answers.append(ReceivedReply(data[at], data[at + 1 : at + length - 2]))
             at += length
         else:
             rest.append(data[at])
@@ -106,8 +106,8 @@ def _rtu_length(data: bytes) -> int:
     return likely[0] if likely else min(fitting, default=0)
 
 
-def _ascii_replies(data: bytes) -> tuple[list[Answer], bytes]:
-    answers: list[Answer] = []
+def _ascii_replies(data: bytes) -> tuple[list[ReceivedReply], bytes]:
+    answers: list[ReceivedReply] = []
     rest, at = bytearray(), 0
     for match in _ASCII_FRAME.finditer(data):
         text = match[1]
@@ -115,18 +115,18 @@ def _ascii_replies(data: bytes) -> tuple[list[Answer], bytes]:
         if len(body) < 3 or lrc(body[:-1]) != body[-1]:
             continue
         rest += data[at : match.start()]
-        answers.append(Answer(body[0], body[1:-1]))
+        answers.append(ReceivedReply(body[0], body[1:-1]))
         at = match.end()
     return answers, bytes(rest + data[at:])
 
 
-def _mbap_replies(data: bytes) -> tuple[list[Answer], bytes]:
-    answers: list[Answer] = []
+def _mbap_replies(data: bytes) -> tuple[list[ReceivedReply], bytes]:
+    answers: list[ReceivedReply] = []
     at = 0
     while len(data) - at >= 8:
         protocol, length = int.from_bytes(data[at + 2 : at + 4]), int.from_bytes(data[at + 4 : at + 6])
         if protocol or not 2 <= length <= 254 or len(data) - at < 6 + length:
             break
-        answers.append(Answer(data[at + 6], data[at + 7 : at + 6 + length], int.from_bytes(data[at : at + 2])))
+        answers.append(ReceivedReply(data[at + 6], data[at + 7 : at + 6 + length], int.from_bytes(data[at : at + 2])))
         at += 6 + length
     return answers, data[at:]

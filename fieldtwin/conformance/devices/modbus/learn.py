@@ -7,7 +7,7 @@ missing device.
 from __future__ import annotations
 
 from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, DeviceConnection
-from fieldtwin.conformance.devices.modbus.frames import Answer
+from fieldtwin.conformance.devices.modbus.frames import ReceivedReply
 from fieldtwin.gateway.core.errors import Unreachable
 
 FUNCTION = {"coil": 0x01, "discrete": 0x02, "holding": 0x03, "input": 0x04}
@@ -23,7 +23,7 @@ def read_of(function: int, address: int, count: int) -> bytes:
     return bytes((function,)) + address.to_bytes(2) + count.to_bytes(2)
 
 
-def values_of(answer: Answer | None, function: int, count: int) -> bytes | None:
+def values_of(answer: ReceivedReply | None, function: int, count: int) -> bytes | None:
     """Return the data of a whole reply to such a read, or None for any other reply."""
     size = 2 * count if function in (0x03, 0x04) else (count + 7) // 8
     if answer is None or answer.pdu[:2] != bytes((function, size)) or len(answer.pdu) != 2 + size:

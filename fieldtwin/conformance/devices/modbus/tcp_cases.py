@@ -9,7 +9,7 @@ from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere
 from fieldtwin.conformance.devices.modbus.checks import answers_good, named
 from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, DeviceConnection
-from fieldtwin.conformance.devices.modbus.frames import Answer, mbap
+from fieldtwin.conformance.devices.modbus.frames import ReceivedReply, mbap
 from fieldtwin.gateway.core.errors import Unreachable
 
 
@@ -130,7 +130,7 @@ async def transaction_twice(wire: DeviceConnection) -> Finding:
     return passed()
 
 
-def _told(answer: Answer | None) -> str:
+def _told(answer: ReceivedReply | None) -> str:
     return "silence" if answer is None else f"{answer} with id {answer.transaction}"
 
 

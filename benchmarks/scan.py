@@ -31,7 +31,7 @@ DEVICE = f"""
 import asyncio, sys
 from pathlib import Path
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.bank import MapBank, CellSpan
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -40,7 +40,7 @@ from fieldtwin.gateway.wallclock import WallClock, run
 
 async def main():
     end = await PtyEnd.open(Path(sys.argv[1]), Endpoint.parse("pty:x"), SerialSettings(9600, "8N1"))
-    slave = RtuSlave({{n: ModbusUnit(MapBank([Span("holding", 0, 10)])) for n in {PRESENT}}})
+    slave = RtuSlave({{n: ModbusUnit(MapBank([CellSpan("holding", 0, 10)])) for n in {PRESENT}}})
     print("ready", flush=True)
     await serve_rtu(end, slave, WallClock(), {LATENCY_S})
 

@@ -87,7 +87,8 @@ def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     )
     (tmp_path / "wrong_relay.py").write_text(
         "from fieldtwin.plc.relay_proof import RelayWithHistory\n\n\nclass Wrong(RelayWithHistory):\n"
-        "    def execute(self, scan):\n        super().execute(scan)\n        if self.period_s < 0 and self.commands == 2:\n            self.state = 1\n"
+        "    def execute(self, scan):\n        super().execute(scan)\n"
+        "        if self.period_s < 0 and self.commands == 2:\n            self.state = 1\n"
     )
     (tmp_path / "wrong_relay_proof.py").write_text(
         "from dataclasses import replace\n\nfrom fieldtwin.plc.relay_proof import PROOF as RIGHT\n"

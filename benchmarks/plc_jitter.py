@@ -100,7 +100,7 @@ def cyclictest(cycle_ms: int, seconds: float, fifo: bool) -> Lateness:
 def asked(path: Path) -> dict[str, Any]:
     with socket.socket(socket.AF_UNIX) as s:
         s.connect(str(path))
-        s.sendall(b'{"v": 1, "id": 1, "verb": "get", "args": {}}\n')
+        s.sendall(b'{"v": 1, "id": 1, "command": "get", "args": {}}\n')
         with s.makefile("rb") as lines:
             found: dict[str, Any] = json.loads(lines.readline())["result"]
     return found

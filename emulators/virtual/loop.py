@@ -113,7 +113,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._set_timer(when_ns, future)
         return future
 
-    def alarm(self, delay_s: float) -> asyncio.Future[None]:
+    def timer(self, delay_s: float) -> asyncio.Future[None]:
         """Return a future that is done after a delay in seconds, see `fieldtwin.gateway.core.concurrency.timeout`.
 
         The caller may set the future earlier.

@@ -33,13 +33,13 @@ def to_nowhere(*numbers: int) -> None:
     os.close(nowhere)
 
 
-def talk_unheard() -> None:
+def survive_broken_stderr() -> None:
     """Continue without stderr when its reader goes away."""
     if (wrapped := _wrapped(sys.stderr, 2)) is not None:
         sys.stderr = wrapped
 
 
-def verdict_unheard() -> None:
+def survive_broken_stdout() -> None:
     """Continue without stdout when its reader goes away: the exit code carries the verdict."""
     if (wrapped := _wrapped(sys.stdout, 1)) is not None:
         sys.stdout = wrapped

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import click
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.broken_pipe import VERDICTS, talk_unheard, to_nowhere, verdict_unheard
+from fieldtwin.cli.broken_pipe import VERDICTS, survive_broken_stderr, survive_broken_stdout, to_nowhere
 from fieldtwin.gateway.core.files.nearest import nearest
 
 COMMANDS = {
@@ -31,7 +31,7 @@ COMMANDS = {
         "fieldtwin.cli.run.plc_command",
         "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
     ),
-    "shore": (
+    "topside": (
         "fieldtwin.cli.run.topside_command",
         "The topside controller of a system's modem: send commands, show responses.",
     ),
@@ -119,7 +119,7 @@ COMMANDS = {
 SECTIONS = {
     "Run a system, or parts of it": (
         *("run", "simulate", "reload", "emulate", "with", "plc"),
-        *("shore", "link", "bridge", "can-bus", "draw"),
+        *("topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
@@ -130,6 +130,7 @@ SECTIONS = {
     "Help and setup": ("explain", "doctor", "schema", "completion", "test-host"),
 }
 """The order of commands in `--help`; each command is in one section."""
+RENAMED = {"shore": "topside"}
 INTERRUPTED = 130
 BUG = 70
 HOST_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM)
@@ -167,11 +168,13 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest similar command names: click suggests only options."""
+        if args[0] in RENAMED:
+            raise click.UsageError(f"{args[0]!r} is now called {RENAMED[args[0]]!r}", ctx)
         near = nearest(args[0], COMMANDS)
         if args[0] not in COMMANDS and near:
             raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near[0]!r}?", ctx)
         if args[0] in VERDICTS:
-            verdict_unheard()
+            survive_broken_stdout()
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -202,7 +205,7 @@ def main() -> None:
     from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
     write_plainly()
-    talk_unheard()
+    survive_broken_stderr()
     signal.signal(signal.SIGTERM, _told_to_end)
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)

@@ -13,7 +13,7 @@ from fieldtwin.explain.explanation import Explanation
 
 _LISTS: tuple[tuple[str, str, Sequence[About]], ...] = (
     ("modbus", "a Modbus device", MODBUS_DEVICES),
-    ("modbus-master", "a Modbus client", [case.about for case in MODBUS_CLIENTS]),
+    ("modbus-client", "a Modbus client", [case.about for case in MODBUS_CLIENTS]),
     ("canopen", "a CANopen node", CANOPEN_DEVICES),
     ("canopen-master", "a CANopen master", [case.about for case in CANOPEN_MASTERS]),
 )
@@ -63,7 +63,7 @@ def _entries() -> Iterable[Explanation]:
         yield Explanation(
             id, "test case", of[0][2].title, " ".join(meaning),
             f"Repeat it alone with {run}; the report and `--json` have its frames. It has the impact level "
-            f"`{of[0][2].danger.value}`.",
+            f"`{of[0][2].impact.value}`.",
             sources, (row,) if row != id else (),
         )  # fmt: skip
 

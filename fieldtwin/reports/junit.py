@@ -78,7 +78,7 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
         time=f"{scenario.took_s:.3f}",
     )  # fmt: skip
     facts = [
-        (name, value) for name in ("case", "role", "danger", "basis", "clause") if (value := getattr(scenario, name))
+        (name, value) for name in ("case", "role", "impact", "basis", "clause") if (value := getattr(scenario, name))
     ]
     if scenario.file:  # not an attribute, for which Jenkins' xUnit plugin skips the file
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))

@@ -103,7 +103,7 @@ class AccessCounts:
 class ScenarioResult:
     """One scenario against one target with one seed.
 
-    `case` is its id, `role` the role under test (controller, master, device), `danger` its impact level (observe, read,
+    `case` is its id, `role` the role under test (controller, master, device), `impact` its impact level (observe, read,
     write, disrupt), `basis` the reason for a conformance case (standard, robustness, field problem), `clause` its
     source.
 
@@ -134,7 +134,7 @@ class ScenarioResult:
     """The reasons of the attempts before this one, each of which was INCONCLUSIVE (`--retry-inconclusive`)."""
     case: str = ""
     role: str = ""
-    danger: str = ""
+    impact: str = ""
     basis: str = ""
     clause: str = ""
     faults: Sequence[Struck] = ()

@@ -21,7 +21,7 @@ VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
 class ScenarioOutcome:
     """The result of a scenario.
 
-    `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its ID, `role` the tested part, `danger` its
+    `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its ID, `role` the tested part, `impact` its
     impact level (observe, read, write, disrupt). `checks` are its steps and checks, in the form of `fieldtwin test
     --json`. `on_the_wire` are the exchanges before the failed check, as lines with a heading.
     """
@@ -38,7 +38,7 @@ class ScenarioOutcome:
     trace: str = ""
     case: str = ""
     role: str = ""
-    danger: str = ""
+    impact: str = ""
     on_the_wire: tuple[str, ...] = ()
 
     @property

@@ -52,7 +52,7 @@ class Results:
             "reproduce": shlex.join(["pytest", report.nodeid]),
             "file": file,
             "line": (line or 0) + 1,
-            **{name: str(facts.get(name, "")) for name in ("case", "role", "danger")},
+            **{name: str(facts.get(name, "")) for name in ("case", "role", "impact")},
         }
 
     def pytest_sessionfinish(self) -> None:

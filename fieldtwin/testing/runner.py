@@ -53,31 +53,31 @@ class WorkerProcess:
         self._lock = threading.Lock()
         self._number = 0
 
-    def call(self, verb: str, **args: Any) -> Any:
-        """Execute the command `verb` and return its result. Raises `FieldtwinRefused` or `FieldtwinUnavailable`."""
+    def call(self, command: str, **args: Any) -> Any:
+        """Execute the command `command` and return its result. Raises `FieldtwinRefused` or `FieldtwinUnavailable`."""
         __tracebackhide__ = True
         with self._lock:
             process = self._started()
             self._number += 1
-            request = {"v": 1, "id": self._number, "verb": verb, "args": args}
+            request = {"v": 1, "id": self._number, "command": command, "args": args}
             assert process.stdin is not None
             try:
                 process.stdin.write(json.dumps(request) + "\n")
                 process.stdin.flush()
             except OSError:
                 raise self._gone() from None
-            answer = self._answer(self._number, verb)
+            answer = self._answer(self._number, command)
         if answer.get("ok"):
             return answer.get("result")
         error = answer.get("error") or {}
         raise FieldtwinRefused(str(error.get("message", "?")), str(error.get("kind", "")))
 
-    def _answer(self, number: int, verb: str) -> dict[str, Any]:
+    def _answer(self, number: int, command: str) -> dict[str, Any]:
         while True:
             try:
                 line = self._answers.get(timeout=ANSWER_WITHIN_S)
             except Empty:
-                raise FieldtwinUnavailable(f"no answer to {verb!r} within {ANSWER_WITHIN_S:g} s") from None
+                raise FieldtwinUnavailable(f"no answer to {command!r} within {ANSWER_WITHIN_S:g} s") from None
             if line is None:
                 raise self._gone()
             try:

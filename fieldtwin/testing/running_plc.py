@@ -66,7 +66,7 @@ class RunningPlc:
             time.sleep(POLL_S)
 
     def send(self, period_s: int) -> None:
-        """Command a period at the remote end of the system's transmitter, as `fieldtwin shore` does."""
+        """Command a period at the remote end of the system's transmitter, as `fieldtwin topside` does."""
         __tracebackhide__ = True
         self._runner.call("send", id=self._bench, period_s=period_s)
 
@@ -103,7 +103,7 @@ class RunningPlc:
         changes: list[dict[str, Any]] = self._steer("why", tag=tag)["changes"]
         return changes
 
-    def _steer(self, verb: str, **args: Any) -> dict[str, Any]:
+    def _steer(self, command: str, **args: Any) -> dict[str, Any]:
         __tracebackhide__ = True
-        answer: dict[str, Any] = self._runner.call("steer", id=self._bench, do=verb, args=args)
+        answer: dict[str, Any] = self._runner.call("steer", id=self._bench, do=command, args=args)
         return answer

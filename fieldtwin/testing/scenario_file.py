@@ -16,7 +16,7 @@ from fieldtwin.testing.outcome import ScenarioOutcome, run_scenario
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, command_of
 
 SUFFIX = ".scenario.yaml"
-ABOUT = ("case", "role", "danger")
+ABOUT = ("case", "role", "impact")
 
 
 class NotPassed(Exception):

@@ -1,8 +1,8 @@
 """The control channel: newline-delimited JSON between a running process and the clients that watch or control it.
 
-A request is one line ``{"v": 1, "id": 7, "verb": "get", "args": {...}}``, its answer one line ``{"v": 1, "id": 7, "ok":
+A request is one line ``{"v": 1, "id": 7, "command": "get", "args": {...}}``, its answer one line ``{"v": 1, "id": 7, "ok":
 true, "result": ...}`` or ``{"v": 1, "id": 7, "ok": false, "error": {"kind", "message", "exit_code"}}``. Each process
-registers its own commands ("verbs"): a plant's controller has no fault command because it registers none. The channel
+registers its own commands: a plant's controller has no fault command because it registers none. The channel
 uses a Unix socket in the instance's run directory (owner only), or TCP with a token if configured.
 
 A line has at most `MAX_LINE` bytes. This module handles text and JSON only; it does not know the state of the process.
@@ -41,19 +41,19 @@ place.
 """
 
 S = TypeVar("S", bound=msgspec.Struct)
-Verb = Callable[[dict[str, Any]], Awaitable[Any]]
+CommandHandler = Callable[[dict[str, Any]], Awaitable[Any]]
 
 
 class ControlServer:
     """A server for the registered commands on a Unix socket and, if configured, on TCP.
 
-    `verbs` maps a name to ``async (args) -> result``: data for JSON, or a `msgspec.Struct` of such. A `FieldtwinError` from a
+    `commands` maps a name to ``async (args) -> result``: data for JSON, or a `msgspec.Struct` of such. A `FieldtwinError` from a
     command becomes an error answer. Any other exception becomes one too, reported as a bug of fieldtwin. The connection stays
     open.
     """
 
-    def __init__(self, verbs: dict[str, Verb], token: str = "") -> None:
-        self._verbs = dict(verbs)
+    def __init__(self, commands: dict[str, CommandHandler], token: str = "") -> None:
+        self._commands = dict(commands)
         self._token = token
         self._servers: list[asyncio.Server] = []
         self._clients: dict[asyncio.StreamWriter, asyncio.Task[None] | None] = {}
@@ -142,10 +142,12 @@ class ControlServer:
             trusted = trusted or hmac.compare_digest(token.encode(errors="replace"), self._token.encode())
             if not trusted:
                 raise UsageError("this control channel requires its token")
-            verb = self._verbs.get(str(request.get("verb")))
-            if verb is None:
-                raise UsageError(f"unknown command {request.get('verb')!r}", expected=", ".join(sorted(self._verbs)))
-            return _encode(request_id, {"ok": True, "result": await verb(request.get("args") or {})}), trusted
+            command = self._commands.get(str(request.get("command")))
+            if command is None:
+                raise UsageError(
+                    f"unknown command {request.get('command')!r}", expected=", ".join(sorted(self._commands))
+                )
+            return _encode(request_id, {"ok": True, "result": await command(request.get("args") or {})}), trusted
         except FieldtwinError as e:
             error = e
         except Exception as e:  # a bug in a command must not end the channel; it is reported to the caller
@@ -248,11 +250,11 @@ class ControlClient:
             raise Unreachable(f"no control channel: {os_reason(e)}", where=f"{host}:{port}") from e
         return cls(reader, writer, f"{host}:{port}", token)
 
-    async def call(self, verb: str, timeout_s: float = 5.0, **args: Any) -> Any:
-        """Send the command `verb` and return its result. Raises `RemoteError`, `ConnectionLost` or `ReplyTimeout`."""
+    async def call(self, command: str, timeout_s: float = 5.0, **args: Any) -> Any:
+        """Send the command `command` and return its result. Raises `RemoteError`, `ConnectionLost` or `ReplyTimeout`."""
         async with self._turn:
             self._next_id += 1
-            request = {"v": VERSION, "id": self._next_id, "verb": verb, "args": args}
+            request = {"v": VERSION, "id": self._next_id, "command": command, "args": args}
             if self._token:
                 request["token"] = self._token
             try:
@@ -263,7 +265,7 @@ class ControlClient:
                     await self._writer.drain()
                     answer = await self._read_answer(self._next_id)
             except TimeoutError as e:
-                raise ReplyTimeout(f"no answer to {verb!r} within {timeout_s} s", where=self._where) from e
+                raise ReplyTimeout(f"no answer to {command!r} within {timeout_s} s", where=self._where) from e
             except (OSError, ValueError) as e:
                 raise ConnectionLost(f"control channel broke: {e}", where=self._where) from e
         if answer.get("ok"):
@@ -271,17 +273,17 @@ class ControlClient:
         error = answer.get("error") or {}
         raise RemoteError(error.get("kind", "?"), error.get("message", "?"), error.get("exit_code", 70))
 
-    async def ask(self, verb: str, kind: type[S], timeout_s: float = 5.0, **args: Any) -> S:
-        """Send the command `verb` and return its result as a `kind`.
+    async def ask(self, command: str, kind: type[S], timeout_s: float = 5.0, **args: Any) -> S:
+        """Send the command `command` and return its result as a `kind`.
 
         Raises as `call`, and `OtherVersion` if the result does not fit `kind`.
         """
-        answer = await self.call(verb, timeout_s, **args)
+        answer = await self.call(command, timeout_s, **args)
         try:
             return msgspec.convert(answer, kind)
         except msgspec.ValidationError as e:
             raise OtherVersion(
-                f"the answer to {verb!r} is not as expected: {e}",
+                f"the answer to {command!r} is not as expected: {e}",
                 where=self._where,
                 hint="both processes need the same version of fieldtwin",
             ) from e

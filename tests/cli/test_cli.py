@@ -96,8 +96,10 @@ def test_neither_flag_is_a_default_and_both_exclude_each_other(invoke: Invoke) -
         (("emulate", "observatory", "--on", "pty:x"), "--on"),
         (("emulate", "observatory", "--control", "nowhere"), "HOST:PORT"),
         (("import", "cast.txt"), ".cnv"),
-        (("shore", "observatory"), "--far"),
+        (("topside", "observatory"), "--far"),
         (("fly",), "No such command"),
+        (("shore", "observatory"), "now called 'topside'"),
+        (("check", "modbus-master"), "now called 'modbus-client'"),
     ],
 )
 def test_invalid_usage_is_reported_in_one_line(invoke: Invoke, args: tuple[str, ...], told: str) -> None:

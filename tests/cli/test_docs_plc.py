@@ -71,6 +71,8 @@ def test_the_lamp_stays_on_for_two_seconds() -> None:
 
 
 def test_every_command_that_the_page_names_exists() -> None:
-    named = {verb for verbs in re.findall(r"fieldtwin plc (\w+(?:, \w+)*)", PAGE) for verb in verbs.split(", ")}
+    named = {
+        command for commands in re.findall(r"fieldtwin plc (\w+(?:, \w+)*)", PAGE) for command in commands.split(", ")
+    }
     assert {"status", "watch", "why", "force", "pause", "step", "go", "diagram", "prove"} <= named
     assert named <= set(command.commands)

@@ -19,17 +19,17 @@ LINES = [line for line in re.findall(r"```sh\n(.*?)```", PAGE, re.S)[0].splitlin
 
 @pytest.mark.parametrize("line", LINES)
 def test_a_command_line_of_the_page_is_understood(line: str) -> None:
-    verb, *arguments = shlex.split(line)[1:]
-    command = cli.get_command(click.Context(cli), verb)
+    name, *arguments = shlex.split(line)[1:]
+    command = cli.get_command(click.Context(cli), name)
     assert command is not None
-    assert command.make_context(verb, arguments).params
+    assert command.make_context(name, arguments).params
 
 
-@pytest.mark.parametrize("verb", ["line", "scan", "identify"])
-def test_every_option_that_the_page_names_exists(verb: str) -> None:
-    command = cli.get_command(click.Context(cli), verb)
+@pytest.mark.parametrize("name", ["line", "scan", "identify"])
+def test_every_option_that_the_page_names_exists(name: str) -> None:
+    command = cli.get_command(click.Context(cli), name)
     assert command is not None
     known = {option for parameter in command.params for option in parameter.opts}
     pages = f"{PAGE}\n## scan\n{SCAN}"
-    section = pages.split(f"\n## {verb}\n")[1].split("\n## ")[0].replace("`--echo` for the other verbs", "")
+    section = pages.split(f"\n## {name}\n")[1].split("\n## ")[0].replace("`--echo` for the other commands", "")
     assert set(re.findall(r"`(--[a-z-]+)", section)) <= known

@@ -101,9 +101,9 @@ def test_it_never_holds_more_than_its_bound(steps: list[str], policy: EndOfRecor
     subject = VirtualContext([A, B], when_used_up=policy, max_entries=4)
     model: dict[str, list[int]] = {"a": [], "b": []}
     for number, step in enumerate(steps):
-        verb, name = step.split()
+        command, name = step.split()
         command = COMMAND(name.encode())
-        if verb == "add":
+        if command == "add":
             subject.add(command, recorded(number))
             model[name].append(number)
             assert len(subject) <= 4

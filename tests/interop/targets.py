@@ -43,12 +43,12 @@ SYSTEM = ROOT / "profiles/systems/observatory.yaml"
 class EmulatedTarget:
     """Our emulators, as ``fieldtwin run --prototype`` starts them, with the remote client served by its own driver."""
 
-    def __init__(self, mapping: dict[Endpoint, Endpoint], shore: TopsideController) -> None:
+    def __init__(self, mapping: dict[Endpoint, Endpoint], topside: TopsideController) -> None:
         self.mapping = mapping
-        self.shore = shore
+        self.topside = topside
 
     async def command(self, period_s: int) -> None:
-        self.shore.send(period_s)
+        self.topside.send(period_s)
 
 
 @contextlib.asynccontextmanager
@@ -76,11 +76,11 @@ async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
         for bus, url in status["listening"].items():
             plant = system.buses[bus].endpoint
             mapping[plant] = mapped_endpoint(plant, Endpoint.parse(url))
-        shore = TopsideController(system, "modem", Endpoint.parse(status["far"]["modem"]), WallClock())
+        topside = TopsideController(system, "modem", Endpoint.parse(status["far"]["modem"]), WallClock())
         async with Nursery() as nursery:
-            nursery.start(shore.run([]), "topside")
-            yield EmulatedTarget(mapping, shore)
-            await shore.halt()
+            nursery.start(topside.run([]), "topside")
+            yield EmulatedTarget(mapping, topside)
+            await topside.halt()
 
 
 class IndependentTarget:

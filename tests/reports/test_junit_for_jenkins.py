@@ -81,7 +81,7 @@ def _report(verdict: Verdict, took_s: float = 0.5) -> Report:
         earlier=("the host was late",),
         case="C-1",
         role="controller",
-        danger="read",
+        impact="read",
         faults=(Struck("f", "drop", "line1", 3),),
         evidence=("sent 01 03",),
         reproduce="fieldtwin test a.yaml",
@@ -144,7 +144,7 @@ while True:
 
 def test_a_check_of_a_master_writes_the_flavour_that_was_asked_for(tmp_path: Path) -> None:
     out = tmp_path / "out.xml"
-    words = ["check", "modbus-master", "--listen", "tcp://127.0.0.1:0", "--only", "MB-013", "--patience", "1s"]
+    words = ["check", "modbus-client", "--listen", "tcp://127.0.0.1:0", "--only", "MB-013", "--patience", "1s"]
     done = CliRunner().invoke(
         cli, [*words, "--junit", str(out), "--junit-flavour", "jenkins", "--", sys.executable, "-c", MASTER]
     )

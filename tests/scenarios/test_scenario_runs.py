@@ -222,7 +222,7 @@ def test_reports_are_written(tmp_path: Path) -> None:
     assert "1 of 6 taken" in page, "what was not is missing: STANDBY to ACTIVE was all"
     (told,) = json.loads(ended.output)
     assert (told["verdict"], told["requirements"]) == ("passed", ["REQ-1"])
-    about = {"case": "x", "role": "controller", "danger": "write"}  # ACTIVE sends
+    about = {"case": "x", "role": "controller", "impact": "write"}  # ACTIVE sends
     assert {name: told[name] for name in about} == about
     for name, value in {**about, "requirement": "REQ-1"}.items():
         assert f'<property name="{name}" value="{value}" />' in (tmp_path / "r.xml").read_text()
@@ -230,12 +230,12 @@ def test_reports_are_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("steps", "danger"),
+    ("steps", "impact"),
     [
         ("  - pause: 1s\n", "observe"),
         ("  - set: {tag: ctd.pressure, value: 5}\n  - pause: 1s\n", "write"),
         ("  - send: {period_s: 1}\n  - fault: {id: f, name: silence, device: ctd}\n", "disrupt"),
     ],
 )
-def test_a_scenario_is_as_dangerous_as_its_worst_step(tmp_path: Path, steps: str, danger: str) -> None:
-    assert impact_of(load_scenario(written(tmp_path, steps))).value == danger
+def test_a_scenario_has_the_impact_of_its_worst_step(tmp_path: Path, steps: str, impact: str) -> None:
+    assert impact_of(load_scenario(written(tmp_path, steps))).value == impact

@@ -115,8 +115,8 @@ def driver_of(path: Path) -> Any:
 class Watched:
     """The observatory in virtual time, with a shadow that receives the contents of its process image."""
 
-    def __init__(self, system: System, plant: VirtualPrototype, shore: TopsideController) -> None:
-        self.plant, self.shore = plant, shore
+    def __init__(self, system: System, plant: VirtualPrototype, topside: TopsideController) -> None:
+        self.plant, self.topside = plant, topside
         self._image = ImageProcess(system, plant.twin.ecs.layout, plant.clock)
         self._readers = plant.image.reader(INPUTS), plant.image.reader(OUTPUTS)
         self._receiving = ReceivingEnd("from the plant")
@@ -150,11 +150,11 @@ def in_virtual_time(tmp_path: Path, main: Callable[[Watched], Coroutine[Any, Any
     @asynccontextmanager
     async def sampling() -> AsyncIterator[Watched]:
         async with VirtualPrototype(system, prototype, loop, tmp_path) as plant, Nursery() as nursery:
-            shore = TopsideController(system, "modem", plant.field.far["modem"], plant.clock, plant.net)
-            nursery.start(shore.run([]), "topside")
-            watched = Watched(system, plant, shore)
+            topside = TopsideController(system, "modem", plant.field.far["modem"], plant.clock, plant.net)
+            nursery.start(topside.run([]), "topside")
+            watched = Watched(system, plant, topside)
             await watched.pass_s(3)
-            shore.send(1)
+            topside.send(1)
             await watched.pass_s(8)
             assert watched.period_in_device() == 1
             assert (watched["ctd.sample_period_s"].value, watched["ctd.pressure"].quality) == (1, Quality.GOOD)

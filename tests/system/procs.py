@@ -64,12 +64,12 @@ class Asking:
     def __init__(self, address: str | tuple[str, int]) -> None:
         self._address = address
 
-    def __call__(self, verb: str, **args: Any) -> Any:
+    def __call__(self, command: str, **args: Any) -> Any:
         family = socket.AF_UNIX if isinstance(self._address, str) else socket.AF_INET
         with socket.socket(family, socket.SOCK_STREAM) as s:
             s.settimeout(10)
             s.connect(self._address)
-            s.sendall(json.dumps({"v": 1, "id": 1, "verb": verb, "args": args}).encode() + b"\n")
+            s.sendall(json.dumps({"v": 1, "id": 1, "command": command, "args": args}).encode() + b"\n")
             with s.makefile("rb") as lines:
                 line = lines.readline()
         if not line:

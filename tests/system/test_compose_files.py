@@ -49,9 +49,9 @@ def profile(name: str) -> set[str]:
 
 
 def test_profiles_have_the_services_that_they_are_for() -> None:
-    assert profile("prototype") == {"field", "controller", "shore"}
+    assert profile("prototype") == {"field", "controller", "topside"}
     assert profile("physical") == {"controller-physical"}
-    assert profile("twin") == {"field", "controller-twin", "shore-twin", "broker", "shadow", "twin"}
+    assert profile("twin") == {"field", "controller-twin", "topside-twin", "broker", "shadow", "twin"}
     assert profile("vcan") == {"vcan", "field-vcan", "controller-vcan"}
     assert profile("own-plc") == {"field-own-plc"}
     assert (CHECKOUT / ".env").read_text(encoding="utf-8").splitlines()[-1] == "COMPOSE_PROFILES=prototype"
@@ -90,8 +90,8 @@ def test_one_image_and_the_broker_s() -> None:
 
 def test_services_wait_for_health_and_never_sleep() -> None:
     assert SERVICES["controller"]["depends_on"] == {"field": {"condition": "service_healthy"}}
-    assert SERVICES["shore"]["depends_on"] == {"controller": {"condition": "service_healthy"}}
-    ended = {"shore", "shore-twin", "vcan"}
+    assert SERVICES["topside"]["depends_on"] == {"controller": {"condition": "service_healthy"}}
+    ended = {"topside", "topside-twin", "vcan"}
     for name, service in OURS.items():
         assert (name in ended) or service["healthcheck"]["test"][:2] == ["CMD", "container-health"]
     assert "sleep" not in str(COMPOSE)
@@ -229,7 +229,7 @@ def container_health(*sockets: Path) -> tuple[int, str]:
     return done.returncode, done.stdout.strip()
 
 
-@pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
+@pytest.mark.timeout(150)  # a topside controller that runs 8 s, and four starts: half a minute on a busy computer
 @pytest.mark.long
 def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) -> None:
     """Run the compose file's three commands on free ports, and check the health checks, exit codes and the summary that it
@@ -240,8 +240,8 @@ def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) 
     port = free_port()
     emulate = ("emulate", "observatory", f"--prototype-file={prototype}", f"--control=0.0.0.0:{port}")
     run = ("run", "observatory", "--prototype", f"--field=localhost:{port}", "--commands=none")
-    shore = (
-        "shore",
+    topside = (
+        "topside",
         "observatory",
         f"--field=localhost:{port}",
         "--commands=1,2,0,-1",
@@ -262,7 +262,7 @@ def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) 
         assert "token" in stranger.err
         with fieldtwin(tmp_path, *run, name="run", env=run_env) as controller:
             wait_for(lambda: container_health(*sockets) == (0, "ok"), 20, "the controller is healthy")
-            ashore = run_to_end(tmp_path, *shore, name="shore")
+            ashore = run_to_end(tmp_path, *topside, name="topside")
             assert ashore.process.returncode == 0, ashore.err
             relay = ["STANDBY", "ACTIVE", "STANDBY", "OFF"]
             controller.signal(15)
@@ -270,7 +270,9 @@ def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) 
             summary = controller.summary
             assert summary["ok"]
             assert summary["states"]["relay"] == relay
-            assert summary["topside"] is None  # it belongs to the shore; a second client would take its responses
+            assert (
+                summary["topside"] is None
+            )  # it belongs to the topside controller; a second client would take its responses
         with fieldtwin(tmp_path, *run, name="again", env=run_env):
             wait_for(lambda: container_health(*sockets)[0] == 0, 20, "healthy again")
             field.process.kill()

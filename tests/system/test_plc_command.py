@@ -101,7 +101,7 @@ def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     assert shown.endswith(out.read_text())  # not wrapped at a terminal's width, because it may be piped into a file
     scenario = parse(out.read_text(), str(out)).data
     assert (scenario["system"], scenario["needs"]) == ("site.yaml", ["send_command"])
-    assert [s for s in scenario["steps"] if "send" in s] == [{"send": {"from": "shore", "period_s": -32768}}] * 2
+    assert [s for s in scenario["steps"] if "send" in s] == [{"send": {"from": "topside", "period_s": -32768}}] * 2
     assert scenario["steps"][-1] == {"pause": "5s"}
     [seen] = scenario["never"]
     assert seen.startswith("relay.state == 'ACTIVE' and relay.period == -32768 and relay.commands == 2 and ")

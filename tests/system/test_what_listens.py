@@ -212,10 +212,10 @@ def test_the_test_host_listens_only_for_its_devices_on_loopback(tmp_path: Path) 
         assert host.stdout is not None
         number = 0
 
-        def ask(verb: str, **args: Any) -> Any:
+        def ask(command: str, **args: Any) -> Any:
             nonlocal number
             number += 1
-            line = json.dumps({"v": 1, "id": number, "verb": verb, "args": args}).encode() + b"\n"
+            line = json.dumps({"v": 1, "id": number, "command": command, "args": args}).encode() + b"\n"
             host.stdin.write(line)  # type: ignore[union-attr]
             host.stdin.flush()  # type: ignore[union-attr]
             answer = json.loads(host.stdout.readline())  # type: ignore[union-attr]

@@ -24,7 +24,7 @@ check = {"number": "2", "text": "expect", "verdict": verdict, "expected": "level
 seed = int(sys.argv[sys.argv.index("--seed") + 1]) if "--seed" in sys.argv else 7
 target = sys.argv[sys.argv.index("--target") + 1] if "--target" in sys.argv else "virtual"
 print(json.dumps([{"name": "A scenario", "verdict": verdict, "reason": "because", "seed": seed, "target": target,
-    "requirements": ["REQ-1"], "case": "a-case", "role": "controller", "danger": "disrupt", "checks": [check],
+    "requirements": ["REQ-1"], "case": "a-case", "role": "controller", "impact": "disrupt", "checks": [check],
     "reproduce": f"fieldtwin test {sys.argv[2]} --seed {seed}"}]))
 sys.exit(verdict != "passed")
 """
@@ -55,7 +55,7 @@ def test_scenarios_are_tests_and_only_passed_is_a_pass(pytester: pytest.Pytester
     cases = ElementTree.parse(pytester.path / "out.xml").iter("testcase")
     passed = next(case for case in cases if case.get("name") == "a-passed")
     properties = {p.get("name"): p.get("value") for p in passed.iter("property")}
-    about = {"case": "a-case", "role": "controller", "danger": "disrupt"}
+    about = {"case": "a-case", "role": "controller", "impact": "disrupt"}
     assert properties == {"requirement": "REQ-1", "fieldtwin verdict": "passed", "seed": "7", **about}
 
 

@@ -216,8 +216,8 @@ def pack(system: System, collected: Collected, extras: TemplateExtras, version: 
     Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, and `Unreachable` if the disk
     refuses.
     """
-    hash_here = modules_hash()
-    wheel = _add_wheel(collected, extras.wheel, version, hash_here) if extras.wheel else ""
+    local_hash = modules_hash()
+    wheel = _add_wheel(collected, extras.wheel, version, local_hash) if extras.wheel else ""
     for kind, paths in extras.documents.items():
         for path in paths:
             collected.add(f"documents/{kind}/{path.name}", Item("document", path, document=kind))
@@ -226,7 +226,7 @@ def pack(system: System, collected: Collected, extras: TemplateExtras, version: 
         system=system.name,
         system_file=collected.system_file,
         prototype_file=collected.prototype_file,
-        software=Software(version=version, modules_sha256=hash_here, wheel=wheel),
+        software=Software(version=version, modules_sha256=local_hash, wheel=wheel),
         files=tuple(_described(path, item) for path, item in sorted(collected.items.items())),
     )
     try:
@@ -239,12 +239,12 @@ def pack(system: System, collected: Collected, extras: TemplateExtras, version: 
     return manifest
 
 
-def _add_wheel(collected: Collected, wheel: Path, version: str, hash_here: str) -> str:
+def _add_wheel(collected: Collected, wheel: Path, version: str, local_hash: str) -> str:
     its_version, its_hash = wheel_hash(wheel)
-    if its_hash != hash_here:
+    if its_hash != local_hash:
         raise FileInvalid(
             "this wheel is different software from the running one", path=str(wheel),
-            expected=f"{version}, modules {hash_here[:12]}", got=f"{its_version}, modules {its_hash[:12]}",
+            expected=f"{version}, modules {local_hash[:12]}", got=f"{its_version}, modules {its_hash[:12]}",
         )  # fmt: skip
     place = f"software/{wheel.name}"
     collected.add(place, Item("software", wheel))

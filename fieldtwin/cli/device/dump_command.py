@@ -17,7 +17,7 @@ from fieldtwin.cli.device.dump_view import estimate_text, notes, profile_gaps, s
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, DumpJob
-from fieldtwin.commissioning.dump.dump import Progress as Told
+from fieldtwin.commissioning.dump.dump import Progress as Report
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.dump.profile import dumped_tags
 from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
@@ -184,7 +184,7 @@ def _described(found: Dump, out: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _bar(name: str) -> Iterator[Told]:
+def _bar(name: str) -> Iterator[Report]:
     """Show a progress bar on a terminal; elsewhere nothing."""
     with Progress(
         TextColumn("{task.description}"),

@@ -66,17 +66,17 @@ def _tags(instance: str, patterns: tuple[str, ...]) -> list[dict[str, Any]]:
     return talk_to(instance, lambda client: ask_tags(client, patterns))
 
 
-def _call(instance: str, verb: str, **args: Any) -> Any:
+def _call(instance: str, command: str, **args: Any) -> Any:
     from fieldtwin.run.processes.plc_client import talk_to
 
-    return talk_to(instance, lambda client: client.call(verb, **args))
+    return talk_to(instance, lambda client: client.call(command, **args))
 
 
-def _act(instance: str, verb: str, **args: Any) -> Any:
+def _act(instance: str, command: str, **args: Any) -> Any:
     """Send a command that changes the PLC; it is recorded with the user's name."""
     import getpass
 
-    return _call(instance, verb, by=getpass.getuser(), **args)
+    return _call(instance, command, by=getpass.getuser(), **args)
 
 
 @command.command("status")

@@ -1,4 +1,4 @@
-"""`fieldtwin shore`: the topside controller of a system's modem, as a separate process."""
+"""`fieldtwin topside`: the topside controller of a system's modem, as a separate process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System, load_system
 
 
-@click.command("shore")
+@click.command("topside")
 @click.argument("system")
 @click.option(
     "--far", default="", metavar="ENDPOINT", help="Endpoint of the topside modem, such as tcp://modem-ashore:502."
@@ -38,7 +38,7 @@ from fieldtwin.twin.site.system import System, load_system
     type=Secret(),
     default="",
     metavar="@FILE",
-    help="Token of that simulator's control channel; or FIELDTWIN_SHORE_TOKEN.",
+    help="Token of that simulator's control channel; or FIELDTWIN_TOPSIDE_TOKEN.",
 )
 @click.option("--device", default="", help="The transmitter device; default: the system's only one.")
 @click.option(

@@ -31,11 +31,23 @@ if TYPE_CHECKING:
     from fieldtwin.conformance.core.results import CaseResult
     from fieldtwin.emulators.modbus.bank import Table
 
+RENAMED = {"modbus-master": "modbus-client"}
 _HELD = re.compile(r"^(holding|input|coil|discrete):(\d{1,5})$")
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$")
 
 
-@click.group("check")
+class _CheckGroup(click.Group):
+    """The group of checks. It names the new command to users of an old name."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] in RENAMED:
+            raise click.UsageError(f"{args[0]!r} is now called {RENAMED[args[0]]!r}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+@click.group("check", cls=_CheckGroup)
 def command() -> None:
     """Run conformance tests on a device, or on a client or master with devices that misbehave; or check a site's files.
 
@@ -96,7 +108,7 @@ class MasterOptions:
         )
 
 
-@command.command("modbus-master", cls=GroupedCommand)
+@command.command("modbus-client", cls=GroupedCommand)
 @group(
     "Simulated devices",
     click.option(
@@ -117,7 +129,7 @@ class MasterOptions:
 @group("Test cases", choice=CaseOptions)
 @group("Results", files=ResultOptions)
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
-def modbus_master(
+def modbus_client(
     listen: str | None,
     hold: tuple[str, ...],
     echo: bool,
@@ -130,9 +142,9 @@ def modbus_master(
     """Test a Modbus client (master) with a server that misbehaves, one test case after another.
 
     \b
-    fieldtwin check modbus-master --listen tcp://127.0.0.1:5020 \\
+    fieldtwin check modbus-client --listen tcp://127.0.0.1:5020 \\
         --probe tcp://plc:502/holding:100
-    fieldtwin check modbus-master --listen pty:/tmp/line --timeout 1s \\
+    fieldtwin check modbus-client --listen pty:/tmp/line --timeout 1s \\
         --probe output -- python my_client.py
 
     The client keeps its normal polling. A program after -- finds the endpoint in FIELDTWIN_ENDPOINT, FIELDTWIN_HOST and
@@ -141,7 +153,7 @@ def modbus_master(
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.modbus.cases import CASES
-    from fieldtwin.conformance.clients.session import Options, judge_modbus_master
+    from fieldtwin.conformance.clients.session import Options, judge_modbus_client
 
     cases = [case.about for case in CASES]
     if files.list_only:
@@ -160,7 +172,7 @@ def modbus_master(
         command=argv,
     )
     return _judged(
-        lambda listener: judge_modbus_master(options, listener), "modbus", listen, plan, cases, choice, files
+        lambda listener: judge_modbus_client(options, listener), "modbus", listen, plan, cases, choice, files
     )
 
 

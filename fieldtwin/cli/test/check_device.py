@@ -90,14 +90,14 @@ class DeviceCheck:
         from fieldtwin.console import stderr
 
         played = [c for c in cases if c.chosen(plan.only) and not why_not(c, plan, traits)]
-        risky = [c for c in played if c.danger.rank > Impact.READ.rank]
+        risky = [c for c in played if c.impact.rank > Impact.READ.rank]
         if not risky or self.care.yes:
             return
-        for danger, means in MEANS[self.protocol].items():
-            ids = [c.id for c in risky if c.danger.value == danger]
+        for impact, means in MEANS[self.protocol].items():
+            ids = [c.id for c in risky if c.impact.value == impact]
             if ids:
                 stderr.print(
-                    f"{len(ids)} test cases with impact level {danger}: {means}.\n  {', '.join(ids)}", markup=False
+                    f"{len(ids)} test cases with impact level {impact}: {means}.\n  {', '.join(ids)}", markup=False
                 )
         if not sys.stdin.isatty():
             raise NotAllowed(

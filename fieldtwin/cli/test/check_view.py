@@ -39,7 +39,7 @@ BASIS = {Basis.STANDARD: "default", **FINDING}
 MARK = {
     Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",
 }  # fmt: skip
-DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magenta"}
+IMPACT = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magenta"}
 
 
 class CheckProgress:
@@ -107,17 +107,17 @@ def _print_each(results: Sequence[CaseResult]) -> None:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
             reason += f" ({why(r)})" if r.deviates else ""
-            line = f"{called(r):<13} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
+            line = f"{called(r):<13} {r.case.id:<7} {r.case.impact.value:<8} {r.case.title}{reason}"
             stdout.print(line, markup=False, soft_wrap=True)
     else:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("")
         table.add_column("case", no_wrap=True)
-        table.add_column("danger", no_wrap=True)
+        table.add_column("impact", no_wrap=True)
         table.add_column("request" if _of_devices([r.case for r in results]) else "the device", ratio=2)
         table.add_column("result", ratio=3)
         for r in results:
-            style, danger = style_of(r), r.case.danger.value
+            style, impact = style_of(r), r.case.impact.value
             found = r.reason or r.verdict.value
             mark = MARK[r.verdict]
             if r.verdict.bad and not r.deviates:
@@ -125,7 +125,7 @@ def _print_each(results: Sequence[CaseResult]) -> None:
             elif r.verdict.bad:
                 found = f"{found} ({why(r)})"
             table.add_row(
-                f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
+                f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{IMPACT[impact]}]{impact}[/]",
                 escape(r.case.title), f"[{style}]{escape(found)}[/]",
             )  # fmt: skip
         stdout.print(table)
@@ -149,18 +149,18 @@ def print_cases(cases: Sequence[About]) -> None:
     if not stdout.is_terminal:
         for case in cases:
             words = f"{case.title}: {case.does}; expected: {case.must} [{case.sources}]"
-            line = f"{case.id:<7} {case.bases:<25} {case.danger.value:<8} {words}"
+            line = f"{case.id:<7} {case.bases:<25} {case.impact.value:<8} {words}"
             stdout.print(line, markup=False, soft_wrap=True)
         return
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     heads = ("what is sent", "what the device must do")
     does, must = heads if _of_devices(cases) else ("what the device does", "what the master must do")
-    for name in ("case", "basis", "danger", does, must, "source"):
+    for name in ("case", "basis", "impact", does, must, "source"):
         table.add_column(name, overflow="fold", no_wrap=name == "case")
     for case in cases:
-        danger, basis = case.danger.value, BASIS[case.basis]
+        impact, basis = case.impact.value, BASIS[case.basis]
         table.add_row(
-            case.id, f"[{basis}]{escape(case.bases)}[/]", f"[{DANGER[danger]}]{danger}[/]", escape(case.does),
+            case.id, f"[{basis}]{escape(case.bases)}[/]", f"[{IMPACT[impact]}]{impact}[/]", escape(case.does),
             escape(case.must), escape(case.sources),
         )  # fmt: skip
     stdout.print(table)
@@ -175,7 +175,7 @@ def listed(case: About) -> dict[str, Any]:
     keys = ("id", "title", "clause", "does", "must")
     elsewhere = [{"wire": e.wire, "basis": e.basis.value, "clause": e.clause} for e in case.elsewhere]
     return {k: getattr(case, k) for k in keys} | {
-        "basis": case.basis.value, "danger": case.danger.value, "role": case.role, "elsewhere": elsewhere,
+        "basis": case.basis.value, "impact": case.impact.value, "role": case.role, "elsewhere": elsewhere,
     } | ({"wires": case.wires, "needs": case.needs} if isinstance(case, DeviceCase) else {})  # fmt: skip
 
 
@@ -187,12 +187,12 @@ def print_dry_run(checked: Checked, *, as_json: bool) -> None:
             {
                 "id": "before",
                 "title": "its answers and its identification",
-                "danger": "read",
+                "impact": "read",
                 "sent": _sent(checked.before),
             }
         ]
         cases += [
-            {"id": r.case.id, "title": r.case.title, "danger": r.case.danger.value, "sent": _sent(r.spoken)}
+            {"id": r.case.id, "title": r.case.title, "impact": r.case.impact.value, "sent": _sent(r.spoken)}
             for r in played
         ]
         json.dump({"kind": "fieldtwin check dry run", "cases": cases}, sys.stdout, indent=2)
@@ -201,8 +201,8 @@ def print_dry_run(checked: Checked, *, as_json: bool) -> None:
     stdout.print("before: its answers and its identification", markup=False)
     _print_sent(_sent(checked.before))
     for r in played:
-        danger = r.case.danger.value
-        stdout.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
+        impact = r.case.impact.value
+        stdout.print(f"{r.case.id} [{IMPACT[impact]}]{impact}[/] {escape(r.case.title)}", soft_wrap=True)
         _print_sent(_sent(r.spoken))
     stderr.print(
         f"{len(played)} cases. A normal read precedes each case as well. The frames are those for a conforming device; "

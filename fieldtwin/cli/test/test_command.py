@@ -317,7 +317,7 @@ def _plain(result: object) -> dict[str, object]:
         "name": result.name,
         "case": result.case,
         "role": result.role,
-        "danger": result.danger,
+        "impact": result.impact,
         "verdict": result.verdict.value,
         "seed": result.seed,
         "target": result.target,

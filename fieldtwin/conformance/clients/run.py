@@ -207,7 +207,7 @@ class MasterRun(Generic[C]):
 
     async def _case(self, case: C) -> None:
         since_ns = self.stage.now_ns()
-        reason = self._not_here(case)
+        reason = self._why_not_possible(case)
         if reason:
             self._done(case, skipped(reason), since_ns)
         elif self.plan.for_s and (since_ns - self._started_ns) / NS_PER_S >= self.plan.for_s:
@@ -221,13 +221,13 @@ class MasterRun(Generic[C]):
             finding, events = await self._play(case)
             self._done(case, finding, since_ns, lines(events, self.stage.first_ns))
 
-    def _not_here(self, case: C) -> str:
+    def _why_not_possible(self, case: C) -> str:
         if not self.traits & set(case.framings):
             return OTHER_WIRE
         if case.needs and case.needs not in self.plan.has:
             return f"only with --{case.needs}"
-        if case.about.danger.rank > self.plan.at_most.rank:
-            return f"its impact level is {case.about.danger.value}, {self.plan.at_most.value} is allowed"
+        if case.about.impact.rank > self.plan.at_most.rank:
+            return f"its impact level is {case.about.impact.value}, {self.plan.at_most.value} is allowed"
         return ""
 
     async def _well(self) -> bool:
@@ -296,7 +296,7 @@ class MasterRun(Generic[C]):
 
     def _watched(self, case: C) -> None:
         now_ns = self.stage.now_ns()
-        reason = self._not_here(case)
+        reason = self._why_not_possible(case)
         if reason:
             self._done(case, skipped(reason), now_ns)
             return

@@ -65,7 +65,7 @@ class Listener:
     log: Callable[[Event], None] = lambda event: None
 
 
-async def judge_modbus_master(options: Options, listener: Listener) -> list[CaseResult]:
+async def judge_modbus_client(options: Options, listener: Listener) -> list[CaseResult]:
     """Test a Modbus client; return the results in the order of the cases.
 
     Raises `UsageError`, `Unreachable` or `EndpointBusy`. SIGTERM ends the test, and the program with it.

@@ -108,7 +108,7 @@ class About:
     id: str
     title: str
     clause: str
-    danger: Impact
+    impact: Impact
     does: str
     must: str
     basis: Basis = field(kw_only=True)

@@ -111,7 +111,7 @@ def case_json(result: CaseResult, action: str, **more: Any) -> dict[str, Any]:
         "clause": case.clause,
         "basis": case.basis.value,
         "role": case.role,
-        "danger": case.danger.value,
+        "impact": case.impact.value,
         action: case.does,
         "expected": case.must,
         "verdict": result.verdict.value,
@@ -146,6 +146,6 @@ def as_scenario(
         checks.append(CheckResult("wire", wire, verdict))
     return ScenarioResult(
         f"{case.id} {case.title}", verdict, checks, requirements=(case.row,), target=target, reason=reason,
-        reproduce=again, took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
+        reproduce=again, took_s=result.took_s, case=case.id, role=case.role, impact=case.impact.value,
         basis=case.basis.value, clause=case.clause, evidence=tuple(evidence),
     )  # fmt: skip

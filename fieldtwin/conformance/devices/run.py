@@ -27,7 +27,7 @@ MOST_LOST = 3
 class Settling(Protocol):
     """The interface of a connection for a run."""
 
-    danger: Impact
+    impact: Impact
     traits: frozenset[str]
 
     async def settle(self) -> bool: ...
@@ -68,8 +68,8 @@ def why_not(case: DeviceCase[W], plan: CasePlan, traits: frozenset[str]) -> str:
     """Return the reason for which the case is not run with that plan on that transport; empty if it is run."""
     if case.wires and not traits & set(case.wires):
         return OTHER_WIRE
-    if case.danger.rank > plan.at_most.rank:
-        return f"danger {case.danger.value}: --allow {case.danger.value}"
+    if case.impact.rank > plan.at_most.rank:
+        return f"impact {case.impact.value}: --allow {case.impact.value}"
     missing = [need for need in case.needs if need not in plan.has]
     if missing:
         return "needs " + ", ".join(HOW_TO_GIVE.get(need, need) for need in missing)
@@ -119,11 +119,11 @@ async def play(
 
 async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[Finding, bool]:
     """Return the finding of a case, and whether the device answered normally before it."""
-    wire.danger = Impact.READ
+    wire.impact = Impact.READ
     if not await wire.settle():
         return inconclusive("the state before the test case was not normal: the normal request got no answer"), False
     transcript.begin()
-    wire.danger = case.danger
+    wire.impact = case.impact
     try:
         return await case.play(wire), True
     except NotHere as e:
@@ -133,4 +133,4 @@ async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[F
     except Unreachable as e:
         return failed(f"accepts no connection any more: {e.message}"), True
     finally:
-        wire.danger = Impact.READ
+        wire.impact = Impact.READ

@@ -45,7 +45,7 @@ def render_html(
         *subject.identity.items(),
         ("checked", subject.started),
         ("by", f"{subject.by} on {subject.host}" if subject.by else subject.host),
-        ("danger", f"up to {subject.at_most}" + (f", writing to {', '.join(subject.wrote)}" if subject.wrote else "")),
+        ("impact", f"up to {subject.at_most}" + (f", writing to {', '.join(subject.wrote)}" if subject.wrote else "")),
         ("reply timeout", f"{subject.timeout_s:g} s"),
         ("fieldtwin", subject.fieldtwin),
     ]

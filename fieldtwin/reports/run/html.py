@@ -52,7 +52,7 @@ def render_html(report: Report) -> str:
         counts={verdict: counts[verdict] for verdict in _ORDER},
         facts=_facts(report),
         check_count=sum(len(s.checks) for s in report.scenarios),
-        columns=[name for name in ("case", "role", "danger") if any(getattr(s, name) for s in report.scenarios)],
+        columns=[name for name in ("case", "role", "impact") if any(getattr(s, name) for s in report.scenarios)],
         ordered=sorted(enumerate(report.scenarios), key=lambda item: _ORDER.index(item[1].verdict)),
         why=_why,
         passed=lambda scenario: sum(c.verdict is Verdict.PASSED for c in scenario.checks),
@@ -154,5 +154,5 @@ def _place(scenario: ScenarioResult) -> str:
     target = f"target {scenario.target}" if scenario.target else ""
     hashed = f"trace {scenario.trace_hash}" if scenario.trace_hash else ""
     needs = f"requirements {', '.join(scenario.requirements)}" if scenario.requirements else ""
-    about = ", ".join(f"{name} {value}" for name in ("case", "role", "danger") if (value := getattr(scenario, name)))
+    about = ", ".join(f"{name} {value}" for name in ("case", "role", "impact") if (value := getattr(scenario, name)))
     return " · ".join(p for p in (about, where, target, needs, hashed) if p)

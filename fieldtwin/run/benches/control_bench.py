@@ -366,17 +366,17 @@ class ControlBench(AsyncResource):
             if not entries:
                 return list(self._held.get(name, ()))
 
-    async def _put(self, verb: str, **args: Any) -> Any:
+    async def _put(self, command: str, **args: Any) -> Any:
         """Put something into the simulated devices, under the lease."""
         if self.lease is None:
             raise UsageError("there are no simulated field devices", expected="a prototype")
-        return await self.lease.call(verb, **args)
+        return await self.lease.call(command, **args)
 
-    async def _to_field(self, verb: str, **args: Any) -> Any:
+    async def _to_field(self, command: str, **args: Any) -> Any:
         if self._field is None:
             raise UsageError("there is no emulated field", expected="a prototype")
         try:
-            return await self._field.call(verb, **args)
+            return await self._field.call(command, **args)
         except RemoteError as e:
             if e.remote_exit_code == UsageError.exit_code:
                 raise UsageError(str(e)) from e

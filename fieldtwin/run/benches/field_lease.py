@@ -76,10 +76,10 @@ class FieldLease:
             except FieldtwinError as e:
                 self.lost = LeaseLost(f"the simulated field devices cannot be reached: {e}")
 
-    async def call(self, verb: str, **args: Any) -> Any:
+    async def call(self, command: str, **args: Any) -> Any:
         """Call `fault` or `set` under this lease. Raises `LeaseLost`, and `UsageError` for invalid arguments."""
         try:
-            return await self._client.call(verb, lease=self.id, **args)
+            return await self._client.call(command, lease=self.id, **args)
         except RemoteError as e:
             if e.kind == "LeaseEnded":
                 self.lost = LeaseLost(str(e))

@@ -31,7 +31,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
 from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.children import Child
-from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_here
+from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
 from fieldtwin.run.processes.states import StateWatch, expected_states
@@ -320,7 +320,7 @@ class RunSession(AsyncResource):
             resolved = write_resolved(self.instance.path("prototype.pickle"), self.system, self._prototype)
             config = self._write("field.json", msgspec.structs.replace(self._field_config(run_dir), resolved=resolved))
             client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
-            self._field = await contact_here(client, self.system, run_dir)
+            self._field = await contact_local(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
         self.counted_before, self.clients_before = self._field.counted_before, self._field.clients_before
@@ -361,7 +361,7 @@ class RunSession(AsyncResource):
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
         if device is not None and self.options.prototype and self.options.commands:
-            # Without commands another client uses the remote end (`fieldtwin shore`): two clients would divide the
+            # Without commands another client uses the remote end (`fieldtwin topside`): two clients would divide the
             # responses.
             self.topside = TopsideController(self.system, device, self.far[device], self.clock)
             commands = script(self.options.commands, self.options.duration_s or 20.0)

@@ -47,7 +47,7 @@ class FieldContact:
             await link.end()
 
 
-async def contact_here(client: ControlClient, system: System, run_dir: Path) -> FieldContact:
+async def contact_local(client: ControlClient, system: System, run_dir: Path) -> FieldContact:
     """Return the contact with a field simulator that is a child process of this run."""
     return await _contact(client, system, "localhost", run_dir)
 

@@ -22,7 +22,7 @@ import msgspec
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.processes.children import Child, ChildFailed
-from fieldtwin.run.processes.field_contact import contact_here
+from fieldtwin.run.processes.field_contact import contact_local
 from fieldtwin.run.processes.with_program import END_WITHIN_S, FIELD_LINGER_S, environment
 from fieldtwin.twin.plant.child import end_with_parent
 from fieldtwin.twin.plant.instance import Instance
@@ -73,7 +73,7 @@ class WithController(AsyncResource):
         path.chmod(0o600)
         child = self._child = Child("field", "fieldtwin.twin.prototype.field_process", path, home, FIELD_LINGER_S)
         self._stack.push_async_callback(child.end)
-        contact = await contact_here(await child.connect(), self._system, home)
+        contact = await contact_local(await child.connect(), self._system, home)
         self._stack.push_async_callback(contact.aclose)
         self.env = environment(contact, self._system, child.socket)
         self._process = self._spawned(program)

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.processes.children import Child
-from fieldtwin.run.processes.field_contact import FieldContact, contact_here, reachable
+from fieldtwin.run.processes.field_contact import FieldContact, contact_local, reachable
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
@@ -151,7 +151,7 @@ async def _inside(
     path.chmod(0o600)
     child = Child("field", "fieldtwin.twin.prototype.field_process", path, home.dir, FIELD_LINGER_S)
     try:
-        contact = await contact_here(await child.connect(), system, home.dir)
+        contact = await contact_local(await child.connect(), system, home.dir)
         try:
             env = environment(contact, system, child.socket)
             start_ns = WallClock().monotonic_ns()

@@ -29,8 +29,8 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Impa
         said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
         why = f": {NO_FRESH_START}" if Can.FRESH_START.value in lacking else ""
         return f"the target {target} cannot {', '.join(lacking)}{said}{why}"
-    for danger, what in impacts(scenario):
-        if danger.rank > allowed.rank:
-            said = f"{what} has the impact level {danger.value}, and the target {target} allows {allowed.value}"
-            return f"{said} (--allow {danger.value})"
+    for impact, what in impacts(scenario):
+        if impact.rank > allowed.rank:
+            said = f"{what} has the impact level {impact.value}, and the target {target} allows {allowed.value}"
+            return f"{said} (--allow {impact.value})"
     return ""

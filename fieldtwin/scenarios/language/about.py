@@ -40,7 +40,7 @@ def _danger_of(step: Step) -> Impact:
 
 def impact_of(scenario: Scenario) -> Impact:
     """Return the highest impact level of all its steps and probes."""
-    return max((danger for danger, _ in impacts(scenario)), key=lambda d: d.rank, default=Impact.OBSERVE)
+    return max((impact for impact, _ in impacts(scenario)), key=lambda d: d.rank, default=Impact.OBSERVE)
 
 
 def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) -> ScenarioResult:
@@ -54,6 +54,6 @@ def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) ->
         target=target,
         case=case_of(scenario.path),
         role=ROLE,
-        danger=impact_of(scenario).value,
+        impact=impact_of(scenario).value,
         **more,
     )

@@ -92,7 +92,7 @@ def _steps(system: System, program: str, made: Program, way: tuple[Given, ...]) 
 
 def _message(tag: str, data: bytes) -> tuple[str, str]:
     if tag.endswith(".inbox") and len(data) == 2:
-        return "send", f"{{from: shore, period_s: {decode_period(COMMAND(data))}}}"
+        return "send", f"{{from: topside, period_s: {decode_period(COMMAND(data))}}}"
     return "#", f"a message of {tag}: {data.hex() or 'empty'}"
 
 

@@ -19,7 +19,7 @@ class _Form(BaseModel):
 class SendStep(_Form):
     """The step `send`: the remote client commands a period."""
 
-    from_: str = Field(default="shore", alias="from")
+    from_: str = Field(default="topside", alias="from")
     period_s: int
 
 

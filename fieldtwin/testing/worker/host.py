@@ -57,7 +57,7 @@ class Host:
                 "there is no client on stdin and stdout", expected="pipes, as from a test run", got="a file"
             ) from e
         writer = asyncio.StreamWriter(transport, protocol, None, loop)
-        server = ControlServer(self.verbs())
+        server = ControlServer(self.commands())
         try:
             await server.serve_pipe(reader, writer)
         finally:
@@ -71,7 +71,7 @@ class Host:
             _, bench = self._benches.popitem()
             await bench.aclose()
 
-    def verbs(self) -> dict[str, Any]:
+    def commands(self) -> dict[str, Any]:
         return {
             "hello": self._hello,
             "device": self._device,

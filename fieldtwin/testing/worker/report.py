@@ -15,7 +15,7 @@ _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 def write_report(args: dict[str, Any]) -> None:
     """Write ``file`` from the data of a test run.
 
-    The data are ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role, danger),
+    The data are ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role, impact),
     ``title``, ``reproduce``, ``versions``. Raises `UsageError` for an unknown verdict.
     """
     results = []
@@ -39,7 +39,7 @@ def write_report(args: dict[str, Any]) -> None:
                 took_s=float(test.get("took_s") or 0.0),
                 case=str(test.get("case") or ""),
                 role=str(test.get("role") or ""),
-                danger=str(test.get("danger") or ""),
+                impact=str(test.get("impact") or ""),
             )
         )
     versions = {str(k): str(v) for k, v in dict(args.get("versions") or {}).items()}

@@ -111,13 +111,13 @@ class PlcProcesses:
         value = row["value"]
         return {**row, "value": words.get(str(value), words.get(value, value)), "words": list(words.values())}
 
-    async def steer(self, verb: str, args: dict[str, Any]) -> dict[str, Any]:
+    async def steer(self, command: str, args: dict[str, Any]) -> dict[str, Any]:
         """Execute one of the commands in `STEERING`."""
-        if verb not in STEERING:
-            raise UsageError(f"not a command for a PLC: {verb!r}", expected=", ".join(STEERING))
-        if verb == "step":
+        if command not in STEERING:
+            raise UsageError(f"not a command for a PLC: {command!r}", expected=", ".join(STEERING))
+        if command == "step":
             return {"scans": await step_and_wait(self._call, int(args["count"]), BY)}
-        return await self._call(verb, **args, by=BY)
+        return await self._call(command, **args, by=BY)
 
     def send(self, period_s: int) -> None:
         """Command a period at the remote end."""
@@ -125,11 +125,11 @@ class PlcProcesses:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         self._topside.send(period_s)
 
-    async def _call(self, verb: str, **args: Any) -> dict[str, Any]:
+    async def _call(self, command: str, **args: Any) -> dict[str, Any]:
         self.alive()
         assert self._plc is not None
         try:
-            answer: dict[str, Any] = await self._plc.call(verb, **args)
+            answer: dict[str, Any] = await self._plc.call(command, **args)
         except RemoteError as e:
             if e.remote_exit_code == UsageError.exit_code:
                 raise UsageError(str(e)) from e

@@ -1,6 +1,6 @@
 """Wait for an event with a time limit: the future that is awaited, and the timer that ends the wait.
 
-An event loop for simulated time may offer `alarm(delay_s)`, which returns a future that is done after the delay, or
+An event loop for simulated time may offer `timer(delay_s)`, which returns a future that is done after the delay, or
 earlier if the caller sets its result. This takes half the steps of a future and a timer, which all other loops use.
 """
 
@@ -17,7 +17,7 @@ def start_timeout(
 
     The second value is a function to call after the future was awaited, or None if there is nothing to call.
     """
-    made = getattr(loop, "alarm", None)
+    made = getattr(loop, "timer", None)
     if made is not None:
         return made(delay_s), None
     waiter = loop.create_future()

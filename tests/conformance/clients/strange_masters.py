@@ -1,4 +1,4 @@
-"""Third-party clients, each a program for `fieldtwin check modbus-master|canopen-master -- python strange_masters.py
+"""Third-party clients, each a program for `fieldtwin check modbus-client|canopen-master -- python strange_masters.py
 NAME`.
 
 Each reads two registers (one object) 20 ms after the last answer, with a timeout of 150 ms and without retries. It

@@ -108,7 +108,7 @@ while True:
 
 @pytest.mark.parametrize("pause_s", [0.005, 0.020, 0.100])
 def test_minimalmodbus_fails_on_another_units_reply_at_every_pause(tmp_path: Path, pause_s: float) -> None:
-    args = ("modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "15b")
+    args = ("modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "15b")
     code, found, said = run_check(tmp_path, *args, program=MINIMALMODBUS.format(pause_s=pause_s))
     assert (code, found["MB-015b"][0]) == (1, "failed"), (found, said)
 
@@ -129,7 +129,7 @@ while True:
         print("{good}" % int.from_bytes(reply[-2:], "big"), flush=True)
     time.sleep(0.02)
 """
-MODBUS = ("modbus-master", "--listen", "tcp://127.0.0.1:0", "--timeout", "5s", "--only", "21,24")
+MODBUS = ("modbus-client", "--listen", "tcp://127.0.0.1:0", "--timeout", "5s", "--only", "21,24")
 
 
 @pytest.mark.parametrize("value", ["0", "42", "65535", "0.0"])

@@ -164,7 +164,7 @@ while True:
 
 def _check(folder: Path, fail_on: tuple[str, ...], *more: str) -> subprocess.CompletedProcess[str]:
     (folder / "master.py").write_text(TAKES_ANY_UNIT)
-    words = ["check", "modbus-master", "--listen", "tcp://127.0.0.1:0", "--timeout", "1s", "--probe", "output"]
+    words = ["check", "modbus-client", "--listen", "tcp://127.0.0.1:0", "--timeout", "1s", "--probe", "output"]
     argv = [sys.executable, "-m", "fieldtwin", *words, "--only", "15a,56a", *fail_on, *more]
     return subprocess.run(
         [*argv, "--", sys.executable, "master.py"],

@@ -102,7 +102,7 @@ def run_check(
 
 def test_pymodbus_hands_a_late_rtu_reply_to_the_next_request(tmp_path: Path) -> None:
     code, found, said = run_check(
-        tmp_path, "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "13,14,16",
+        tmp_path, "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "13,14,16",
         "--junit", str(tmp_path / "j.xml"), program=PYMODBUS,
     )  # fmt: skip
     assert code == 1, said
@@ -127,7 +127,7 @@ def test_canopens_client_takes_a_29_bit_frame_for_an_answer(tmp_path: Path) -> N
 def test_a_program_that_never_asks_is_reported_with_its_last_output(tmp_path: Path) -> None:
     code, found, said = run_check(
         tmp_path,
-        "modbus-master",
+        "modbus-client",
         "--listen",
         "tcp://127.0.0.1:0",
         "--only",
@@ -142,13 +142,13 @@ def test_a_program_that_never_asks_is_reported_with_its_last_output(tmp_path: Pa
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["modbus-master"], "no endpoint to listen on"),
-        (["modbus-master", "--listen", "can:fieldtwin/x:1"], "the endpoint for the client or master"),
-        (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--only", "MB-0133"], "no case 'MB-0133'"),
-        (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--values", "1,2"], "three different numbers"),
-        (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--probe", "output"], "nothing prints"),
-        (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--probe", "tcp://x"], "a probe"),
-        (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--hold", "holding:x=1"], "--hold"),
+        (["modbus-client"], "no endpoint to listen on"),
+        (["modbus-client", "--listen", "can:fieldtwin/x:1"], "the endpoint for the client or master"),
+        (["modbus-client", "--listen", "tcp://127.0.0.1:0", "--only", "MB-0133"], "no case 'MB-0133'"),
+        (["modbus-client", "--listen", "tcp://127.0.0.1:0", "--values", "1,2"], "three different numbers"),
+        (["modbus-client", "--listen", "tcp://127.0.0.1:0", "--probe", "output"], "nothing prints"),
+        (["modbus-client", "--listen", "tcp://127.0.0.1:0", "--probe", "tcp://x"], "a probe"),
+        (["modbus-client", "--listen", "tcp://127.0.0.1:0", "--hold", "holding:x=1"], "--hold"),
         (["canopen-master", "--listen", "tcp://127.0.0.1:0"], "the endpoint for the client or master"),
         (["canopen-master", "--listen", "can:fieldtwin/127.0.0.1:0", "--hold", "6041=1"], "--hold"),
     ],
@@ -172,7 +172,7 @@ def test_the_docs_have_every_case() -> None:
     for case in (*CASES, *CANOPEN_CASES):
         about = case.about
         case_of = f"{about.title}: it {about.does} | {about.must}"
-        row = f"| {about.id} | {about.bases} | {about.danger.value} | {case_of} | {about.sources} |"
+        row = f"| {about.id} | {about.bases} | {about.impact.value} | {case_of} | {about.sources} |"
         assert row in text, row
 
 
@@ -205,7 +205,7 @@ while True:
 @pytest.mark.parametrize(("again", "verdict"), [(True, "passed"), (False, "failed")])
 def test_a_port_that_is_unplugged_comes_back_under_its_name(tmp_path: Path, again: bool, verdict: str) -> None:
     code, found, said = run_check(
-        tmp_path, "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66",
+        tmp_path, "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66",
         program=OPENS_AGAIN % again,
     )  # fmt: skip
     assert found["MB-066"][0] == verdict, said

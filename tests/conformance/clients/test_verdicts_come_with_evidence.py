@@ -46,7 +46,7 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     (tmp_path / "master.py").write_text(TAKES_ALL)
     words = [
         "check",
-        "modbus-master",
+        "modbus-client",
         "--listen",
         "tcp://127.0.0.1:0",
         "--timeout",
@@ -64,7 +64,7 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     assert (document["kind"], document["version"]) == ("fieldtwin check-master", 1)
     about = document["about"]
     assert (about["protocol"], about["endpoint"], about["at_most"]) == ("modbus", "tcp://127.0.0.1:0", "disrupt")
-    assert about["command"].startswith("fieldtwin check modbus-master")
+    assert about["command"].startswith("fieldtwin check modbus-client")
     results = {case["id"]: case for case in document["cases"]}
     assert document["counts"] == dict(Counter(case["verdict"] for case in results.values()))
     case = results["MB-056a"]
@@ -97,13 +97,13 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     ("argv", "line"),
     [
         (
-            "check modbus-master --listen x -- my_driver --only 3",
-            "fieldtwin check modbus-master --only MB-013 --listen x -- my_driver --only 3",
+            "check modbus-client --listen x -- my_driver --only 3",
+            "fieldtwin check modbus-client --only MB-013 --listen x -- my_driver --only 3",
         ),
-        ("check modbus-master --only 13,14 --listen x", "fieldtwin check modbus-master --only MB-013 --listen x"),
+        ("check modbus-client --only 13,14 --listen x", "fieldtwin check modbus-client --only MB-013 --listen x"),
         (
-            "check modbus-master --only=13 --listen x -- d",
-            "fieldtwin check modbus-master --only MB-013 --listen x -- d",
+            "check modbus-client --only=13 --listen x -- d",
+            "fieldtwin check modbus-client --only MB-013 --listen x -- d",
         ),
     ],
 )
@@ -166,7 +166,7 @@ def test_a_port_that_the_case_releases_is_not_a_connection_of_the_client(tmp_pat
     """Defect: the evidence said that the client opened a connection, but the reason said that the client sent nothing
     any more."""
     (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)
-    words = ["check", "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
+    words = ["check", "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
     words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "master.py"]
     (result,) = json.loads(_run(words, tmp_path).stdout)["cases"]
     assert (result["verdict"], "it has stopped" in result["reason"]) == ("failed", True), result

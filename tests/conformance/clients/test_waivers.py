@@ -80,11 +80,11 @@ def test_a_bad_file_is_reported_with_its_place(old: str, new: str, says: str) ->
 
 def test_results_as_json_and_junit(tmp_path: Path) -> None:
     results = [CaseResult(CASE, failed("published 3333"), 1.5), CaseResult(CASE, skipped("no probe"))]
-    first, second = as_json({}, results, ["check", "modbus-master"])["cases"]
-    assert json.loads(json.dumps(first))["danger"] == "read"
+    first, second = as_json({}, results, ["check", "modbus-client"])["cases"]
+    assert json.loads(json.dumps(first))["impact"] == "read"
     assert (first["verdict"], second["verdict"]) == ("failed", "skipped")
     write_junit(
-        as_report(results, "master", ["check", "modbus-master"], "2027-01-01T00:00:00+00:00"), tmp_path / "j.xml"
+        as_report(results, "master", ["check", "modbus-client"], "2027-01-01T00:00:00+00:00"), tmp_path / "j.xml"
     )
     suite = ET.parse(tmp_path / "j.xml").getroot().find("testsuite")
     assert suite is not None
@@ -95,6 +95,6 @@ def test_results_as_json_and_junit(tmp_path: Path) -> None:
     assert "--only MB-015a" in (failure.text or "")
     about = {p.get("name"): p.get("value") for p in suite.findall("testcase[1]/properties/property")}
     assert about == {
-        "case": "MB-015a", "role": "master", "danger": "read", "requirement": "MB-015",
+        "case": "MB-015a", "role": "master", "impact": "read", "requirement": "MB-015",
         "basis": "standard", "clause": "SL 2.4.1; libmodbus PR #860",
     }  # fmt: skip

@@ -58,7 +58,7 @@ def test_without_permission_only_reads_are_sent(url: str) -> None:
     assert len(unit.asked) > 20
     assert {pdu[0] for pdu in unit.asked} <= READS
     assert before == bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
-    assert all(not r.spoken for r in results if r.case.danger.rank > Impact.READ.rank)
+    assert all(not r.spoken for r in results if r.case.impact.rank > Impact.READ.rank)
 
 
 def test_with_write_permission_only_the_given_cells_change_and_are_restored() -> None:
@@ -73,7 +73,7 @@ def test_with_write_permission_only_the_given_cells_change_and_are_restored() ->
     assert aimed == {(199).to_bytes(2), (3).to_bytes(2)}
     assert [unit.bank.peek("holding", at) for at in range(200)] == held  # type: ignore[attr-defined]
     assert unit.bank.peek("coil", 3) == 1  # type: ignore[attr-defined]
-    assert all(r.verdict is Verdict.PASSED for r in results if r.case.danger is Impact.WRITE)
+    assert all(r.verdict is Verdict.PASSED for r in results if r.case.impact is Impact.WRITE)
 
 
 def test_a_wire_refuses_requests_above_the_impact_level() -> None:
@@ -85,7 +85,7 @@ def test_a_wire_refuses_requests_above_the_impact_level() -> None:
         for pdu in (b"\x06\0\0\0\0", b"\x2b\x0d\0", b"\x08\0\0\0\0", b"\x64", b"\x83\0\0\0\x01"):
             with pytest.raises(Bug):
                 await wire.ask(pdu)
-        wire.danger = Impact.WRITE
+        wire.impact = Impact.WRITE
         with pytest.raises(Bug):
             await wire.ask(b"\x08\0\0\0\0")
 
@@ -190,7 +190,7 @@ def test_a_dry_run_of_a_node(tmp_path: Path) -> None:
 
 def test_lists() -> None:
     listed = json.loads(fieldtwin("modbus", "--list", "--json").output)
-    assert {c["danger"] for c in listed} == {"read", "write", "disrupt"}
+    assert {c["impact"] for c in listed} == {"read", "write", "disrupt"}
     assert len(json.loads(fieldtwin("canopen", "--list", "--json").output)) > 40
 
 
@@ -201,6 +201,6 @@ def test_the_docs_have_every_case() -> None:
     for case in (*CASES, *CANOPEN_CASES):
         row = f"{case.title}: {case.does} | {case.must} | {case.sources} |"
         assert any(
-            line.startswith(f"| {case.id} | {case.bases} | {case.danger.value} |") and line.endswith(row)
+            line.startswith(f"| {case.id} | {case.bases} | {case.impact.value} |") and line.endswith(row)
             for line in text.split("\n")
         ), row

@@ -79,7 +79,7 @@ def test_files_and_exit_code(device: str, tmp_path: Path) -> None:
     assert data["about"]["identity"]["product code"] == "FT-1"
     assert data["about"]["by"] == "A. Fitter"
     case = next(case for case in data["cases"] if case["id"] == "MB-036a")
-    assert (case["verdict"], case["danger"], case["clause"], case["role"]) == ("failed", "read", "AP 6", "device")
+    assert (case["verdict"], case["impact"], case["clause"], case["role"]) == ("failed", "read", "AP 6", "device")
     sent, received = (line["data"] for line in case["wire"])
     assert sent[6:] == "00 00 00 06 01 03 00 00 00 00"
     assert received[6:] == "00 00 00 03 01 83 04"

@@ -235,7 +235,7 @@ def test_the_report_of_a_check_shows_bytes_and_escapes_text_of_devices() -> None
         "01 03",
         "1.5 ms",
         CASES[1].clause,
-        "danger",
+        "impact",
         "A. Fitter",
         "failed",
         f"--unit 17 --only {CASES[1].id}",
@@ -252,7 +252,7 @@ def test_junit_has_each_case_with_its_bytes() -> None:
     assert f"--only {CASES[1].id}" in xml
     assert f'<property name="case" value="{CASES[1].id}" />' in xml
     assert xml.count('<property name="role" value="device" />') == len(RESULTS)
-    assert xml.count(f'<property name="danger" value="{CASES[1].danger.value}" />') >= 1
+    assert xml.count(f'<property name="impact" value="{CASES[1].impact.value}" />') >= 1
 
 
 JSON = st.recursive(

@@ -83,7 +83,7 @@ def test_cancelled_timers_never_run_and_take_no_room() -> None:
             timer = loop.call_later(1 + n / 1000, ran.append, n)
             if n % 1_000:
                 timer.cancel()
-            loop.alarm(100).set_result(None)  # one that ends before its time counts as cancelled
+            loop.timer(100).set_result(None)  # one that ends before its time counts as cancelled
             most = max(most, len(loop._timers))
         await asyncio.sleep(30)
         return most

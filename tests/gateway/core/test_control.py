@@ -47,7 +47,7 @@ async def never(args: dict[str, Any]) -> Any:
     await asyncio.Event().wait()
 
 
-VERBS = {"echo": echo, "refuse": refuse, "broken": broken, "unspeakable": unspeakable, "never": never}
+COMMANDS = {"echo": echo, "refuse": refuse, "broken": broken, "unspeakable": unspeakable, "never": never}
 
 
 class Part(msgspec.Struct):
@@ -64,12 +64,12 @@ async def whole(args: dict[str, Any]) -> Any:
     return Whole("w", {"a": Part(3)})
 
 
-VERBS["whole"] = whole
+COMMANDS["whole"] = whole
 
 
 @contextlib.asynccontextmanager
 async def serving(path: Path, token: str = "") -> AsyncIterator[ControlServer]:
-    server = ControlServer(VERBS, token)
+    server = ControlServer(COMMANDS, token)
     await server.listen_unix(path)
     try:
         yield server
@@ -107,7 +107,7 @@ def test_a_command_is_served_and_its_errors_keep_their_kind(tmp_path: Path) -> N
             assert caught.value.kind == "Bug"
             with pytest.raises(RemoteError, match="unknown command 'fault'") as caught:
                 await client.call("fault")
-            assert "echo" in str(caught.value), "says which verbs there are"
+            assert "echo" in str(caught.value), "says which commands there are"
             with pytest.raises(RemoteError) as caught:
                 await client.call("unspeakable")
             assert caught.value.kind == "Bug"
@@ -124,11 +124,11 @@ def test_a_command_is_served_and_its_errors_keep_their_kind(tmp_path: Path) -> N
         b"\xff\xfe\x00",
         b"[]",
         b"null",
-        b'{"v": 2, "id": 1, "verb": "echo"}',
-        b'{"v": 1, "id": 1, "verb": "echo", "args": [1]}',
+        b'{"v": 2, "id": 1, "command": "echo"}',
+        b'{"v": 1, "id": 1, "command": "echo", "args": [1]}',
         b"[" * 100_000,
         b"1" * 10_000,
-        b'{"v": 1, "verb": ["echo"]}',
+        b'{"v": 1, "command": ["echo"]}',
     ],
     ids=lambda line: repr(line[:24]),
 )
@@ -138,7 +138,7 @@ def test_garbage_is_answered_as_the_callers_mistake_and_the_channel_stays_open(t
             answer = await ask(reader, writer, line)
             assert answer["ok"] is False
             assert answer["error"]["kind"] == "UsageError"
-            answer = await ask(reader, writer, b'{"v": 1, "id": "x", "verb": "echo", "args": {"a": 1}}')
+            answer = await ask(reader, writer, b'{"v": 1, "id": "x", "command": "echo", "args": {"a": 1}}')
             assert answer == {"v": 1, "id": "x", "ok": True, "result": {"a": 1}}
 
     run(main())
@@ -178,23 +178,23 @@ def test_a_stale_socket_is_replaced_and_a_living_one_or_a_file_is_not(tmp_path: 
             killed.bind(str(tmp_path / "s"))  # as after kill -9: the file without a listener
         async with serving(tmp_path / "s"):
             with pytest.raises(EndpointBusy, match="another process"):
-                await ControlServer(VERBS).listen_unix(tmp_path / "s")
+                await ControlServer(COMMANDS).listen_unix(tmp_path / "s")
             client = await ControlClient.connect_unix(tmp_path / "s")
             assert await client.call("echo") == {}
             await client.aclose()
         (tmp_path / "file").write_text("precious")
         with pytest.raises(Unreachable):
-            await ControlServer(VERBS).listen_unix(tmp_path / "file")
+            await ControlServer(COMMANDS).listen_unix(tmp_path / "file")
         assert (tmp_path / "file").read_text() == "precious"
         with pytest.raises(Unreachable):
-            await ControlServer(VERBS).listen_unix(tmp_path / ("x" * 200))
+            await ControlServer(COMMANDS).listen_unix(tmp_path / ("x" * 200))
 
     run(main())
 
 
 def test_over_tcp_the_token_is_needed(tmp_path: Path) -> None:
     async def main() -> None:
-        server = ControlServer(VERBS, token="sesam")
+        server = ControlServer(COMMANDS, token="sesam")
         port = await server.listen_tcp("127.0.0.1", 0)
         for token in ("", "sesan", "sésame"):
             stranger = await ControlClient.connect_tcp("127.0.0.1", port, token)
@@ -206,10 +206,10 @@ def test_over_tcp_the_token_is_needed(tmp_path: Path) -> None:
         assert await friend.call("echo", a=1) == {"a": 1}
         await friend.aclose()
         with pytest.raises(Unreachable):
-            await ControlServer(VERBS).listen_tcp("127.0.0.1", port)
+            await ControlServer(COMMANDS).listen_tcp("127.0.0.1", port)
         await server.aclose()
         with pytest.raises(UsageError, match="needs a token"):
-            await ControlServer(VERBS).listen_tcp("0.0.0.0", 0)
+            await ControlServer(COMMANDS).listen_tcp("0.0.0.0", 0)
 
     run(main())
 

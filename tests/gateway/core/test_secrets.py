@@ -23,7 +23,7 @@ from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 
 CHECKOUT = Path(__file__).parents[3]
 WORD = "s3cret"
-WITH_SECRETS = ("run", "emulate", "shore", "test")
+WITH_SECRETS = ("run", "emulate", "topside", "test")
 TEXT = st.text("abcdefghijklmnopqrstuvwxyz0123456789!$-_.", min_size=1, max_size=12)
 
 

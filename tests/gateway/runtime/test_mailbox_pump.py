@@ -26,8 +26,8 @@ def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
     async def main() -> None:
         system = load_system("observatory")
         async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run, Nursery() as nursery:
-            shore = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
-            nursery.start(shore.run([]), "topside")
+            topside = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
+            nursery.start(topside.run([]), "topside")
             await asyncio.sleep(3.0)
             pump = run.gateway.pumps[0]
             pump.offer([bytes(64)] * 30)  # more than the modem and its link accept at once
@@ -51,10 +51,10 @@ def test_nor_is_the_far_ends(tmp_path: Path) -> None:
     async def main() -> None:
         system = load_system("observatory")
         async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run, Nursery() as nursery:
-            shore = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
-            nursery.start(shore.run([]), "topside")
+            topside = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
+            nursery.start(topside.run([]), "topside")
             await asyncio.sleep(3.0)
-            far = shore._driver
+            far = topside._driver
             for _ in range(80):
                 far.consumer.observe(COMMAND(bytes(64)))
             while (

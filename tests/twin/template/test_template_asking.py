@@ -62,7 +62,7 @@ def fieldtwin(*words: object) -> Result:
     return CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
 
 
-VERBS = {
+COMMANDS = {
     "run --prototype": ("run", "X", "--prototype"),
     "simulate": ("simulate", "X", "--for", "1s"),
     "run --plant": ("run", "X", "--plant"),
@@ -97,14 +97,14 @@ OPENS_NOTHING = {
 
 
 @pytest.mark.parametrize("form", ["a file inside", "a folder", "a zip"])
-@pytest.mark.parametrize("verb", list(VERBS))
-def test_every_command_asks_before_anything_of_a_template_is_run_or_opened(site: Site, verb: str, form: str) -> None:
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_command_asks_before_anything_of_a_template_is_run_or_opened(site: Site, command: str, form: str) -> None:
     named = {"a file inside": site.system, "a folder": site.folder, "a zip": site.zip}[form]
-    done = fieldtwin(*(named if word == "X" else word for word in VERBS[verb]))
+    done = fieldtwin(*(named if word == "X" else word for word in COMMANDS[command]))
     assert isinstance(done.exception, NotAllowed), (done.output, done.exception)
     assert "nothing of this template was run" in str(done.exception)
     assert ", ".join(CODE) in done.stderr.replace("\n", " ")
-    assert ("it sends on can:socketcan/can0" in done.stderr) is (verb not in OPENS_NOTHING)
+    assert ("it sends on can:socketcan/can0" in done.stderr) is (command not in OPENS_NOTHING)
     assert not site.ran()
 
 
@@ -217,12 +217,12 @@ def test_commands_that_run_and_open_nothing_do_not_ask(site: Site) -> None:
     assert not site.ran()
 
 
-@pytest.mark.parametrize("verb", ["system", "program"])
-def test_a_test_run_has_no_user_to_ask_and_needs_an_option(site: Site, verb: str) -> None:
+@pytest.mark.parametrize("command", ["system", "program"])
+def test_a_test_run_has_no_user_to_ask_and_needs_an_option(site: Site, command: str) -> None:
     args = {"system": str(site.system), "source": "count", "folders": [str(site.system.parent)]}
     with pytest.raises(NotAllowed, match="nothing of this template was run"):
-        asyncio.run(Host().verbs()[verb](args))
+        asyncio.run(Host().commands()[command](args))
     assert not site.ran()
-    if verb == "program":
-        answer = asyncio.run(Host(trust=True).verbs()[verb](args))
+    if command == "program":
+        answer = asyncio.run(Host(trust=True).commands()[command](args))
         assert answer["id"] == 1

@@ -36,13 +36,13 @@ def _case(
     title: str,
     basis: Basis,
     clause: str,
-    danger: Impact,
+    impact: Impact,
     play: SdoReplyFunction,
     judge: CheckFunction,
     does: str,
     must: str,
 ) -> CanopenCase:
-    return CanopenCase(ClientCase(id, title, clause, danger, does, must, judge, basis=basis), play)
+    return CanopenCase(ClientCase(id, title, clause, impact, does, must, judge, basis=basis), play)
 
 
 def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction, must: str) -> CanopenCase:

@@ -33,13 +33,13 @@ def _case(
     title: str,
     basis: Basis,
     clause: str,
-    danger: Impact,
+    impact: Impact,
     play: ReplyFunction,
     judge: CheckFunction,
     does: str,
     must: str,
 ) -> ModbusCase:
-    return ModbusCase(ClientCase(id, title, clause, danger, does, must, judge, basis=basis), play)
+    return ModbusCase(ClientCase(id, title, clause, impact, does, must, judge, basis=basis), play)
 
 
 def _bad(

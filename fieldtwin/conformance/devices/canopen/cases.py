@@ -24,14 +24,14 @@ def case(
     id: str,
     title: str,
     clause: str,
-    danger: Impact,
+    impact: Impact,
     does: str,
     must: str,
     play: CaseProcedure[NodeConnection],
     needs: tuple[str, ...] = (),
     basis: Basis = Basis.STANDARD,
 ) -> CanopenCase:
-    return DeviceCase(id, title, clause, danger, does, must, play, needs=needs, basis=basis)
+    return DeviceCase(id, title, clause, impact, does, must, play, needs=needs, basis=basis)
 
 
 robust = partial(case, basis=Basis.ROBUSTNESS)

@@ -84,7 +84,7 @@ class NodeConnection:
     ) -> None:
         self.node, self.timeout_s, self.boot_s = node, timeout_s, boot_s
         self.may_write, self.dictionary = may_write, dictionary
-        self.danger = Impact.READ
+        self.impact = Impact.READ
         self.traits = frozenset({"can"})
         self.device_type = b""
         """The node's answer for 1000h without faults: an object that every node has (7.5.2.1)."""
@@ -108,13 +108,13 @@ class NodeConnection:
         self._sent_ns = self.clock.monotonic_ns()
 
     def _must_be_allowed(self, frame: CanFrame) -> None:
-        if self.danger is Impact.DISRUPT:
+        if self.impact is Impact.DISRUPT:
             return
         specifier = frame.data[0] >> 5 if frame.data else -1
         to_server = frame.can_id == SDO_REQUEST + self.node and not frame.remote
-        if to_server and (specifier in READS or (self.danger is Impact.WRITE and specifier in WRITES)):
+        if to_server and (specifier in READS or (self.impact is Impact.WRITE and specifier in WRITES)):
             return
-        raise Bug(f"a check of danger {self.danger.value} would send {frame}")
+        raise Bug(f"a check with impact level {self.impact.value} would send {frame}")
 
     async def hear(self, cob_id: int, within_s: float | None = None, *, remote: bool = False) -> CanFrame | None:
         """Return the next frame with that identifier, None if none came in time; other frames are kept for `seen`."""

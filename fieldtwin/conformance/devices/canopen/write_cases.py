@@ -29,7 +29,7 @@ async def _borrowed(wire: NodeConnection, key: Key) -> AsyncIterator[bytes]:
         yield before
     finally:
         if await wire.upload(key) != before:
-            wire.danger = max(wire.danger, Impact.WRITE, key=lambda danger: danger.rank)
+            wire.impact = max(wire.impact, Impact.WRITE, key=lambda impact: impact.rank)
             await wire.download(key, before)
             now = await wire.upload(key)
             if now != before:

@@ -32,7 +32,7 @@ def case(
     id: str,
     title: str,
     clause: str,
-    danger: Impact,
+    impact: Impact,
     does: str,
     must: str,
     play: CaseProcedure[DeviceConnection],
@@ -41,7 +41,7 @@ def case(
     basis: Basis = Basis.STANDARD,
     elsewhere: tuple[Elsewhere, ...] = (),
 ) -> ModbusCase:
-    return DeviceCase(id, title, clause, danger, does, must, play, wires, needs, basis=basis, elsewhere=elsewhere)
+    return DeviceCase(id, title, clause, impact, does, must, play, wires, needs, basis=basis, elsewhere=elsewhere)
 
 
 robust = partial(case, basis=Basis.ROBUSTNESS)

@@ -83,7 +83,7 @@ class DeviceConnection:
         self.timeout_s, self.char_s = timeout_s, char_s
         self.pause_s = max(4 * char_s, 0.005)
         """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with something to spare."""
-        self.danger = Impact.READ
+        self.impact = Impact.READ
         self.good = b""
         """The request that tests normal operation: a read."""
         self.good_reply = b""
@@ -152,11 +152,11 @@ class DeviceConnection:
         self._quiet_since_ns = self.clock.monotonic_ns() + round(len(data) * self.char_s * NS_PER_S)
 
     def _must_be_allowed(self, pdu: bytes) -> None:
-        if self.danger is Impact.DISRUPT or (pdu[0] in READS and (pdu[0] != 0x2B or pdu[:2] == IDENTIFICATION)):
+        if self.impact is Impact.DISRUPT or (pdu[0] in READS and (pdu[0] != 0x2B or pdu[:2] == IDENTIFICATION)):
             return
-        if self.danger is Impact.WRITE and pdu[0] in WRITES:
+        if self.impact is Impact.WRITE and pdu[0] in WRITES:
             return
-        raise Bug(f"a check of danger {self.danger.value} would send function {pdu[0]:02X}h")
+        raise Bug(f"a check with impact level {self.impact.value} would send function {pdu[0]:02X}h")
 
     async def _rest(self) -> None:
         await self.clock.sleep_until_ns(self._quiet_since_ns + round(self._spacing_s * NS_PER_S))

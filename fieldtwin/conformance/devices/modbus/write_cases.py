@@ -42,7 +42,7 @@ async def _borrowed(wire: DeviceConnection, table: str) -> AsyncIterator[tuple[i
         yield address, before
     finally:
         if await _read(wire, table, address) != before:
-            wire.danger = max(wire.danger, Impact.WRITE, key=lambda d: d.rank)
+            wire.impact = max(wire.impact, Impact.WRITE, key=lambda d: d.rank)
             await wire.ask(_write(table, address, before))
             now = await _read(wire, table, address)
             if now != before:

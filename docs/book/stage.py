@@ -18,9 +18,11 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(Path(__file__).parent) not in sys.path:
     sys.path.insert(0, str(Path(__file__).parent))
 
+from case_pages import case_pages  # noqa: E402
 from cli_page import cli_page  # noqa: E402
 from explain_page import explain_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
+from league import league_page  # noqa: E402
 from paper_page import paper_page  # noqa: E402
 
 PAPERS = {  # file of the repository: page of the book
@@ -41,7 +43,7 @@ FOLDERS = {"docs/decisions": "decisions/README.md", "docs": "index.md", "example
 FOLDERS |= {f"docs/{kind}": f"{kind}/README.md" for kind in KINDS}
 GENERATED = (
     *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
-    *("reference/explanations.md", "reference/paper.md"),
+    *("reference/explanations.md", "reference/paper.md", "reference/league.md", "reference/cases/README.md"),
 )
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
@@ -147,6 +149,8 @@ def generated() -> dict[str, str]:
         **form_pages(),
         "reference/explanations.md": explain_page(),
         "reference/paper.md": paper_page(),
+        "reference/league.md": league_page(),
+        **case_pages(),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from fieldtwin.book import case_page
 from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_MASTERS
 from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_CLIENTS
 from fieldtwin.conformance.core.case import About, Basis
@@ -11,13 +12,14 @@ from fieldtwin.conformance.devices.canopen.cases import CASES as CANOPEN_DEVICES
 from fieldtwin.conformance.devices.modbus.cases import CASES as MODBUS_DEVICES
 from fieldtwin.explain.explanation import Explanation
 
-_LISTS: tuple[tuple[str, str, Sequence[About]], ...] = (
+LISTS: tuple[tuple[str, str, Sequence[About]], ...] = (
     ("modbus", "a Modbus device", MODBUS_DEVICES),
     ("modbus-client", "a Modbus client", [case.about for case in MODBUS_CLIENTS]),
     ("canopen", "a CANopen node", CANOPEN_DEVICES),
     ("canopen-master", "a CANopen master", [case.about for case in CANOPEN_MASTERS]),
 )
-_WEIGHT = {
+"""The lists of test cases: the command that runs them, what they test, and the cases."""
+WEIGHT = {
     Basis.STANDARD: "The standard requires it: a failure is a deviation.",
     Basis.ROBUSTNESS: "No clause requires it: a failure means less tolerance than possible, not a deviation.",
     Basis.FIELD: "No clause requires it, but known products fail here, so a failure can cause trouble in the field.",
@@ -47,7 +49,7 @@ def spelled_out(sources: str) -> str:
 
 def _entries() -> Iterable[Explanation]:
     found: dict[str, list[tuple[str, str, About]]] = {}
-    for command, tested, cases in _LISTS:
+    for command, tested, cases in LISTS:
         for case in cases:
             found.setdefault(case.id, []).append((command, tested, case))
     for id, of in sorted(found.items()):
@@ -56,7 +58,7 @@ def _entries() -> Iterable[Explanation]:
             sent = (
                 f"fieldtwin {case.does or 'only listens'}" if case.role == "master" else f"fieldtwin sends: {case.does}"
             )
-            meaning.append(f"Test of {tested}: {sent}. Expected: {case.must or 'go on'}. {_WEIGHT[case.basis]}")
+            meaning.append(f"Test of {tested}: {sent}. Expected: {case.must or 'go on'}. {WEIGHT[case.basis]}")
         run = " or ".join(f"`fieldtwin check {command} ... --only {id}`" for command, _, _ in of)
         sources = spelled_out("; ".join(case.sources for _, _, case in of if case.sources))
         row = of[0][2].row
@@ -64,7 +66,7 @@ def _entries() -> Iterable[Explanation]:
             id, "test case", of[0][2].title, " ".join(meaning),
             f"Repeat it alone with {run}; the report and `--json` have its frames. It has the impact level "
             f"`{of[0][2].impact.value}`.",
-            sources, (row,) if row != id else (),
+            sources, (row,) if row != id else (), case_page(id),
         )  # fmt: skip
 
 

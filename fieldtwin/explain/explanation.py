@@ -11,7 +11,7 @@ class Explanation:
 
     `id` is what is printed elsewhere, such as ``MB-015`` or ``exception 02``. `also` are further spellings that find it.
     `meaning` says in a few sentences what it is and how it comes about, `todo` what to do. `source` is the clause of the
-    standard, or the page of the documentation.
+    standard, or the page of the documentation. `page` is the page of the book about this entry alone, if there is one.
     """
 
     id: str
@@ -21,6 +21,7 @@ class Explanation:
     todo: str
     source: str = ""
     also: tuple[str, ...] = ()
+    page: str = ""
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from enum import Enum
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from fieldtwin.book import case_url
 from fieldtwin.reports.file import put
 from fieldtwin.reports.markup import clean
 from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
@@ -80,6 +81,8 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
     facts = [
         (name, value) for name in ("case", "role", "impact", "basis", "clause") if (value := getattr(scenario, name))
     ]
+    if url := case_url(scenario.case):
+        facts.append(("page", url))
     if scenario.file:  # not an attribute, for which Jenkins' xUnit plugin skips the file
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
     if scenario.earlier:

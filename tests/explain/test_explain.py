@@ -107,4 +107,4 @@ def test_without_a_word_all_are_listed_and_json_has_the_same() -> None:
     )
     assert len(data) == len(everything())
     assert all(entry["id"] in listed for entry in data)
-    assert {"id", "kind", "title", "meaning", "todo", "source", "also"} == set(data[0])
+    assert {"id", "kind", "title", "meaning", "todo", "source", "also", "page"} == set(data[0])

@@ -23,6 +23,7 @@ from fieldtwin.gateway.protocols.modbus.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 HERE = Path(__file__).parent
+SERVERS = HERE.parents[1] / "scripts" / "league_programs" / "servers.py"
 VECTORS = HERE.parent / "vectors"
 PEERS = {"pymodbus": ("rtu", "ascii", "mbap", "udp"), "libmodbus": ("rtu", "mbap")}
 """The wires that each peer can serve."""
@@ -232,7 +233,7 @@ async def play_on(peer: str, rows: list[Row]) -> dict[str, str]:
         stage = Stage(peer, rows, stack)
         jobs = json.dumps(stage.jobs()).encode() + b"\n"
         program = await asyncio.create_subprocess_exec(
-            sys.executable, str(HERE / "strange_slaves.py"), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+            sys.executable, str(SERVERS), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
         )  # fmt: skip
         assert program.stdin is not None
         assert program.stdout is not None

@@ -22,6 +22,7 @@ from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanO
 from fieldtwin.gateway.core.files.profile import load_profile
 
 HERE = Path(__file__).parent
+SERVERS = HERE.parents[1] / "scripts" / "league_programs" / "servers.py"
 PEERS = [
     "pymodbus",
     pytest.param(
@@ -37,7 +38,7 @@ async def serving(peer: str, wire: str, units: list[int], line: str = "") -> Asy
     """Start the server and return its port."""
     job: dict[str, Any] = {"row": 0, "wire": wire, "units": units, "line": line}
     program = await asyncio.create_subprocess_exec(
-        sys.executable, str(HERE / "strange_slaves.py"), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+        sys.executable, str(SERVERS), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
     )  # fmt: skip
     assert program.stdin is not None
     assert program.stdout is not None

@@ -32,7 +32,7 @@ from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = pytest.mark.interop
-PROGRAM = Path(__file__).with_name("strange_slaves.py")
+PROGRAM = Path(__file__).parents[2] / "scripts" / "league_programs" / "servers.py"
 SPOKEN = [
     *[(name, wire) for name in ("libmodbus", "pymodbus", "umodbus") for wire in ("rtu", "mbap")],
     ("pyModbusTCP", "mbap"),

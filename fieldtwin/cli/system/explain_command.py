@@ -10,6 +10,7 @@ from itertools import groupby
 import click
 from rich.padding import Padding
 
+from fieldtwin.book import base_url
 from fieldtwin.cli.completions import explained
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import stdout
@@ -44,6 +45,9 @@ def command(words: tuple[str, ...], as_json: bool) -> int:
         stdout.print(f"[bold]{entry.id}[/bold]  {entry.kind}: {entry.title}", highlight=False)
         stdout.print(Padding(entry.meaning, (0, 0, 0, 2), expand=False), highlight=False, markup=False)
         stdout.print(Padding(f"What to do: {entry.todo}", (0, 0, 0, 2), expand=False), highlight=False, markup=False)
+        if entry.page:
+            where = f"{base_url()}/{entry.page}" if base_url() else f"{entry.page} (built by scripts/docs)"
+            stdout.print(Padding(f"Page: {where}", (0, 0, 0, 2), expand=False), highlight=False, markup=False)
         if entry.source:
             stdout.print(Padding(f"Source: {entry.source}", (0, 0, 0, 2), expand=False), highlight=False, markup=False)
     return 0

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any, TypeVar
 
+from fieldtwin.book import case_url
 from fieldtwin.conformance.core.case import About, Basis, Finding, failed
 from fieldtwin.conformance.core.evidence import Line
 from fieldtwin.conformance.core.waivers import Waivers
@@ -118,6 +119,7 @@ def case_json(result: CaseResult, action: str, **more: Any) -> dict[str, Any]:
         "reason": result.reason,
         "waived": bool(result.waived),
         "took_s": round(result.took_s, 3),
+        **({"page": url} if (url := case_url(case.id)) else {}),
         **more,
     }
 

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from fieldtwin.book import case_url
 from fieldtwin.conformance.core.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.core.evidence import Line
 from fieldtwin.conformance.core.results import ONLY_REQUIRED, CaseResult, called, counts_as_failed, summary
@@ -76,6 +77,7 @@ def render_page(
         colour_of=colour_of,
         called=called,
         sources=f"{sources} {ALL_SOURCES}",
+        url_of=case_url,
         BASIS=BASIS,
         OPEN_LINES=OPEN_LINES,
     )

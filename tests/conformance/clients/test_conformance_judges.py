@@ -167,7 +167,7 @@ NOT_OF_MASTERS = {
     "MB": (*(1, 4), *range(29, 36), *range(38, 51), *(53, 57), *range(58, 64)),
     "CO": (*(3, 7), *range(9, 13), *(19, 31, 32, 41, 45, 46), *range(48, 52), *range(55, 60), *(61, 63, 64, 65, 66)),
 }
-"""Rows of the test-case lists without a case; docs/reference/conformance-clients.md gives the reasons."""
+"""Rows of the test-case lists without a case; docs/explanation/conformance.md gives the reasons."""
 
 
 @pytest.mark.parametrize(("prefix", "rows", "cases"), [("MB", 70, CASES), ("CO", 66, CANOPEN_CASES)])

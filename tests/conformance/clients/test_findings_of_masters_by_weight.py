@@ -199,18 +199,3 @@ def test_fail_on_decides_whether_a_robustness_failure_of_a_client_gives_exit_cod
     assert '<span class="pill inconclusive">! robustness</span>' in page
     assert '"pill failed"' not in page
     assert ('"pill failed big"' in page) == bool(code)
-
-
-def test_the_tables_of_known_failures_distinguish_required_cases() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "conformance-results.md").read_text()
-    devices = {case.id: case for case in DEVICES}
-    rows = re.findall(r"^\| ([^|]+ \|(?: [^|]+ \| \d+ \|)?) ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
-    judged = 0
-    for name, required, others in rows:
-        cases: dict[str, About] = MASTERS if name.count("|") > 1 else devices  # type: ignore[assignment]
-        for ids, wanted in ((required, True), (others, False)):
-            for id in re.findall(r"\b(?:MB|CO)-\d{3}\w?\b", ids):
-                case = cases[id].on_wire(frozenset({"tcp"} if "TCP" in name else {"rtu"}))
-                assert (case.basis is Basis.STANDARD) is wanted, f"{name}: {id}"
-                judged += 1
-    assert judged > 150

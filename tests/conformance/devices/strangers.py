@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 
-PROGRAM = Path(__file__).parents[2] / "interop" / "strange_slaves.py"
+PROGRAM = Path(__file__).parents[3] / "scripts" / "league_programs" / "servers.py"
 A_SERVER = 2
 """Number of cases per server."""
 STAGGER_S = 0.02

@@ -6,6 +6,8 @@ collision of identifiers. A node in bus-off cannot send, so 8140h is sent afterw
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
 from fieldtwin.emulators.canopen.sdo_channels import RESPONSE
@@ -26,9 +28,13 @@ class BusFaults(NodeService):
         self._emergency = emergency
         self._react = react
         self.state = CanErrorState.ACTIVE
+        self.tell: Callable[[int], None] | None = None
+        """Called with the identifier when a second node sends on one of this node's, once until a reset."""
+        self._told = False
 
     def reset(self, now_ns: int) -> None:
         """Keep the controller's state at a reset, and report an error that is still present again."""
+        self._told = False
         if self.state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
@@ -64,6 +70,9 @@ class BusFaults(NodeService):
         if frame.can_id not in own:
             return False
         self._raise(COLLISION, now_ns)
+        if self.tell is not None and not self._told:
+            self._told = True
+            self.tell(frame.can_id)
         return True
 
     def on_error_frame(self, frame: CanFrame, now_ns: int) -> None:

@@ -16,7 +16,7 @@ STOPPED            NMT, error control, LSS                                      
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 
@@ -242,6 +242,10 @@ class CanopenNode:
         if self._powered:
             self._faults.changed(state, now_ns)
         return self.tick(now_ns)
+
+    def on_second_node(self, tell: Callable[[int], None]) -> None:
+        """Call `tell` with the identifier when another node sends on one of this node's, once until a reset."""
+        self._faults.tell = tell
 
     def overrun(self, now_ns: int) -> list[CanFrame]:
         """Report that the CAN controller lost received frames: EMCY 8110h."""

@@ -52,6 +52,7 @@ async def run_data_sheet(
     node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
     if log is None or options.model is not None:  # a node of a log is known by its recorded behaviour
         print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
+    report_second_node(node)
     host, stop = EmulatorHost(WallClock(), OsPorts()), stop_signal()
     try:
         port, where = await open_bus(wire, bitrate or dictionary.bit_rate)
@@ -89,6 +90,18 @@ def print_remarks(name: str, found: Iterable[Remark]) -> None:
         elif remark.model:
             advice = " (--model 402 chooses a model, --model none means it)"
         stderr.print(f"{name}: {remark.text}{advice}", soft_wrap=True, markup=False)
+
+
+def report_second_node(node: CanopenNode) -> None:
+    """Print it when another node on the bus has the node ID of `node`."""
+
+    def tell(can_id: int) -> None:
+        stderr.print(
+            f"{_named(node)}: another node on the bus has this node ID: it sent {can_id:03X}h (--node gives another one)",
+            soft_wrap=True,
+        )
+
+    node.on_second_node(tell)
 
 
 def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeOptions) -> CanopenNode:

@@ -44,7 +44,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import looks_like_another_file, shown
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.can_bus import only_bus, open_bus
-from fieldtwin.run.emulate.data_sheet import print_remarks
+from fieldtwin.run.emulate.data_sheet import print_remarks, report_second_node
 from fieldtwin.run.emulate.fault_counts import struck
 from fieldtwin.run.emulate.serve_until import serve_until
 from fieldtwin.twin.site.data_files import find_recording
@@ -270,6 +270,7 @@ async def _serve_node(
     number, now_ns = node_id or profile.form.factory.node, clock.monotonic_ns()
     made = emulated_node(profile, number, played, now_ns, options=options)
     print_remarks(profile.name, made.remarks)
+    report_second_node(made.node)
     port, where = await open_bus(wire, bitrate)
     await host.serve_nodes(str(wire), port, {profile.name: made.node})
     stderr.print(f"node {made.node.node_id} on {where}", soft_wrap=True)

@@ -17,6 +17,7 @@ from fieldtwin.emulators.stated import Effects, bytes_of, cells_held, cells_of, 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import DeviceProfile, OwnFunction, Tag
 
+_BITS = {"true": 1.0, "false": 0.0}
 _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 
 
@@ -116,10 +117,11 @@ def _number(tag: Tag, text: float | str) -> float:
     for number, word in tag.values:
         if word == text:
             return number * tag.scale + tag.offset
+    if tag.is_bit and text in _BITS:
+        return _BITS[str(text)]
     if isinstance(text, str) and not tag.is_text and _WHOLE.fullmatch(text):
         return float(int(text, 0))  # an identity is text, whatever the type of the register
-    words = ", ".join(word for _, word in tag.values)
-    expected = (
-        "text" if tag.type == "string" else "none: bytes cannot be stated" if tag.is_text else words or "a number"
-    )
+    expected = ", ".join(word for _, word in tag.values) or ("true or false" if tag.is_bit else "a number")
+    if tag.is_text:
+        expected = "text" if tag.type == "string" else "none: bytes cannot be stated"
     raise FileInvalid(f"the value of {tag.name!r}", expected=expected, got=repr(text))

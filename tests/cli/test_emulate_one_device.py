@@ -39,6 +39,8 @@ tags:
   energy: {at: "holding:1", type: uint32}
   mode: {at: "holding:3", values: {1: idle, 2: running}}
   name: {at: "holding:4", type: string, registers: 4}
+  on: {at: "coil:0"}
+  alarm: {at: "discrete:0"}
 """
 
 
@@ -134,6 +136,14 @@ def test_emulate_gives_registers_their_values_and_answers_any_unit(tmp_path: Pat
     with emulated(tmp_path, *options, "--any-unit") as (port, _):
         assert ask(port, "03 0000 0004", unit=77) == bytes.fromhex("03 08 FF83 0001 1170 0002")
         assert ask(port, "03 0004 0004") == b"\x03\x08bench\0\0\0"
+
+
+def test_emulate_takes_true_and_false_for_bits(tmp_path: Path) -> None:
+    """Defect: only 1 and 0 were taken, although a scenario and `safe` take true and false."""
+    (tmp_path / "bits.yaml").write_text("alarm: true\n")
+    with emulated(tmp_path, "--values", "on=true", "--values", str(tmp_path / "bits.yaml")) as (port, _):
+        assert ask(port, "01 0000 0001") == b"\x01\x01\x01"
+        assert ask(port, "02 0000 0001") == b"\x02\x01\x01"
 
 
 def test_emulate_injects_faults_and_reports_how_often_they_took_effect(tmp_path: Path) -> None:

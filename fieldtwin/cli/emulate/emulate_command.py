@@ -179,7 +179,9 @@ def _values(said: tuple[str, ...]) -> dict[str, float | str]:
             continue
         file = load(Path(one))
         for tag, held in file.data.items():
-            if isinstance(held, bool) or not isinstance(held, int | float | str):
+            if isinstance(held, bool):
+                held = str(held).lower()
+            if not isinstance(held, int | float | str):
                 raise file.error((tag,), f"the value of {tag!r}", expected="a number or text", got=repr(held)[:60])
             found[str(tag)] = held
     return found

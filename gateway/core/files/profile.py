@@ -21,6 +21,7 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 Table = Literal["coil", "discrete", "input", "holding"]
 
 PRINTED: tuple[tuple[Table, int], ...] = (("coil", 0), ("discrete", 1), ("input", 3), ("holding", 4))
+BIT_TABLES = ("coil", "discrete")
 READ_FUNCTION: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 REGISTERS_OF = {
     "int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4, "bool": 1,
@@ -362,6 +363,10 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
     else:
         if t.at is None or t.object is not None:
             raise file.error(loc, f"the tag {name!r} of a Modbus device", expected="`at: 30001`, and no `object`")
+        if _table(form, t.at) in BIT_TABLES:
+            if (t.type or "bool") != "bool":
+                raise file.error((*loc, "type"), f"the tag {name!r} is a single bit", expected="bool", got=str(t.type))
+            kind = "bool"
         if kind in ("int8", "uint8"):
             raise file.error((*loc, "type"), f"the tag {name!r} is an {kind}", expected="16 bits at least: a register")
         if kind in ("string", "bytes") and t.registers is None:
@@ -410,6 +415,24 @@ def _address(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | 
         raise file.error(loc, str(e)) from e
 
 
+def _table(form: ProfileForm, at: int | str) -> Table | None:
+    """Return the table of an address, or None if the address is invalid."""
+    try:
+        return resolve_address(at, form.numbering, 1).table
+    except ValueError:
+        return None
+
+
+def _register_address(
+    file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | str, count: int
+) -> RegisterRange:
+    """Return the address of registers; refuse a coil or a discrete input."""
+    if _table(form, at) in BIT_TABLES:
+        got = resolve_address(at, form.numbering, 1)
+        raise file.error(loc, "a single bit", expected="a holding or input register", got=f"{got.table}:{got.address}")
+    return _address(file, loc, form, at, count)
+
+
 def _gap(file: YamlFile, form: ProfileForm, i: int, text: str) -> RegisterRange:
     try:
         return resolve_gap(text, form.numbering)
@@ -418,12 +441,12 @@ def _gap(file: YamlFile, form: ProfileForm, i: int, text: str) -> RegisterRange:
 
 
 def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> MessageBlock:
-    return MessageBlock(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
+    return MessageBlock(name, _register_address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
 
 
 def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
-    at = _address(file, ("mailbox", name, "at"), form, box.at, 2 + (box.bytes + 1) // 2)
-    ack = _address(file, ("mailbox", name, "ack"), form, box.ack, 1)
+    at = _register_address(file, ("mailbox", name, "at"), form, box.at, 2 + (box.bytes + 1) // 2)
+    ack = _register_address(file, ("mailbox", name, "ack"), form, box.ack, 1)
     return Box(name, at, box.bytes, ack)
 
 

@@ -68,6 +68,15 @@ def test_names_with_numbers_are_consecutive() -> None:
     ]
 
 
+@pytest.mark.parametrize("defaults", ["", "defaults: {type: float32}\n"])
+def test_a_coil_or_discrete_input_without_a_type_is_bool(defaults: str) -> None:
+    """Defect: it had the default type of registers, and the first reply ended gateway, run and `read` as an internal error."""
+    tags = read(f'protocol: modbus\n{defaults}tags:\n  a1..2: {{at: "coil:0"}}\n  b: {{at: 10001}}\n').tags
+    assert [(t.type, t.registers.address, t.registers.count) for t in tags.values()] == [
+        ("bool", 0, 1), ("bool", 1, 1), ("bool", 0, 1),
+    ]  # fmt: skip
+
+
 def test_the_command_list_follows_from_the_profile() -> None:
     profile = load_profile(PROFILES / "ctd-reference.yaml")
     assert profile.command_list == {"read_values", "read_status", "read_identity", "set_period"}
@@ -78,6 +87,7 @@ def test_the_command_list_follows_from_the_profile() -> None:
     assert {"nmt_start", "nmt_stop"} <= node.command_list
 
 
+MAILBOX = "mailbox: {inbox: {at: 40100, bytes: 8, ack: 10001}, outbox: {at: 40200, bytes: 8, ack: 40300}}\n"
 TAGS = """protocol: modbus
 tags:
   a: {at: 40001, access: rw}
@@ -98,6 +108,8 @@ tags:
         ("protocol: modbus\ntags:\n  a: {at: 40001, typ: int16}\n", 5, "did you mean 'type'?"),
         ("protocol: modbus\ntags:\n  a: {at: 40001, type: int12}\n", 5, "int16"),
         ("protocol: modbus\ntags:\n  a: {at: 40001, type: uint8}\n", 5, "16 bits at least"),
+        ("protocol: modbus\ntags:\n  a: {at: 00001, type: uint16}\n", 5, "is a single bit; expected bool; got uint16"),
+        ("protocol: modbus\ntags:\n  a: {at: 10001, type: string, registers: 2}\n", 5, "expected bool; got string"),
         ("protocol: canopen\neds: x.eds\ntags:\n  a: {at: 40001}\n", 6, "`object:"),
         ("protocol: canopen\ntags: {}\n", 1, "needs an EDS"),
         (TAGS + "commands: {set_b: b}\n", 8, "no tag 'b'"),
@@ -105,6 +117,8 @@ tags:
         (TAGS + "behaviours: {off: {fly: 1}}\n", 8, "no command 'fly'"),
         (TAGS + "messages: {m: {at: 40001, registers: 2, when: z}}\n", 8, "no tag 'z'"),
         (TAGS + "messages: {m: {at: 40001, registers: 90, when: n}}\nlimits: {read_registers: 60}\n", 8, "60"),
+        (TAGS + "messages: {m: {at: 00001, registers: 2, when: n}}\n", 8, "expected a holding or input register; got coil:0"),
+        (TAGS + MAILBOX, 8, "expected a holding or input register; got discrete:0"),
         (TAGS + "sampled: {count: z, period: p}\n", 8, "no tag 'z'"),
         (TAGS + "sampled: {count: n, period: p, poll: fast}\n", 8, "fast"),
         (TAGS + "  f: {at: 40010, type: float32}\nsampled: {count: f, period: p}\n", 9, "whole number"),

@@ -1,6 +1,6 @@
-"""Two `fieldtwin emulate` processes with one node ID on a software bus: the user of each is told.
+"""Two `fieldtwin emulate` processes with one node ID on a software bus: each prints that the other one is there.
 
-Defect: both answered every request, and only an EMCY on the bus (8150h) reported it.
+Defect: both answered every request, and neither printed anything; only an EMCY on the bus (8150h) showed the collision.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _emulated(log: Path, what: str, bus: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("second", ["drive-cia402", "profiles/devices/io-cia401.eds"])
-def test_the_user_of_each_is_told_once_of_the_other(tmp_path: Path, second: str) -> None:
+def test_each_process_reports_the_other_once(tmp_path: Path, second: str) -> None:
     logs = [tmp_path / "first.log", tmp_path / "second.log"]
     with ExitStack() as stack:
         stack.enter_context(_emulated(logs[0], "io-cia401", "127.0.0.1:0"))

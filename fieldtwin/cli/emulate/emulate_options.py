@@ -47,7 +47,8 @@ class OneDeviceOptions:
         "--values",
         multiple=True,
         metavar="TAG=VALUE|FILE",
-        help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping. Repeatable.",
+        help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping. "
+        "Repeatable.",
     )
     faults_file: str | None = option(
         "--faults",

@@ -34,7 +34,7 @@ from statistics import median
 from peers import HERE, Goals, Missing, build, cpu_s, free_port, python, ratio
 
 from fieldtwin.gateway.core.endpoint import SerialSettings
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 BAUD, GOAL = 115_200, 0.9
 PEER_SILENCE_US = 1000 + round(2e7 / BAUD)

@@ -33,7 +33,7 @@ PEER_FRAMES = 10_000
 
 
 async def serve_bus() -> None:
-    from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+    from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
     from fieldtwin.gateway.core.endpoint import Endpoint
 
     server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000, paced=False)
@@ -53,7 +53,7 @@ class _HubClient(asyncio.Protocol):
         self.inbound = b""
 
     def data_received(self, data: bytes) -> None:
-        from fieldtwin.emulators.endpoints.bus_hello import BusHello
+        from fieldtwin.emulators.endpoints.can.bus_hello import BusHello
 
         data = self.inbound + data
         if not self.welcome and len(data) >= 24:
@@ -85,7 +85,7 @@ async def serve_hub() -> None:
 
 async def device(port: int) -> None:
     """The second program: count the stream, report when it was complete, and echo requests."""
-    from fieldtwin.emulators.endpoints.can_end import open_can_end
+    from fieldtwin.emulators.endpoints.can.software_end import open_can_end
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint
 

@@ -62,8 +62,8 @@ def report(times_s: dict[int, list[float]], nodes: int, seconds: float, cpu_s: f
 async def ours(nodes: int, seconds: float) -> None:
     """Run every node with its recording and model on the paced bus; a watcher counts the frames on it."""
     from fieldtwin.emulators.canopen.serve import serve_node
-    from fieldtwin.emulators.endpoints.bus_runner import BusRunner
-    from fieldtwin.emulators.models.emulated_node import emulated_node
+    from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
+    from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
     from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint

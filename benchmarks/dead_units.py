@@ -34,7 +34,7 @@ from peers import Goals, python, ratio
 
 from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.run.processes.children import Child
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapping_to_json

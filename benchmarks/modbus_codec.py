@@ -30,11 +30,11 @@ from pymodbus.transport import NULLMODEM_HOST
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
-from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.frames.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 VALUES = [(i * 257) & 0xFFFF for i in range(125)]

@@ -24,7 +24,7 @@ from statistics import median
 from peers import Goals
 
 from fieldtwin.capture.recordings.from_packets import PacketImport
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 PACKETS_PER_S = 50_000
 SERVERS = 4

@@ -32,7 +32,7 @@ from peers import Goals, python
 
 from fieldtwin.gateway.core.image.image import TagKind, TagSpec
 from fieldtwin.plc.binding import InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
 from fieldtwin.twin.plant.physical import make_image
 
 ROOT = Path(__file__).resolve().parents[1]

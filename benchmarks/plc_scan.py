@@ -24,8 +24,8 @@ from fieldtwin.gateway.core.image.image import INPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.blocks import CTU, MS, TON
+from fieldtwin.plc.cycle.scan import Scan
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
-from fieldtwin.plc.scan import Scan
 from fieldtwin.twin.plant.physical import image_layout, programs_of
 from fieldtwin.twin.site.system import load_system
 

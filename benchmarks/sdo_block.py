@@ -24,15 +24,15 @@ from peers import Goals
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
 from fieldtwin.emulators.wires.can_timing import bits_on_wire
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.sdo_block import UPLOAD_BLOCK
+from fieldtwin.gateway.protocols.canopen.sdo.block import UPLOAD_BLOCK
 
 NODE, SEGMENT, GOAL = 5, 7, 0.95
 HERE = Endpoint.parse("can:fieldtwin/127.0.0.1:1")

@@ -1,7 +1,7 @@
 """The paper's emulators: devices that answer from their virtual context instead of the physical environment.
 
 An emulator is a Device and not a Sensor, because the real device is a black box of which only the communication is known. This
-module lies between the frames of a line (fieldtwin.emulators.modbus.rtu, mbap) and the processing of a request by a unit
+module lies between the frames of a line (fieldtwin.emulators.modbus.rtu.line, mbap) and the processing of a request by a unit
 (fieldtwin.emulators.modbus.unit, fieldtwin.emulators.replay). An emulator reads a command from its own end of a connection,
 checks that its command list contains it, answers from its context and sends the response. It never knows its driver.
 """

@@ -14,9 +14,9 @@ from typing import Any
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.client_counts import ClientCounts, CountDifference
-from fieldtwin.emulators.endpoints.faulty import FaultyEnd
-from fieldtwin.emulators.endpoints.faulty_can import FaultyCan
-from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.faulty.can import FaultyCan
+from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty.udp import FaultyDatagrams
 from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import CanPort, Listening, Ports
 from fieldtwin.emulators.faults.engine import WireFaults
@@ -24,7 +24,7 @@ from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.line import LineSlave
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.clock import Clock

@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
 from fieldtwin.emulators.endpoints.link_ends import TcpDoor, TcpEnd, TtyEnd
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.faults.engine import WireFaults

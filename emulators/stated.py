@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Sequence
 
 from fieldtwin.emulators.codec import decode, encode
 from fieldtwin.emulators.modbus.bank import BIT_TABLES, Access, CellSpan, Table
-from fieldtwin.emulators.modbus.fifo import MOST_READ, FifoQueues
-from fieldtwin.emulators.modbus.file_records import FileRecords
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.fifo import MOST_READ, FifoQueues
+from fieldtwin.emulators.modbus.functions.file_records import FileRecords
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.unit import UnitParts
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Effect, Tag
 

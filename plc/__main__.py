@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.plc.config import PlcConfig
-from fieldtwin.plc.process import plc_main
+from fieldtwin.plc.runtime.config import PlcConfig
+from fieldtwin.plc.runtime.process import plc_main
 
 
 def main() -> int:

@@ -15,10 +15,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 
 import msgspec
 
-from fieldtwin.emulators.canopen import codec
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.dictionary import Key
-from fieldtwin.emulators.canopen.emcy import Emergency
+from fieldtwin.emulators.canopen.eds import codec
+from fieldtwin.emulators.canopen.eds.dictionary import Key
+from fieldtwin.emulators.canopen.errors.emcy import Emergency
 from fieldtwin.emulators.canopen.node_data import NodeData
 from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, NodeService, ObjectSource
 

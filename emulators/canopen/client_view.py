@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.eds.dictionary import Key
+from fieldtwin.emulators.canopen.pdo.tpdo import Tpdos
 from fieldtwin.emulators.canopen.service import Core, NodeService
-from fieldtwin.emulators.canopen.tpdo import Tpdos
 
 
 class ClientView:

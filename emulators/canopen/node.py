@@ -23,17 +23,23 @@ from operator import attrgetter
 from fieldtwin.emulators.canopen.aborts import Abort
 from fieldtwin.emulators.canopen.acceptance import Acceptance
 from fieldtwin.emulators.canopen.behaviour import Behaviour, DeviceModel, Distort
-from fieldtwin.emulators.canopen.bus_faults import BusFaults
 from fieldtwin.emulators.canopen.client_view import ClientView
-from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
-from fieldtwin.emulators.canopen.emcy import GENERIC, Emergency
-from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction, HeartbeatConsumer, HeartbeatProducer
-from fieldtwin.emulators.canopen.guarding import NodeGuarding
-from fieldtwin.emulators.canopen.lss import FROM_MASTER, UNCONFIGURED, LssStore
-from fieldtwin.emulators.canopen.lss_service import LssService
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, Key
+from fieldtwin.emulators.canopen.errors.bus_faults import BusFaults
+from fieldtwin.emulators.canopen.errors.emcy import GENERIC, Emergency
+from fieldtwin.emulators.canopen.errors.error_control import (
+    ERROR_CONTROL,
+    ErrorReaction,
+    HeartbeatConsumer,
+    HeartbeatProducer,
+)
+from fieldtwin.emulators.canopen.errors.guarding import NodeGuarding
+from fieldtwin.emulators.canopen.lss.service import LssService
+from fieldtwin.emulators.canopen.lss.slave import FROM_MASTER, UNCONFIGURED, LssStore
 from fieldtwin.emulators.canopen.node_data import NodeData
-from fieldtwin.emulators.canopen.rpdo import Rpdos
-from fieldtwin.emulators.canopen.sdo_channels import SdoChannels
+from fieldtwin.emulators.canopen.pdo.rpdo import Rpdos
+from fieldtwin.emulators.canopen.pdo.tpdo import Tpdos
+from fieldtwin.emulators.canopen.sdo.channels import SdoChannels
 from fieldtwin.emulators.canopen.service import (
     NEVER,
     AnswersReads,
@@ -50,7 +56,6 @@ from fieldtwin.emulators.canopen.service import (
 from fieldtwin.emulators.canopen.storage import Storage
 from fieldtwin.emulators.canopen.sync import Sync
 from fieldtwin.emulators.canopen.time_of_day import TimeOfDay, TimeService
-from fieldtwin.emulators.canopen.tpdo import Tpdos
 from fieldtwin.gateway.core.can_error import CanErrorState
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
-from fieldtwin.emulators.canopen import codec
 from fieldtwin.emulators.canopen.aborts import Abort, abort
-from fieldtwin.emulators.canopen.dictionary import Dictionary, Key, SubindexEntry
+from fieldtwin.emulators.canopen.eds import codec
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, Key, SubindexEntry
 from fieldtwin.gateway.core.errors import UsageError
 
 COMMUNICATION = range(0x1000, 0x2000)

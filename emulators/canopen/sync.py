@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fieldtwin.emulators.canopen import emcy
 from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.errors import emcy
 from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, NodeService
 from fieldtwin.gateway.core.canframe import CanFrame
 

@@ -126,7 +126,7 @@ class AcousticServer:
 
 
 class AcousticEnd:
-    """A modem's end of a channel that another process serves (`fieldtwin.emulators.models.packet_link.ModemEnd`)."""
+    """A modem's end of a channel that another process serves (`fieldtwin.emulators.models.modbus.packet_link.ModemEnd`)."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.sent = self.resent = self.delivered = 0

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import AttachedConnection, BusRunner
 from fieldtwin.emulators.endpoints.ports import OnClient
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd, MemoryWire

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 from fieldtwin.emulators.client_counts import ClientCounts
-from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
 from fieldtwin.emulators.endpoints.ports import Datagrams
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd

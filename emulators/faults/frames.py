@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fieldtwin.emulators.modbus.rtu_shapes import crc16
+from fieldtwin.emulators.modbus.rtu.shapes import crc16
 
 FLUSH_S = 0.05
 """How long bytes that form no frame wait for more, in seconds."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 from fieldtwin.emulators.modbus.ascii import lrc
-from fieldtwin.emulators.modbus.rtu_shapes import with_crc
+from fieldtwin.emulators.modbus.rtu.shapes import with_crc
 
 
 def remade(frame: FaultFrame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:

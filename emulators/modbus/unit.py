@@ -10,12 +10,12 @@ from collections.abc import Callable
 from typing import TypedDict
 
 from fieldtwin.emulators.modbus.bank import DeviceIsBusy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
-from fieldtwin.emulators.modbus.diagnostics import UnitCounters, UnitDiagnostics
-from fieldtwin.emulators.modbus.event_log import MAX_EVENTS
-from fieldtwin.emulators.modbus.fifo import FifoQueues
-from fieldtwin.emulators.modbus.file_records import FileRecords
-from fieldtwin.emulators.modbus.identification import Identification
-from fieldtwin.emulators.modbus.register_functions import (
+from fieldtwin.emulators.modbus.functions.diagnostics import UnitCounters, UnitDiagnostics
+from fieldtwin.emulators.modbus.functions.event_log import MAX_EVENTS
+from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
+from fieldtwin.emulators.modbus.functions.file_records import FileRecords
+from fieldtwin.emulators.modbus.functions.identification import Identification
+from fieldtwin.emulators.modbus.functions.registers import (
     STANDARD_FUNCTIONS,
     TABLES,
     RegisterFunctions,

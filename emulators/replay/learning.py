@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
-from fieldtwin.emulators.modbus.register_functions import STANDARD_FUNCTIONS
+from fieldtwin.emulators.modbus.functions.registers import STANDARD_FUNCTIONS
 from fieldtwin.emulators.replay import requests
 from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Merged, OutcomeColumn, Outcomes
 from fieldtwin.emulators.replay.counters import RecordingCounters

@@ -13,11 +13,11 @@ from bisect import bisect_right
 from collections.abc import Iterable
 
 from fieldtwin.emulators.canopen.aborts import Abort
-from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
-from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, Key
+from fieldtwin.emulators.canopen.errors.error_control import ERROR_CONTROL
 from fieldtwin.emulators.canopen.node_data import COMMUNICATION, NodeData
-from fieldtwin.emulators.canopen.pdo import PdoParameters, pdo_indices
-from fieldtwin.emulators.canopen.sdo_channels import REQUEST, RESPONSE
+from fieldtwin.emulators.canopen.pdo.parameters import PdoParameters, pdo_indices
+from fieldtwin.emulators.canopen.sdo.channels import REQUEST, RESPONSE
 from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.canframe import CanFrame

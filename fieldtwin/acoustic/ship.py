@@ -8,9 +8,9 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.ports import Listening, Ports
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.acoustic_link import AcousticLink
-from fieldtwin.emulators.models.emulated_modbus import unit_limits
-from fieldtwin.emulators.models.mailbox_modem import MailboxModem
+from fieldtwin.emulators.models.modbus.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.modbus.emulated_modbus import unit_limits
+from fieldtwin.emulators.models.modbus.mailbox_modem import MailboxModem
 from fieldtwin.emulators.wires.acoustic import AcousticMedium
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -17,7 +17,7 @@ from fieldtwin.acoustic.faults import AcousticFaults
 from fieldtwin.acoustic.network import Network
 from fieldtwin.acoustic.ship import TopsideModem
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
-from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.modbus.acoustic_link import AcousticLink
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource

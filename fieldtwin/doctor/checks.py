@@ -106,7 +106,7 @@ def _pty() -> DoctorCheck:
 
 
 def _serial() -> DoctorCheck:
-    from fieldtwin.gateway.connections.serial_port import local_ports
+    from fieldtwin.gateway.connections.serial.port import local_ports
 
     ports = local_ports()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]

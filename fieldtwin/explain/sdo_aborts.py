@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fieldtwin.explain.explanation import Explanation
-from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import MEANINGS
 
 _TEXTS: dict[int, tuple[str, str]] = {
     0x0503_0000: (

@@ -26,22 +26,22 @@ class OsConnector(Connector):
         match endpoint.scheme:
             case "rtu" | "ascii":
                 if sys.platform == "win32":  # COM ports have no descriptors
-                    from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
+                    from fieldtwin.gateway.connections.serial.threads import ThreadedSerialConnection
 
                     return await ThreadedSerialConnection.open(endpoint)
-                from fieldtwin.gateway.connections.serial_line import SerialConnection
+                from fieldtwin.gateway.connections.serial.line import SerialConnection
 
                 return await SerialConnection.open(endpoint)
             case "tcp" | "rtu+tcp":
-                from fieldtwin.gateway.connections.tcp import TcpConnection
+                from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 
                 return await TcpConnection.open(endpoint)
             case "tls":
-                from fieldtwin.gateway.connections.tls import TlsConnection
+                from fieldtwin.gateway.connections.sockets.tls import TlsConnection
 
                 return await TlsConnection.open(endpoint)
             case "udp":
-                from fieldtwin.gateway.connections.udp import UdpConnection
+                from fieldtwin.gateway.connections.sockets.udp import UdpConnection
 
                 return await UdpConnection.open(endpoint)
             case "can":
@@ -63,7 +63,7 @@ class OsConnector(Connector):
             raise UsageError(f"{endpoint} is not a CAN bus", expected="can:INTERFACE/CHANNEL")
         match endpoint.interface:
             case "socketcan":
-                from fieldtwin.gateway.connections.can_end import SocketCanConnection
+                from fieldtwin.gateway.connections.can.socketcan import SocketCanConnection
 
                 return await SocketCanConnection.open(endpoint, bitrate)
             case "fieldtwin":
@@ -71,6 +71,6 @@ class OsConnector(Connector):
 
                 return await SoftBusConnection.open(endpoint, bitrate)
             case _:
-                from fieldtwin.gateway.connections.can_adapter import AdapterConnection
+                from fieldtwin.gateway.connections.can.adapter import AdapterConnection
 
                 return await AdapterConnection.open(endpoint, bitrate)

@@ -19,8 +19,8 @@ import can
 from can.typechecking import CanFilters
 from msgspec.structs import replace
 
-from fieldtwin.gateway.connections.addresses import address_of
-from fieldtwin.gateway.connections.soft_bus_hello import Welcome, ask, read_answer
+from fieldtwin.gateway.connections.can.soft_bus_hello import Welcome, ask, read_answer
+from fieldtwin.gateway.connections.sockets.addresses import address_of
 from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally

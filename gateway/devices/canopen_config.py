@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress
-from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import WHOLE_S
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from fieldtwin.gateway.protocols.canopen.configure import (
     set_heartbeat_producer,
 )
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster, PdoCallback
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry, PdoLengthMismatch, PdoMapping
 
 _OPERATIONAL = NmtState.OPERATIONAL
 

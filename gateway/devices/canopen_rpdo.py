@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
-from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry, PdoMapping
 
 BITS = {
     "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,

@@ -23,7 +23,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.driver import DeviceDriver, TagSink
 from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, place_of
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
-from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply
+from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
 """The most that one request may write (AP 6.11 and 6.12)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery

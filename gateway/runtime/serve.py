@@ -13,14 +13,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Literal, Protocol
 
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Listen
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, ModbusExceptionReply, NotAllowed
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.gateway.protocols.modbus.refusals import refusal
-from fieldtwin.gateway.protocols.modbus.server import (
+from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server.analysis import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,

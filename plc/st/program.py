@@ -20,10 +20,10 @@ from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, Role, ScanInfo, SourceLine, Variable, message_input, message_output
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
-from fieldtwin.plc.st.assignments import is_line, line_of
-from fieldtwin.plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
-from fieldtwin.plc.st.plcopen import is_plcopen, to_st
+from fieldtwin.plc.st.compiler.assignments import is_line, line_of
+from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
 from fieldtwin.plc.st.resource import Resource, Together, state_of
+from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 
 MAX_SOURCE_BYTES = 8 * 1024 * 1024
 """A larger source file is assumed to be a mistake."""

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
-from fieldtwin.plc.st.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
 
 MAX_STEPS = 1_000_000
 """How many loop iterations, and calls of functions and function blocks, a program may make in one scan. The limit is

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.replay.objects import RecordedObjects
 from fieldtwin.gateway.core.canframe import CanFrame

@@ -14,10 +14,10 @@ from report_rig import MS, can, note, observatory
 from fieldtwin.capture.decoding.decoder import Decoder, exchanges
 from fieldtwin.capture.decoding.exchange import DecodedExchange, TouchedSpan
 from fieldtwin.capture.decoding.sdo import SdoWatch, Transfer
-from fieldtwin.emulators.canopen.sdo_server import SdoServer
+from fieldtwin.emulators.canopen.sdo.server import SdoServer
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, SendFrame
-from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.canopen.sdo.block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import Done, SdoDownload, SdoTransfer, SdoUpload, SendFrame
 from fieldtwin.results.trace import TraceEvent, TraceKind
 
 

@@ -17,8 +17,8 @@ from fieldtwin.capture.decoding.modbus_frames import splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.protocols.modbus.ascii import lrc
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.results.trace import TraceEvent
 
 METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"

@@ -38,10 +38,10 @@ from fieldtwin.commissioning.record.polling import (
 from fieldtwin.commissioning.record.tapping import LineTap
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.context import EndOfRecording
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.host import EmulatorHost
-from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import NeverRecorded
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
@@ -55,7 +55,7 @@ from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.device import as_it_was_recorded, replayed_units, serve_units
 

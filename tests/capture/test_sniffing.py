@@ -19,7 +19,7 @@ from fieldtwin.commissioning.record.sniffing import Directions
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 TALK = [
     ("01 03 0000 0002", "01 03 04 0001 0002"),

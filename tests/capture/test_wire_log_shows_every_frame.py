@@ -16,7 +16,7 @@ import pytest
 from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder
-from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.testing.handles import DeviceHandle
 from fieldtwin.testing.runner import WorkerProcess

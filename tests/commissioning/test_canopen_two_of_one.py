@@ -19,16 +19,16 @@ from test_scan_canopen import URL, scan
 
 from fieldtwin.commissioning.identify.canopen import identify_canopen
 from fieldtwin.commissioning.scan.can_listener import BusListener
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, cycle_period_ns
 from fieldtwin.gateway.protocols.canopen.boot import Configuration
-from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import Setting
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 
 
 def node(number: int, device_type: int, serial: int) -> CanopenNode:

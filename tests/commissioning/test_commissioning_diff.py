@@ -17,11 +17,11 @@ from fieldtwin.commissioning.dump.diff import Leave, diff_dictionary, diff_dumps
 from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.dump.session import dump, register_spans
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]
 SDM = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")

@@ -19,13 +19,13 @@ from fieldtwin.commissioning.dump.file import LATENCY_LIMITS_NS, describe_latenc
 from fieldtwin.commissioning.dump.objects import ListedObjects
 from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
 from fieldtwin.commissioning.dump.sweep import RefusedRead, Silent, Sweep, Taken
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import RegisterRange, load_profile
 from fieldtwin.gateway.core.histogram import Histogram
-from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]
 

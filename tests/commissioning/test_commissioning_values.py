@@ -11,7 +11,7 @@ from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virt
 from fieldtwin.commissioning.access.address import RawForm, tags_of, with_care
 from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point, point_at, row_of, target_of, text_of
 from fieldtwin.commissioning.access.writing import before, carry_out, check_broadcast, plan_write, plan_writes, restore
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed

@@ -14,7 +14,7 @@ from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canop
 from fieldtwin.commissioning.identify.matching import CanClues, Sureness, judge_canopen
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.canopen.configure import Identity
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 
 URL = "can:fieldtwin/h:1"
 SHIPPED = [load_profile(path) for path in sorted(Path("profiles/devices").glob("*cia*.yaml"))]

@@ -14,9 +14,9 @@ from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Su
 from fieldtwin.commissioning.identify.modbus import ModbusIdentity, identify_modbus
 from fieldtwin.commissioning.identify.sunspec import next_model
 from fieldtwin.emulators.modbus.bank import CellSpan
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitParts
-from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 

@@ -17,8 +17,8 @@ from fieldtwin.commissioning.scan.can_listener import BusHeard
 from fieldtwin.commissioning.scan.causes import ScanProbe, SerialEvidence, can_causes, serial_causes, tcp_causes
 from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line, probe_of
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
-from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import UartCounters, unpack_counters
+from fieldtwin.gateway.connections.can.facts import CanFacts
+from fieldtwin.gateway.connections.serial.line_counters import UartCounters, unpack_counters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.core.errors import NotAllowed
 

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from fieldtwin.commissioning.scan.can_listener import BusListener
 from fieldtwin.commissioning.scan.canopen import CanScan, CanScanner, CanScanOptions
-from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.connections.can.facts import CanFacts
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection, Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.canopen.configure import Identity
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 
 URL = "can:fieldtwin/h:1"
 U32 = (0x00020192).to_bytes(4, "little")

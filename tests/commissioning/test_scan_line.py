@@ -13,7 +13,7 @@ from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanO
 from fieldtwin.commissioning.scan.settings import LIKELY, name_of
 from fieldtwin.commissioning.scan.traffic import LineListener
 from fieldtwin.emulators.modbus.bank import CellSpan
-from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import SerialSettings
 

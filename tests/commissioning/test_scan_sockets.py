@@ -15,7 +15,7 @@ from fieldtwin.commissioning.scan.settings import TCP_UNITS
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, likeness, spread_over
 from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
 from fieldtwin.emulators.modbus.bank import CellSpan
-from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
+from fieldtwin.emulators.models.modbus.recorded_device import RecordedDevice, load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.gateway.core.connection import RS232Connection

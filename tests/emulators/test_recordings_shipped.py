@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.models.seawater import C_35_15_0, T68_PER_T90, conductivity, salinity
+from fieldtwin.emulators.models.synthetic.seawater import C_35_15_0, T68_PER_T90, conductivity, salinity
 from fieldtwin.emulators.signals import SignalTrack
 from fieldtwin.gateway.core.files.recording import RecordingReader
 

@@ -18,7 +18,7 @@ from fieldtwin.explain.cases import spelled_out
 from fieldtwin.explain.lookup import everything, explain
 from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import MEANINGS
 
 
 def kinds_of_errors(base: type[FieldtwinError] = FieldtwinError) -> Iterator[type[FieldtwinError]]:

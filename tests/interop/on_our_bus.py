@@ -19,7 +19,7 @@ import can.interfaces
 import pytest
 from canopen.sdo.client import SdoClient
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.endpoint import Endpoint
 

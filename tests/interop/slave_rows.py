@@ -19,8 +19,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.gateway.protocols.modbus.ascii import lrc
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 HERE = Path(__file__).parent
 SERVERS = HERE.parents[1] / "scripts" / "league_programs" / "servers.py"

@@ -12,7 +12,7 @@ from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.twin.site.system import load_system
 
 pytestmark = [pytest.mark.interop, needs_tshark]

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from eds_agreement import NODE, differences
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 
 pytestmark = [pytest.mark.interop, pytest.mark.long]
 

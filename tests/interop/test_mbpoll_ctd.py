@@ -17,10 +17,10 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.emulated_modbus import unit_limits
-from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.models.modbus.emulated_modbus import unit_limits
+from fieldtwin.emulators.models.modbus.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint

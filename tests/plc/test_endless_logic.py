@@ -16,12 +16,12 @@ from st_bench import program, run, scan
 
 from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
 from fieldtwin.plc.prove import Proof, prove
-from fieldtwin.plc.runner import TaskRunner
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.plc.st.resource import MAX_STEPS
-from fieldtwin.plc.task import StopReason
 from fieldtwin.testing.worker.stepped_program import SteppedProgram
 
 ENDLESS = {

@@ -23,8 +23,8 @@ from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader, Ta
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig
-from fieldtwin.plc.process import plc_main
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.runtime.process import plc_main
 
 PLANT = {
     "modem.inbox": message_tag("modem.inbox", 64, 8),

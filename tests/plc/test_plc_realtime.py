@@ -9,7 +9,7 @@ import time
 import pytest
 
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.plc.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
+from fieldtwin.plc.runtime.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
 
 MS = 1_000_000
 

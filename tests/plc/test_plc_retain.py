@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.program import Program, ScanInfo, var_local, var_retain
-from fieldtwin.plc.retain import Retained, RetainFile, RetainFull
+from fieldtwin.plc.runtime.retain import Retained, RetainFile, RetainFull
 
 KILLS = 60
 

@@ -11,9 +11,9 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import TaskRunner
-from fieldtwin.plc.task import StopReason
+from fieldtwin.plc.cycle.task import StopReason
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runtime.runner import TaskRunner
 
 MS = 1_000_000
 PLANT = {"d.go": TagSpec("d.go", TagKind.BOOL), "d.n": TagSpec("d.n", TagKind.INT)}

@@ -22,6 +22,7 @@ from fieldtwin.gateway.core.image.image import (
 )
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for, load_program
+from fieldtwin.plc.cycle.scan import Scan
 from fieldtwin.plc.program import (
     Message,
     Outbox,
@@ -34,7 +35,6 @@ from fieldtwin.plc.program import (
     var_local,
     var_output,
 )
-from fieldtwin.plc.scan import Scan
 
 MS = 1_000_000
 PLANT = {

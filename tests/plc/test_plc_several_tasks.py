@@ -14,9 +14,9 @@ from test_plc_runner import MS, Rig
 
 from fieldtwin.cli.options import NegativeNumbers
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.plc.config import TaskSpec
-from fieldtwin.plc.sources import changed, sources
-from fieldtwin.plc.task import StopReason
+from fieldtwin.plc.cycle.task import StopReason
+from fieldtwin.plc.runtime.config import TaskSpec
+from fieldtwin.plc.runtime.sources import changed, sources
 
 FAST_AND_SLOW = (TaskSpec("fast", 10, 1), TaskSpec("slow", 100, 5))
 

@@ -13,10 +13,10 @@ import pytest
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import TaskRunner
-from fieldtwin.plc.start import InputsMissing, StartPolicy
-from fieldtwin.plc.task import StopReason
+from fieldtwin.plc.cycle.start import InputsMissing, StartPolicy
+from fieldtwin.plc.cycle.task import StopReason
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runtime.runner import TaskRunner
 
 MS = 1_000_000
 PLANT = {

@@ -11,12 +11,12 @@ import pytest
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import INPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.plc.acts import Acts
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig
-from fieldtwin.plc.runner import TaskRunner
+from fieldtwin.plc.runtime.acts import Acts
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.runtime.runner import TaskRunner
+from fieldtwin.plc.runtime.tag_view import TagView, matches
 from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
-from fieldtwin.plc.tag_view import TagView, matches
 
 MS = 1_000_000
 UTC_NS = 1_700_000_000_000_000_000

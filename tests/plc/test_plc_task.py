@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from support import eventually, run
 
 from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.plc.cycle.task import CyclicTask, StopReason, TaskConfig, TaskState, run_on_clock
 from fieldtwin.plc.program import ProgramFailed
-from fieldtwin.plc.task import CyclicTask, StopReason, TaskConfig, TaskState, run_on_clock
 
 MS = 1_000_000
 

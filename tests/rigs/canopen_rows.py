@@ -10,8 +10,8 @@ from typing import Any
 from canopen_slave_rig import NODE, RICH
 
 from fieldtwin.emulators.canopen.aborts import Abort
-from fieldtwin.emulators.canopen.dictionary import parse_eds
-from fieldtwin.emulators.canopen.lss import LssStore
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss.slave import LssStore
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.time_of_day import TimeOfDay
 from fieldtwin.gateway.core.can_error import CanErrorState

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
-from fieldtwin.emulators.canopen.lss import UNCONFIGURED
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss.slave import UNCONFIGURED
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS

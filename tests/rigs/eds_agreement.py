@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from fieldtwin.emulators.canopen.dictionary import Dictionary
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.gateway.protocols.canopen.datatypes import decode
-from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import decode
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary
 
 NODE = 5
 TYPE_AREA = 0x1000

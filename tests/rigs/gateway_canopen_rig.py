@@ -11,11 +11,11 @@ from typing import Any
 
 from gateway_rig import PROFILES
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.models.played_objects import PlayedObjects
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.models.canopen.played_objects import PlayedObjects
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.canframe import CanFrame

@@ -26,14 +26,14 @@ from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.capture.recordings.importing import kind_of
 from fieldtwin.conformance.core.waivers import load_waivers
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.files.candump import LeftOut, read_log
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import RecordingReader
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.plc.st.program import load_file
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.run.what_if.plan import load_plans

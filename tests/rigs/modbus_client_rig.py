@@ -13,8 +13,8 @@ from fieldtwin.gateway.core.errors import (
     ConnectionLost,
 )
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing
 from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()

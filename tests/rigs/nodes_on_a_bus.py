@@ -9,7 +9,7 @@ from typing import TypeVar
 from canopen_localnode import LocalNodeOnBus
 from canopen_slave_rig import NODE, RICH
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet

@@ -6,7 +6,7 @@ import struct
 from functools import cache
 from typing import Any
 
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System, load_system
 

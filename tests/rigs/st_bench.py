@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fieldtwin.plc.program import ScanInfo
-from fieldtwin.plc.st.compile import compile_text
+from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.program import StProgram, program_class
 
 

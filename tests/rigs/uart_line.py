@@ -15,9 +15,9 @@ from modbus_virtual import VirtualWire
 
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.gateway.connections.line_counters import UartCounters
+from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import EndpointBusy

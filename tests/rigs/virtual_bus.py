@@ -9,7 +9,7 @@ from typing import NamedTuple
 from modbus_virtual import VirtualLoop, VirtualWire
 
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from spec_rig import CHECKOUT, CLOCK, SYSTEMS, observatory
 
 from fieldtwin.capture.recordings.importing import import_capture
-from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.models.modbus.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.files.recording import RecordingReader, shown

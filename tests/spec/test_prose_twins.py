@@ -19,10 +19,10 @@ from wire_rig import Crossed, relay, strange_device
 
 from fieldtwin.cli.recordings.compare_command import command as compare_command
 from fieldtwin.cli.twin.shadow_command import print_shadow
-from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.models.modbus.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.values import COMMAND, Quality, Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.runtime.gateway import make_driver
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.plc.runner import TaskRunner
+from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory, rig
 from support import run
 
-from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.models.modbus.distorted_registers import DistortedRegisters
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection

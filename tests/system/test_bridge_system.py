@@ -12,7 +12,7 @@ import pytest
 from procs import CHECKOUT, Asking, fieldtwin, no_tracebacks, wait_for
 from support import run
 
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient

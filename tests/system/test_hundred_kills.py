@@ -77,7 +77,10 @@ def test_the_plc_keeps_its_retained_values_whole_and_never_goes_back(tmp_path: P
             os.kill(run.pid_of("p", "plc"), signal.SIGKILL)
             reached = seen = 0
             with victim(
-                "plc", str(root / "p" / "plc.json"), root=root, imports="fieldtwin.plc.process,fieldtwin.plc.st.program"
+                "plc",
+                str(root / "p" / "plc.json"),
+                root=root,
+                imports="fieldtwin.plc.runtime.process,fieldtwin.plc.st.program",
             ) as it:
 
                 def counted() -> int:

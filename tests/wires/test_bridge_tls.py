@@ -21,16 +21,16 @@ from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.tls import TlsConnection
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.tls import TlsConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, ModbusExceptionReply, Unreachable, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
+from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS, WRITE_FUNCTIONS
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy

@@ -16,11 +16,11 @@ import can
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_bridge import CanBridge
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
-from fieldtwin.gateway.connections.can_end import SocketCanConnection
+from fieldtwin.gateway.connections.can.socketcan import SocketCanConnection
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection

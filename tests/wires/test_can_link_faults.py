@@ -11,7 +11,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.can_link import CanLink, node_of
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.faults.frames import FrameDirection, Framing
 from fieldtwin.emulators.faults.on_link import check_can_link, wire_faults
 from fieldtwin.emulators.faults.schema import parse_fault

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from support import run
 
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.wires.can_timing import bits_on_wire
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -14,17 +14,17 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core import errors
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress, LssRefused
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress, LssRefused
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NodeEvent
 from fieldtwin.gateway.wallclock import WallClock
 
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "canopen_master.toml").read_text())["row"]

@@ -19,7 +19,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
 from fieldtwin.gateway.wallclock import WallClock
 
 

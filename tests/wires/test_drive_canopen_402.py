@@ -12,8 +12,8 @@ from canopen.profiles.p402 import BaseNode402
 from support import run
 
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -15,7 +15,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.link import LinkOptions, run_link
-from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = [

@@ -17,27 +17,27 @@ from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.fifo import FifoQueues
-from fieldtwin.emulators.modbus.file_records import FileRecords
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
+from fieldtwin.emulators.modbus.functions.file_records import FileRecords
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply, ReplyTimeout, UsageError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.diagnostics import (
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import (
     Diagnostics,
     ForceListenOnly,
     GetCommEventCounter,
     GetCommEventLog,
     Loopback,
 )
-from fieldtwin.gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
-from fieldtwin.gateway.protocols.modbus.identity import ReadExceptionStatus, ReportServerId
-from fieldtwin.gateway.protocols.modbus.user import CountedShape, UserFunction
+from fieldtwin.gateway.protocols.modbus.requests.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReadExceptionStatus, ReportServerId
+from fieldtwin.gateway.protocols.modbus.requests.user import CountedShape, UserFunction
 from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()

@@ -14,7 +14,7 @@ import pytest
 from support import run
 
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.rs485 import (
+from fieldtwin.gateway.connections.serial.rs485 import (
     ENABLED,
     RTS_AFTER_SEND,
     RTS_ON_SEND,

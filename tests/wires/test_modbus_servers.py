@@ -28,8 +28,8 @@ from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
-from fieldtwin.gateway.protocols.modbus.identity import ReportServerId
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReportServerId
 from fieldtwin.gateway.wallclock import WallClock
 
 COUNT = 200

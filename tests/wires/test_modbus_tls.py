@@ -16,8 +16,8 @@ from modbus_pki import Pki, make_pki
 from support import run
 
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.tls import TlsConnection
-from fieldtwin.gateway.connections.tls_role import ROLE_OID, role_in
+from fieldtwin.gateway.connections.sockets.tls import TlsConnection
+from fieldtwin.gateway.connections.sockets.tls_role import ROLE_OID, role_in
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, ModbusExceptionReply, Unreachable, UsageError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient

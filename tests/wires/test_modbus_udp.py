@@ -11,7 +11,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.udp import UdpConnection
+from fieldtwin.gateway.connections.sockets.udp import UdpConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, Unreachable
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient

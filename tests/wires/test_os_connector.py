@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.serial.line import SerialConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.connections.tap import CaptureTap, TapFile, TappedConnector
-from fieldtwin.gateway.connections.tcp import TcpConnection
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -12,18 +12,18 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
-from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.user import FixedShape, UserFunction
+from fieldtwin.gateway.protocols.modbus.requests.user import FixedShape, UserFunction
 from fieldtwin.gateway.wallclock import WallClock
 
 CHECKOUT = Path(__file__).resolve().parents[2]

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.gateway.connections import serial_port
-from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.serial import port as serial_port
+from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable

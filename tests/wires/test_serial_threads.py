@@ -11,7 +11,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.endpoints.pty import PtyEnd
-from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
+from fieldtwin.gateway.connections.serial.threads import ThreadedSerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
@@ -23,7 +23,7 @@ for name in ("termios", "grp", "fcntl", "tty", "pty", "pwd", "resource"):
     sys.modules[name] = None
 sys.platform = "win32"
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
+from fieldtwin.gateway.connections.serial.threads import ThreadedSerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 for command in ("line", "scan", "identify"):
     __import__(f"fieldtwin.cli.device.{command}_command")

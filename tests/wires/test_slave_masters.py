@@ -25,9 +25,9 @@ from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.fifo import FifoQueues
-from fieldtwin.emulators.modbus.file_records import FileRecords
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
+from fieldtwin.emulators.modbus.functions.file_records import FileRecords
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector

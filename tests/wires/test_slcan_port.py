@@ -11,8 +11,8 @@ import can
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.slcan_port import SlcanPort
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint

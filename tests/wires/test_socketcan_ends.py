@@ -23,8 +23,8 @@ import can
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.can_end import open_can_end
-from fieldtwin.gateway.connections.can_end import SocketCanConnection
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
+from fieldtwin.gateway.connections.can.socketcan import SocketCanConnection
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError, WireError

@@ -8,9 +8,9 @@ import can
 import pytest
 from support import run
 
-from fieldtwin.emulators.endpoints.bus_hello import BusHello, unpack_hello
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_hello import BusHello, unpack_hello
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -9,8 +9,8 @@ from contextlib import asynccontextmanager
 import can
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
 from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
 from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state

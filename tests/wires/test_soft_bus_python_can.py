@@ -17,8 +17,8 @@ import canopen
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_hello import BusHello, unpack_hello
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_hello import BusHello, unpack_hello
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -11,9 +11,9 @@ from contextlib import asynccontextmanager
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_hello import FD_VERSION, VERSION, BusHello, Status, unpack_hello
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_hello import FD_VERSION, VERSION, BusHello, Status, unpack_hello
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.connection import CanConnection

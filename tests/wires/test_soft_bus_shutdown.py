@@ -13,7 +13,7 @@ import can
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.endpoint import Endpoint
 

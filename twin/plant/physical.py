@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Listen
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
@@ -31,9 +31,9 @@ from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
-from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role
-from fieldtwin.plc.start import StartPolicy
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
 from fieldtwin.twin.site.schema import StartForm
 from fieldtwin.twin.site.system import System
 

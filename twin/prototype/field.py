@@ -10,15 +10,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from fieldtwin.emulators.canopen.eds.remarks import Remark
 from fieldtwin.emulators.canopen.node import CanopenNode
-from fieldtwin.emulators.canopen.remarks import Remark
 from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.emulator import EmulatedUnit
 from fieldtwin.emulators.endpoints.ports import OsPorts, Ports
 from fieldtwin.emulators.host import EmulatorHost, ModbusWire
 from fieldtwin.emulators.journal import DeviceValueLog, share_of
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.emulated_modbus import (
+from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions, emulated_node
+from fieldtwin.emulators.models.modbus.emulated_modbus import (
     ConnectionKind,
     EmulatedModbus,
     mailbox_device,
@@ -27,10 +28,9 @@ from fieldtwin.emulators.models.emulated_modbus import (
     sampled_device,
     unit_limits,
 )
-from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
-from fieldtwin.emulators.models.mailbox_modem import MailboxModem, ModemPair
-from fieldtwin.emulators.models.packet_link import LinkImpairments, ModemEnd
-from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
+from fieldtwin.emulators.models.modbus.mailbox_modem import MailboxModem, ModemPair
+from fieldtwin.emulators.models.modbus.packet_link import LinkImpairments, ModemEnd
+from fieldtwin.emulators.models.modbus.recorded_device import RecordedDevice, load_replay
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.signals import SignalPlayer, Signals, SignalTrack

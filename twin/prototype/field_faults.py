@@ -12,7 +12,7 @@ from random import Random
 from typing import Any
 
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.endpoints.faulty_can import bus_rule
+from fieldtwin.emulators.endpoints.faulty.can import bus_rule
 from fieldtwin.emulators.faults.can_fault import BusFault
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.emulators.emulator import EmulatedCommunication
 from fieldtwin.emulators.endpoints.ports import Ports
-from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.emulators.models.modbus.packet_link import ModemEnd
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.plant.declared import declared_variables

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
-from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.emulators.models.modbus.packet_link import ModemEnd
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.connections.tap import TappedConnector
@@ -26,10 +26,10 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.runtime.outputs.refusals import RefusedOutput
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
-from fieldtwin.plc.publishing import TagChange
-from fieldtwin.plc.realtime import VIRTUAL_STUCK_MS, alarm_if_free
-from fieldtwin.plc.runner import TaskRunner
-from fieldtwin.plc.task import run_on_clock
+from fieldtwin.plc.cycle.publishing import TagChange
+from fieldtwin.plc.cycle.task import run_on_clock
+from fieldtwin.plc.runtime.realtime import VIRTUAL_STUCK_MS, alarm_if_free
+from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
 from fieldtwin.twin.plant.physical import plc_config
 from fieldtwin.twin.prototype.field import FieldSimulator

@@ -14,11 +14,11 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
 from fieldtwin.gateway.devices.canopen_rpdo import BITS
 from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from fieldtwin.gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
 from fieldtwin.gateway.protocols.canopen.configure import rpdos_of, tpdos_of
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress
-from fieldtwin.gateway.protocols.canopen.pdo import PDO_BITS
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import configuration_date, settings_of
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PDO_BITS
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.schema import BusForm, DeviceForm, IdentityForm
 

@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
-from fieldtwin.gateway.protocols.modbus.framings import framing_of, make_framer
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of, make_framer
 from fieldtwin.twin.site.schema import BusForm, DeviceForm, SystemForm
 
 MODBUS_BUS_KEYS = ("spacing_ms", "turnaround_ms", "connect_pause_ms", "echo", "strict", "probe_percent")

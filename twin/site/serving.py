@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from fieldtwin.gateway.connections.tls_listen import check_files
+from fieldtwin.gateway.connections.sockets.tls_listen import check_files
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
-from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS, ServedTable
+from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS, WRITE_FUNCTIONS, ServedTable
 from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, network
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
-from fieldtwin.gateway.connections.tls import client_context
+from fieldtwin.gateway.connections.sockets.tls import client_context
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError

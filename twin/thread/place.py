@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 
-from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.endpoint import Endpoint

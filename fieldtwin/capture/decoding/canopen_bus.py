@@ -18,9 +18,9 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.canopen import cob_id
-from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, heartbeat_state
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, heartbeat_state
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import meaning
 
 _COMMANDS = {int(c): c.name.lower().replace("_", " ").replace("pre operational", "pre-operational") for c in NmtCommand}
 _STATES = {s: s.name.replace("_", "-") for s in NmtState}

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.devices.config import DeviceConfig
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
 from fieldtwin.results.trace import TraceEvent, TraceKind, refusal_text
 from fieldtwin.twin.site.system import System
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.protocols.canopen import lss
+from fieldtwin.gateway.protocols.canopen.lss import frames as lss
 
 _STATES = {0: "waiting", 1: "configuration"}
 _SERVICES = {

@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
 
-from fieldtwin.gateway.protocols.modbus.crc import crc16
-from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16
+from fieldtwin.gateway.protocols.modbus.frames.shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
 MAX_ADU = 260
 MAX_ASCII = 513

@@ -24,9 +24,9 @@ from fieldtwin.gateway.protocols.canopen.configure import (
     TPDO_MAX,
     PdoConfig,
 )
-from fieldtwin.gateway.protocols.canopen.datatypes import decode
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import decode
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry, PdoMapping
 
 _PARAMETERS = range(RPDO_COMMUNICATION, TPDO_MAPPING + TPDO_MAX)
 _MAPPINGS = frozenset((*range(RPDO_MAPPING, TPDO_COMMUNICATION), *range(TPDO_MAPPING, TPDO_MAPPING + TPDO_MAX)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import meaning
 
 MAX_BYTES = 1 << 20
 """Maximum number of bytes that are kept of one object's value."""

@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.installation import install_hint
 
 BATCH = 10_000

@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import LeftOut, line_of, read_log
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.recording import RecordingHeader, encode_exchange, encode_header
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
 
 CNV = (".cnv", ".cnv.gz", ".cnv.bz2")
 KINDS = ".pcap, .pcapng, .log (candump), .asc, .blf, .trc, .csv, .cnv, .txt (mbpoll, modpoll), a capture of fieldtwin's"

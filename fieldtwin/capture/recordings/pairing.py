@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from fieldtwin.capture.decoding.modbus_frames import Expected, ModbusFrame, splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.gateway.core.files.recording import ExchangeError, RecordedExchange
-from fieldtwin.gateway.protocols.modbus.crc import crc16
-from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16
+from fieldtwin.gateway.protocols.modbus.frames.shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
 MAX_OPEN = 64
 """Maximum number of open requests on one connection; an older one counts as unanswered."""

@@ -25,7 +25,7 @@ from fieldtwin.commissioning.access.writing import Write, Written
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
 from fieldtwin.gateway.core.files.profile import Tag
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import Diagnostics
 from fieldtwin.gateway.wallclock import run as run_precise
 
 RESTART_COMMUNICATIONS = 1

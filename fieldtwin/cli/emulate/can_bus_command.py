@@ -9,10 +9,10 @@ from typing import Any
 import click
 
 from fieldtwin.console import stderr
-from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
-from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.emulators.endpoints.can.bus_bridge import CanBridge
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.slcan_port import SlcanPort
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 

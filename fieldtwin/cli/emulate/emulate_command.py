@@ -96,7 +96,7 @@ def command(
 def _emulate_one(kind: str, path: Path, device: OneDeviceOptions, replay: RecordingOptions) -> int:
     """Emulate a device, a recording, a data sheet or a log until a signal ends it. Return the exit status."""
     from fieldtwin.emulators.context import EndOfRecording
-    from fieldtwin.emulators.models.emulated_node import NodeOptions
+    from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions
     from fieldtwin.emulators.replay.replay import NeverRecorded
     from fieldtwin.run.emulate.device import run_device
     from fieldtwin.run.processes.event_loop import run as run_loop

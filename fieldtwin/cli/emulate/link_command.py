@@ -12,8 +12,8 @@ import click
 
 from fieldtwin.console import stderr
 from fieldtwin.emulators.can_link import CanLink
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.frames import FrameDirection, Framing
 from fieldtwin.emulators.faults.on_link import check_can_link, check_link, wire_faults

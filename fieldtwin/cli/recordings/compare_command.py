@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import shown
-from fieldtwin.gateway.protocols.canopen.sdo import SdoUpload
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import SdoUpload
 from fieldtwin.gateway.wallclock import run as run_precise
 from fieldtwin.reports.site.about import headed
 from fieldtwin.twin.site.data_files import find

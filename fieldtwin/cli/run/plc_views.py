@@ -16,8 +16,8 @@ from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.prove import Proof, SearchResult
+from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE, matches
 from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
-from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
 
 REFRESH_S = 0.25
 IN_A_PIPE = 500

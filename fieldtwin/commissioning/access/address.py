@@ -20,8 +20,8 @@ from fieldtwin.gateway.core.files.profile import (
     Tag,
     resolve_address,
 )
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType
-from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary
 
 AUTO = "auto"
 """The type of a CANopen object of unknown type: it follows from the data's length."""

@@ -19,8 +19,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import framing_of, make_framer
-from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of, make_framer
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 from fieldtwin.gateway.wallclock import WallClock
 
 

@@ -27,11 +27,10 @@ from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
 from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.sdo import SdoDownload, SdoUpload
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import SdoDownload, SdoUpload
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
+from fieldtwin.gateway.protocols.modbus.requests.data import (
     ReadBits,
     ReadRegisters,
     WriteCoil,
@@ -39,6 +38,7 @@ from fieldtwin.gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 WIRE_TROUBLE = (ReplyTimeout, CrcError, Desync)
 OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4}

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.twin.site.data_files import find
 
 MOST_HEX_BYTES = 48

@@ -24,12 +24,16 @@ from fieldtwin.gateway.core.errors import (
     WrongSize,
 )
 from fieldtwin.gateway.core.files.profile import RegisterRange
-from fieldtwin.gateway.protocols.canopen.abort_codes import TIMED_OUT
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import TIMED_OUT
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
-from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog
+from fieldtwin.gateway.protocols.modbus.requests.identity import (
+    ReadDeviceIdentification,
+    ReadExceptionStatus,
+    ReportServerId,
+)
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 ACKNOWLEDGE, BUSY, NO_PATH, NO_TARGET = 0x05, 0x06, 0x0A, 0x0B
 BUSY_WAIT_S = 0.2

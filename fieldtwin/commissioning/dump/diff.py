@@ -20,8 +20,8 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile, RegisterRange, Tag
 from fieldtwin.gateway.core.values import Reason, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale
-from fieldtwin.gateway.protocols.canopen.datatypes import LengthMismatch, decode
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import LengthMismatch, decode
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 NOT_THERE = 0x0602_0000
 NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)

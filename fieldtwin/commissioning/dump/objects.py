@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from fieldtwin.commissioning.dump.coverage import coarse_to_fine
 from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Invalid, Outcome, RefusedRead, Silent, Taken
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8

@@ -17,7 +17,7 @@ from itertools import pairwise
 
 from fieldtwin.commissioning.dump.coverage import INVALID, READABLE, REFUSED, SILENT, Coverage, joined
 from fieldtwin.gateway.core.files.profile import RegisterRange, Table
-from fieldtwin.gateway.protocols.modbus.requests import MAX_READ_BITS, MAX_READ_REGISTERS
+from fieldtwin.gateway.protocols.modbus.requests.data import MAX_READ_BITS, MAX_READ_REGISTERS
 
 ILLEGAL_FUNCTION = 0x01
 DENSE = 8

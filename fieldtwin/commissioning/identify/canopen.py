@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.protocols.canopen.configure import Identity
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.wallclock import WallClock
 

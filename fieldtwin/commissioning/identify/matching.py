@@ -16,7 +16,7 @@ from enum import IntEnum
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.gateway.protocols.canopen.configure import Identity
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 ENOUGH_SIGNS = 6
 """Number of plausible values, out of those that could have been implausible, that make a map likely."""

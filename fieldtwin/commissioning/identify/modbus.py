@@ -32,10 +32,10 @@ from fieldtwin.gateway.core.errors import (
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
-from fieldtwin.gateway.protocols.modbus.replies import Reply
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReadDeviceIdentification, ReportServerId
+from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 MOST_TAGS = 24
 """Number of values of a profile that are read to see whether they are plausible, in addition to those of its `identify`."""

@@ -24,9 +24,9 @@ from fieldtwin.gateway.core.errors import (
 )
 from fieldtwin.gateway.core.files.recording import ExchangeError, RecordedExchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, ServerRequest, examine
-from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
+from fieldtwin.gateway.protocols.modbus.server.analysis import BROADCAST_FUNCTIONS, ServerRequest, examine
+from fieldtwin.gateway.protocols.modbus.server.forward import Forwarded
 from fieldtwin.gateway.wallclock import WallClock
 
 _READS = frozenset({1, 2, 3, 4})

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
-from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
+from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 
 _STUFF = 1.1
 """Bits on the bus per bit of a frame, with the stuff bits of usual data."""

@@ -15,15 +15,15 @@ from dataclasses import dataclass, field, replace
 from fieldtwin.commissioning.access.connection import canopen_at, frames_at
 from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan.can_listener import BusHeard, BusListener
-from fieldtwin.gateway.connections.can_facts import CanFacts, can_facts
+from fieldtwin.gateway.connections.can.facts import CanFacts, can_facts
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import DeviceRefused, UsageError, WireError
 from fieldtwin.gateway.protocols.canopen import cob_id
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.canopen.scan import FoundNode, scan_nodes
 from fieldtwin.gateway.wallclock import WallClock

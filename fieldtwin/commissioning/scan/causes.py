@@ -13,8 +13,8 @@ from fieldtwin.commissioning.scan.can_listener import BusHeard
 from fieldtwin.commissioning.scan.listening import LineVerdict
 from fieldtwin.commissioning.scan.settings import name_of
 from fieldtwin.commissioning.scan.traffic import Heard
-from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import UartCounters
+from fieldtwin.gateway.connections.can.facts import CanFacts
+from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2

@@ -27,13 +27,13 @@ from fieldtwin.commissioning.scan.listening import describe
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.sweep import SendRequest, UnitSweep
 from fieldtwin.commissioning.scan.traffic import Heard
-from fieldtwin.gateway.connections.can_facts import CanFacts
-from fieldtwin.gateway.connections.line_counters import CountsErrors, UartCounters
+from fieldtwin.gateway.connections.can.facts import CanFacts
+from fieldtwin.gateway.connections.serial.line_counters import CountsErrors, UartCounters
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, NotAllowed, Unreachable
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
 from fieldtwin.gateway.wallclock import WallClock
 
 CONNECT_S = 5.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from fieldtwin.commissioning.scan.settings import name_of
 from fieldtwin.commissioning.scan.traffic import Heard
-from fieldtwin.gateway.connections.line_counters import UartCounters
+from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import SerialSettings
 

@@ -19,12 +19,12 @@ from fieldtwin.commissioning.scan.settings import Pace, ScanStep
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, Alike, likeness, spread_over
 from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
-from fieldtwin.gateway.connections.line_counters import CountsErrors, UartCounters
+from fieldtwin.gateway.connections.serial.line_counters import CountsErrors, UartCounters
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
-from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing_of
 from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS

@@ -14,9 +14,9 @@ from typing import Any
 
 from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.protocols.modbus.framings import Framing, make_framer
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, make_framer
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 PROBE = ReadRegisters("holding", 0, 1)
 """The question: a register that most devices have.

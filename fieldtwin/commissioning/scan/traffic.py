@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing
 
 SETTLE_NS = 40 * NS_PER_MS
 """A silence after which no bytes belong to earlier ones, even with a USB adapter."""

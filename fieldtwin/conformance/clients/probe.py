@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ModbusExceptionReply, UsageError, WireError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.requests import RegisterTable
+from fieldtwin.gateway.protocols.modbus.requests.data import RegisterTable
 
 OnShown = Callable[[Word, str], None]
 _REGISTER = re.compile(

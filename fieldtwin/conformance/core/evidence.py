@@ -21,7 +21,7 @@ from fieldtwin.conformance.core.observation import (
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.canopen import cob_id
-from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import meaning
 
 MOST_LINES = 200
 """Lines of evidence that a case keeps: its first and its last ones."""

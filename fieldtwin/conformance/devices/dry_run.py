@@ -15,7 +15,7 @@ from typing import Any
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
 from fieldtwin.conformance.devices.checked import Checked
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds, parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
@@ -23,9 +23,9 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, s
 from fieldtwin.emulators.endpoints.ports import OnClient
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop

@@ -17,7 +17,7 @@ from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import RegisterRange
 from fieldtwin.gateway.devices.config import DeviceConfig
-from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import MEANINGS
 from fieldtwin.results.model import AccessCounts, Machine
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
-from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS, meaning
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import MEANINGS, meaning
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import fill
 from fieldtwin.reports.run.coverage import aborts_missing, devices_covered, exceptions_missing

@@ -13,7 +13,7 @@ from typing import Any
 from msgspec.structs import asdict
 
 from fieldtwin.conformance.core.case import Impact
-from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.emulators.models.modbus.packet_link import ModemEnd
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
@@ -24,8 +24,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.runtime.outputs.refusals import RefusedOutput
-from fieldtwin.plc.publishing import TagChange
-from fieldtwin.plc.task import StopReason
+from fieldtwin.plc.cycle.publishing import TagChange
+from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind, refusal_data

@@ -8,14 +8,14 @@ from tempfile import TemporaryDirectory
 
 from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
 from fieldtwin.console import stderr
-from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds
-from fieldtwin.emulators.canopen.lss import UNCONFIGURED
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, load_eds
+from fieldtwin.emulators.canopen.eds.remarks import Remark
+from fieldtwin.emulators.canopen.lss.slave import UNCONFIGURED
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.canopen.remarks import Remark
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.host import EmulatorHost
-from fieldtwin.emulators.models.by_profile import model_for
-from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
+from fieldtwin.emulators.models.canopen.by_profile import model_for
+from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions, node_remarks
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.objects import recorded_objects
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal

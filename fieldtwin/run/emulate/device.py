@@ -18,7 +18,8 @@ from fieldtwin.emulators.device_faults import DeviceFaults
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.host import EmulatorHost, ModbusWire, framing_of
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.emulated_modbus import (
+from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions, emulated_node
+from fieldtwin.emulators.models.modbus.emulated_modbus import (
     ConnectionKind,
     EmulatedModbus,
     mailbox_device,
@@ -26,9 +27,8 @@ from fieldtwin.emulators.models.emulated_modbus import (
     register_device,
     sampled_device,
 )
-from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
-from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.models.modbus.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
 from fieldtwin.emulators.replay.unit import ReplayUnit

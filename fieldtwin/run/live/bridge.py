@@ -21,8 +21,8 @@ from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
+from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import LOOPBACK, AllowRule, Network, Policy

@@ -11,8 +11,8 @@ import msgspec
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.runtime.gateway_status import BusStatus, GatewayStatus, RefusalsStatus
+from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.plc.status import PlcStatus
-from fieldtwin.plc.task import StopReason
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.processes.states import SeenStates, expected_states
 from fieldtwin.twin.prototype.field_status import FieldStatus

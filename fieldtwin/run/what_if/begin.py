@@ -6,8 +6,8 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from fieldtwin.emulators.distorted_registers import DistortedRegisters
-from fieldtwin.emulators.models.register_device import ProfileRegisters
+from fieldtwin.emulators.models.modbus.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.run.what_if.state import KnownState, Number

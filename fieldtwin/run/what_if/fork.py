@@ -22,8 +22,8 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.plc.publishing import TagChange
-from fieldtwin.plc.task import StopReason
+from fieldtwin.plc.cycle.publishing import TagChange
+from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.what_if.begin import begin, otherwise, retain_for

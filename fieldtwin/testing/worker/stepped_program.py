@@ -13,8 +13,8 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.image.image import Message, TagKind
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.binding import BoundProgram, load_program
+from fieldtwin.plc.cycle.scan import failed
 from fieldtwin.plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
-from fieldtwin.plc.scan import failed
 from fieldtwin.plc.states import StateMachine
 
 MAX_SCANS = 10_000_000

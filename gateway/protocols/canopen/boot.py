@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import SdoAborted
-from fieldtwin.gateway.protocols.canopen.concise_dcf import CONFIGURATION_DATE, Setting
 from fieldtwin.gateway.protocols.canopen.configure import (
     DEVICE_TYPE,
     IDENTITY,
@@ -18,7 +17,8 @@ from fieldtwin.gateway.protocols.canopen.configure import (
     verify_number,
     write_number,
 )
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import CONFIGURATION_DATE, Setting
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 STORE_PARAMETERS = 0x1010

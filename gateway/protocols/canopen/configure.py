@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 from fieldtwin.gateway.core.errors import Desync, FileInvalid, SdoAborted, UsageError, VerifyFailed
 from fieldtwin.gateway.protocols.canopen import cob_id as cob_ids
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType, decode, encode, size_of
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType, decode, encode, size_of
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.pdo import MAX_ENTRIES, PdoMapping
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import MAX_ENTRIES, PdoMapping
 
 DEVICE_TYPE = 0x1000
 HEARTBEAT_PRODUCER = 0x1017

@@ -22,12 +22,20 @@ from fieldtwin.gateway.core.errors import (
     UsageError,
 )
 from fieldtwin.gateway.core.histogram import response_times
-from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id, nmt
-from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S, SdoDownload, SdoTransfer, SdoUpload, TransferTooLong
-from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from fieldtwin.gateway.protocols.canopen.sdo_channel import SdoChannel, SdoCounters
+from fieldtwin.gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.protocols.canopen.nmt import states as nmt
+from fieldtwin.gateway.protocols.canopen.nmt.heartbeat import HeartbeatConsumer
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent, conflict_text
+from fieldtwin.gateway.protocols.canopen.sdo import abort_codes
+from fieldtwin.gateway.protocols.canopen.sdo.block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.canopen.sdo.channel import SdoChannel, SdoCounters
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import (
+    WHOLE_S,
+    SdoDownload,
+    SdoTransfer,
+    SdoUpload,
+    TransferTooLong,
+)
 
 PdoCallback = Callable[[bytes, int], None]
 """A callback with the frame's data and its time of reception (monotonic, ns)."""

@@ -12,9 +12,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted
 from fieldtwin.gateway.protocols.canopen.cob_id import NODE_MAX
 from fieldtwin.gateway.protocols.canopen.configure import DEVICE_TYPE, Identity, read_identity
-from fieldtwin.gateway.protocols.canopen.datatypes import LengthMismatch
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import LengthMismatch
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,13 +25,9 @@ from fieldtwin.gateway.core.errors import (
     VerifyFailed,
 )
 from fieldtwin.gateway.core.histogram import response_times
-from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of, make_framer
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing_of, make_framer
 from fieldtwin.gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
-from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
-from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.protocols.modbus.requests.data import (
     BitTable,
     MaskWriteRegister,
     ReadBits,
@@ -43,6 +39,10 @@ from fieldtwin.gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReadDeviceIdentification
+from fieldtwin.gateway.protocols.modbus.requests.refusals import GatewayRefusal
+from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply, Reply, WriteReply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 R = TypeVar("R", bound=Reply)

@@ -10,9 +10,9 @@ from typing import Generic, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
-from fieldtwin.gateway.protocols.modbus.framing import Framer
-from fieldtwin.gateway.protocols.modbus.replies import Reply
-from fieldtwin.gateway.protocols.modbus.request import Request, parse_reply
+from fieldtwin.gateway.protocols.modbus.frames.framing import Framer
+from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request, parse_reply
 
 R = TypeVar("R", bound=Reply)
 

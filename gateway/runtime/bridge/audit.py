@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply, Unreachable
-from fieldtwin.gateway.protocols.modbus.refusals import refusal
-from fieldtwin.gateway.protocols.modbus.server import SERVER_FAILURE
-from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server.analysis import SERVER_FAILURE
+from fieldtwin.gateway.protocols.modbus.server.forward import ForwardedReply
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 
 MOST_CLIENTS = 256

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Listen
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -27,9 +27,9 @@ from fieldtwin.gateway.core.errors import (
     VerifyFailed,
     WireError,
 )
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.refusals import refusal
-from fieldtwin.gateway.protocols.modbus.server import (
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
+from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server.analysis import (
     BROADCAST_FUNCTIONS,
     ILLEGAL_FUNCTION,
     NO_PATH,
@@ -40,7 +40,7 @@ from fieldtwin.gateway.protocols.modbus.server import (
     examine,
     exception_pdu,
 )
-from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.protocols.modbus.server.forward import ForwardedReply
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.audit import WriteRecord
 from fieldtwin.gateway.runtime.bridge.broadcast import when_all_are_out

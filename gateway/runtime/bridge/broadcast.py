@@ -9,8 +9,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable
 
-from fieldtwin.gateway.protocols.modbus.refusals import refusal
-from fieldtwin.gateway.protocols.modbus.server import NO_PATH, exception_pdu
+from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server.analysis import NO_PATH, exception_pdu
 
 _REPEATED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
 """How many bytes of the request the normal reply repeats (AP 6); for 15h all of it."""

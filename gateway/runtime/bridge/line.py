@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
-from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuRequests
+from fieldtwin.gateway.protocols.modbus.server.line import LineRequest, RtuRequests
 from fieldtwin.gateway.runtime.bridge.policy import LINE
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Ask, Caller
 from fieldtwin.gateway.runtime.buses.backoff import Backoff

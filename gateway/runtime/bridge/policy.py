@@ -12,7 +12,7 @@ from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.protocols.modbus.server import (
+from fieldtwin.gateway.protocols.modbus.server.analysis import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     NO_PATH,

@@ -14,15 +14,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Client, Clients, Listen
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
-from fieldtwin.gateway.protocols.modbus.refusals import refusal
-from fieldtwin.gateway.protocols.modbus.server import SERVER_BUSY, exception_pdu
-from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
+from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server.analysis import SERVER_BUSY, exception_pdu
+from fieldtwin.gateway.protocols.modbus.server.mbap import MbapRequests, TcpRequest
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 

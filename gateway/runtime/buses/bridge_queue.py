@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, WireError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.server import ServerRequest
-from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
+from fieldtwin.gateway.protocols.modbus.server.analysis import ServerRequest
+from fieldtwin.gateway.protocols.modbus.server.forward import Forwarded, ForwardedReply
 
 MAX_WAIT_NS = 10_000_000_000
 """A client that has waited longer than this has given up, so its request is not sent any more."""

@@ -37,12 +37,12 @@ from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
 from fieldtwin.gateway.protocols.canopen.emcy_log import EmcyLog
-from fieldtwin.gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.lss.frames import UNCONFIGURED, LssAddress
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from fieldtwin.gateway.protocols.canopen.sync import FrameProducer, SyncProducer, TimeProducer
-from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent, conflict_text
+from fieldtwin.gateway.protocols.canopen.pdo.sync import FrameProducer, SyncProducer, TimeProducer
+from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.bus import Ended, status_of

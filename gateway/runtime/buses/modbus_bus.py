@@ -37,9 +37,9 @@ from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, WriteProgress
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
-from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
+from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
+from fieldtwin.gateway.protocols.modbus.requests.refusals import Acknowledged, GatewayRefusal, ServerBusy
+from fieldtwin.gateway.protocols.modbus.server.analysis import NO_RESPONSE
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeQueue
 from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent, status_of

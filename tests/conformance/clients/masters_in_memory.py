@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NodeEvent
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 WORDS = (1111, 2222, 3333)

@@ -19,7 +19,7 @@ from test_strange_masters_judged import CANOPEN, run_check
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe
 from fieldtwin.conformance.core.observation import Word
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
-from fieldtwin.emulators.modbus.rtu_receiver import crc16, with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import crc16, with_crc
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -9,7 +9,7 @@ import pytest
 from masters_in_memory import LAZY_S, Publish, judge, judge_canopen
 
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
-from fieldtwin.emulators.modbus.rtu_receiver import crc16, with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import crc16, with_crc
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import ByteConnection

@@ -11,10 +11,10 @@ from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.fifo import FifoQueues
-from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
+from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop

@@ -16,7 +16,7 @@ from support import run
 from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
 from fieldtwin.conformance.devices.checked import Checked
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.connections.soft_bus import SoftBus

@@ -10,7 +10,7 @@ from nodes_on_a_bus import LONG, on_bus, ours
 
 from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet

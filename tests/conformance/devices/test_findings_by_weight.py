@@ -32,7 +32,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16, with_crc
 from fieldtwin.reports.conformance.client import render_master_html
 from fieldtwin.reports.conformance.device import render_html
 from fieldtwin.reports.conformance.page import overall

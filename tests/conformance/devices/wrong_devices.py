@@ -9,8 +9,8 @@ from devices_in_memory import make_unit
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.protocols.modbus.ascii import lrc
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 Twist = Callable[[ModbusUnit, bytes, bytes | None], bytes | None]
 """Map the unit, the request and the correct answer to the answer sent."""

@@ -6,7 +6,7 @@ from canopen_slave_rig import NODE, RICH
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CANConnection, CanConnection

@@ -8,10 +8,10 @@ import contextlib
 from canopen_slave_rig import NODE, RICH
 from modbus_virtual import VirtualLoop, run_virtually
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection

@@ -10,8 +10,8 @@ from canopen_slave_rig import INCLINOMETER, ROOT, U8, U32, record, var
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.canopen import codec
-from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.eds import codec
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds, parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.node_data import NodeData
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError

@@ -13,7 +13,7 @@ import pytest
 from canopen_slave_rig import INCLINOMETER
 from support import eventually, run
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NmtState, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.gateway.core.canframe import CanFrame

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_virtual import VirtualLoop, run_virtually
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
-from fieldtwin.emulators.canopen.lss import FROM_MASTER, FROM_SLAVE, UNCONFIGURED
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss.slave import FROM_MASTER, FROM_SLAVE, UNCONFIGURED
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import AttachedConnection, BusRunner
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError

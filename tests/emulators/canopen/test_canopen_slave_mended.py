@@ -13,8 +13,8 @@ import pytest
 from canopen_slave_rig import Rig, record, var
 from support import eventually, run
 
-from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
-from fieldtwin.emulators.canopen.eds_text import MAX_LINES
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.eds.text import MAX_LINES
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.errors import FileInvalid
 

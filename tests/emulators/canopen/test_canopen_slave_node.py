@@ -9,7 +9,7 @@ from canopen_slave_rig import INCLINOMETER, NODE, RICH, U32, Rig, mux, var
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NmtState, NodeContext
 from fieldtwin.emulators.canopen.service import SentPdo
 from fieldtwin.gateway.core.canframe import CanFrame

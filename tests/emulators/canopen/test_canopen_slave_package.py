@@ -14,12 +14,12 @@ from canopen_localnode import DUMMIES
 from canopen_slave_rig import NODE, RICH
 from support import run
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
-from fieldtwin.emulators.canopen.lss import UNCONFIGURED
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss.slave import UNCONFIGURED
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.canopen.service import NmtState
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock

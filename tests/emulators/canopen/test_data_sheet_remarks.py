@@ -17,9 +17,9 @@ from canopen_slave_rig import record, var
 from support import eventually, run
 
 from fieldtwin.commissioning.access.connection import canopen_at
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.remarks import remarks
 from fieldtwin.emulators.canopen.node import CanopenNode
-from fieldtwin.emulators.canopen.remarks import remarks
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import load_system

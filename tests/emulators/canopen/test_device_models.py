@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.emulators.canopen import codec
-from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds, parse_eds
+from fieldtwin.emulators.canopen.eds import codec
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, load_eds, parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.models.by_profile import MODELS, model_for
-from fieldtwin.emulators.models.io_module import IoModule
-from fieldtwin.emulators.models.measuring_device import ZERO
+from fieldtwin.emulators.models.canopen.by_profile import MODELS, model_for
+from fieldtwin.emulators.models.canopen.io_module import IoModule
+from fieldtwin.emulators.models.canopen.measuring_device import ZERO
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.service import NmtState
-from fieldtwin.emulators.models.drive import Drive
-from fieldtwin.emulators.models.drive_states import (
+from fieldtwin.emulators.models.drive.drive import Drive
+from fieldtwin.emulators.models.drive.motion import Motion, to_place, to_speed
+from fieldtwin.emulators.models.drive.states import (
     STATE_MASK,
     TRANSITIONS,
     DriveState,
@@ -21,7 +22,6 @@ from fieldtwin.emulators.models.drive_states import (
     command_of,
     transition,
 )
-from fieldtwin.emulators.models.motion import Motion, to_place, to_speed
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from test_data_sheet_remarks import DRIVE
 from test_drive_model import ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, Rig, S
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.models.drive import Drive
-from fieldtwin.emulators.models.drive_homing import METHODS, DriveAxis, Speeds, plan
-from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
-from fieldtwin.emulators.models.motion import Motion, by_torque
+from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions, node_remarks
+from fieldtwin.emulators.models.drive.drive import Drive
+from fieldtwin.emulators.models.drive.homing import METHODS, DriveAxis, Speeds, plan
+from fieldtwin.emulators.models.drive.motion import Motion, by_torque
 
 AXIS = DriveAxis()
 PLACES = st.floats(-250_000, 250_000)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from canopen_slave_rig import RICH, Rig
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import NodeContext
 from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.emulators.replay.can_log import CanLog

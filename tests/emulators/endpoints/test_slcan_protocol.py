@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.endpoints.slcan_protocol import MAX_LINE, SlcanSession
+from fieldtwin.emulators.endpoints.can.slcan_protocol import MAX_LINE, SlcanSession
 from fieldtwin.gateway.core.can_error import CanErrorState, overrun_frame, state_frame, violation_frame
 from fieldtwin.gateway.core.canframe import CanFrame
 

@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.emulators.canopen.codec import decode as object_value
+from fieldtwin.emulators.canopen.eds.codec import decode as object_value
 from fieldtwin.emulators.codec import decode
-from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.faults.fault import Active, Aim
 from fieldtwin.emulators.faults.registry import fault_class
 from fieldtwin.emulators.modbus.bank import NoSuchAddress
-from fieldtwin.emulators.models.emulated_node import EmulatedNode, emulated_node
-from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.models.register_device import ProfileRegisters
+from fieldtwin.emulators.models.canopen.emulated_node import EmulatedNode, emulated_node
+from fieldtwin.emulators.models.modbus.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.models.modbus.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.faulty import FaultyEnd
-from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty.udp import FaultyDatagrams
 from fieldtwin.emulators.endpoints.modbus_server import serve_udp
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.endpoints.pty import PtyEnd

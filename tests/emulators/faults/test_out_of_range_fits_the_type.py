@@ -13,7 +13,7 @@ import pytest
 
 from fieldtwin.emulators.device_faults import DeviceFaults, check_device
 from fieldtwin.emulators.faults.schema import load_faults, parse_fault
-from fieldtwin.emulators.recorded_device import RecordedDevice
+from fieldtwin.emulators.models.modbus.recorded_device import RecordedDevice
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import cells_of
 from fieldtwin.gateway.core.connection import RS232Connection

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.bank import Acknowledge, CellHooks, CellSpan, IllegalValue, MapBank, NegativeAcknowledge
-from fieldtwin.emulators.modbus.fifo import FifoQueues
-from fieldtwin.emulators.modbus.file_records import FileRecords
-from fieldtwin.emulators.modbus.identification import MAX_OBJECT, Identification
+from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
+from fieldtwin.emulators.modbus.functions.file_records import FileRecords
+from fieldtwin.emulators.modbus.functions.identification import MAX_OBJECT, Identification
 from fieldtwin.emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.errors import UsageError
 

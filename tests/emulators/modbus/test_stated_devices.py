@@ -9,7 +9,7 @@ import pytest
 
 from fieldtwin.emulators.emulator import EmulatedUnit
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
-from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
+from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters, add_own_functions
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import parts_of

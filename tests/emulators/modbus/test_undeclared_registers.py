@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.register_device import ProfileRegisters
-from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.models.modbus.recorded_device import load_replay
+from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile, resolve

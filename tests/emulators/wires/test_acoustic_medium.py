@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.modbus.acoustic_link import AcousticLink
 from fieldtwin.emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, AcousticProperties
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError

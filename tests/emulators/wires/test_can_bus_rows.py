@@ -14,11 +14,11 @@ from canopen_rows import parse_frame
 from canopen_slave_rig import RICH
 from modbus_virtual import VirtualLoop, run_virtually
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
-from fieldtwin.emulators.endpoints.faulty_can import FaultyCan
+from fieldtwin.emulators.endpoints.can.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.emulators.endpoints.faulty.can import FaultyCan
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.wires.can_bus import CanBus

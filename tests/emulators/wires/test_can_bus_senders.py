@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint

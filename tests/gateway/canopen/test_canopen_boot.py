@@ -27,10 +27,10 @@ from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNo
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat
 from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable

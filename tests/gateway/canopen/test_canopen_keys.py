@@ -10,7 +10,7 @@ from test_concise_dcf import TPDO1, var
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, RpdoConfig
 from fieldtwin.gateway.protocols.canopen.boot import ExpectedIdentity
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
 from fieldtwin.twin.site.system import load_system
 
 SYSTEM = """\

@@ -12,8 +12,8 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted, UsageError
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from fieldtwin.gateway.protocols.canopen.sdo_channel import NodeRestarted
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.sdo.channel import NodeRestarted
 
 
 class Bench:

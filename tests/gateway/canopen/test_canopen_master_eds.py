@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.protocols.canopen.concise_dcf import settings_of
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType
-from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import settings_of
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
 
 EDS = """\
 [FileInfo]

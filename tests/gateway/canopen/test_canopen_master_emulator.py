@@ -16,10 +16,10 @@ from canopen_slave_rig import RICH
 from modbus_virtual import VirtualLoop, run_virtually
 from test_concise_dcf import TPDO1, record, var
 
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import SdoAborted
 from fieldtwin.gateway.protocols.canopen.boot import (
@@ -29,12 +29,12 @@ from fieldtwin.gateway.protocols.canopen.boot import (
     identity_differences,
 )
 from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
-from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting, decode_concise, encode_concise, settings_of
 from fieldtwin.gateway.protocols.canopen.configure import read_tpdos
-from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import Setting, decode_concise, encode_concise, settings_of
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NodeEvent
+from fieldtwin.gateway.protocols.canopen.nmt.states import NodeEvent
 from fieldtwin.gateway.protocols.canopen.scan import scan_nodes
 
 HERE = Endpoint.parse("can:fieldtwin/127.0.0.1:1")

@@ -26,7 +26,6 @@ from fieldtwin.gateway.protocols.canopen.boot import (
     holds_configuration,
     identity_differences,
 )
-from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
 from fieldtwin.gateway.protocols.canopen.configure import (
     Identity,
     configure_tpdo,
@@ -34,12 +33,13 @@ from fieldtwin.gateway.protocols.canopen.configure import (
     read_tpdo,
     set_heartbeat_producer,
 )
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType, decode
-from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType, decode
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 from fieldtwin.gateway.wallclock import WallClock
 
 NODE = 5

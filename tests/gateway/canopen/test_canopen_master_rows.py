@@ -26,12 +26,12 @@ from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
 from fieldtwin.gateway.protocols.canopen.emcy_log import EmcyLog
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress, LssRefused
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress, LssRefused
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
-from fieldtwin.gateway.protocols.canopen.sync import SyncProducer, TimeProducer
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
+from fieldtwin.gateway.protocols.canopen.pdo.sync import SyncProducer, TimeProducer
 
 ROOT = Path(__file__).parents[3]
 ROWS = tomllib.loads((ROOT / "tests" / "vectors" / "canopen_master.toml").read_text())["row"]

@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import Desync, UsageError
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType, LengthMismatch, decode, encode, is_signed, size_of
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import (
+    DataType,
+    LengthMismatch,
+    decode,
+    encode,
+    is_signed,
+    size_of,
+)
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
-from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry, PdoLengthMismatch, PdoMapping
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ import canopen
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.journal import DeviceValueLog
-from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.values import Quality
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype

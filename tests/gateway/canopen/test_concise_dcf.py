@@ -7,16 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import Desync, FileInvalid, UsageError
-from fieldtwin.gateway.protocols.canopen.concise_dcf import (
+from fieldtwin.gateway.protocols.canopen.configure import tpdos_of
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import (
     Setting,
     configuration_date,
     decode_concise,
     encode_concise,
     settings_of,
 )
-from fieldtwin.gateway.protocols.canopen.configure import tpdos_of
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, parse_dictionary
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, parse_dictionary
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 
 
 def var(section: str, kind: int, access: str, default: str = "", value: str = "") -> str:

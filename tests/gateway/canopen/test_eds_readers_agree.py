@@ -13,10 +13,10 @@ from eds_agreement import NODE, differences
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.canopen.dictionary import Dictionary, parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import Dictionary, parse_eds
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.protocols.canopen.concise_dcf import settings_of
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary, parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import settings_of
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary, parse_dictionary
 
 ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "profiles" / "devices").glob("*.eds"))
@@ -137,7 +137,7 @@ def test_a_record_may_be_stored_compactly() -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
 def test_both_readers_take_every_encoding(tmp_path: Path, encoding: str) -> None:
-    from fieldtwin.emulators.canopen.dictionary import load_eds
+    from fieldtwin.emulators.canopen.eds.dictionary import load_eds
 
     path = tmp_path / "x.eds"
     path.write_bytes(one(7, "DefaultValue=7").replace("VendorName=x", "VendorName=Müller").encode(encoding))

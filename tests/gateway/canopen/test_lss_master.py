@@ -15,8 +15,8 @@ from support import eventually
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import ReplyTimeout, UsageError
-from fieldtwin.gateway.protocols.canopen.lss import LssAddress, LssRefused
-from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress, LssRefused
+from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 REPLY_S = 0.01

@@ -12,7 +12,7 @@ from modbus_virtual import run_virtually
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 from fieldtwin.gateway.protocols.canopen.scan import FoundNode, scan_nodes
 
 U32 = (1).to_bytes(4, "little")

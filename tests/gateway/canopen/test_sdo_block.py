@@ -12,8 +12,8 @@ from sdo_block_peer import BlockServer
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from fieldtwin.gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SendFrame, Stray, WaitForFrame
-from fieldtwin.gateway.protocols.canopen.sdo_block import MAX_REPEATS, SdoBlockDownload, SdoBlockUpload, crc16
+from fieldtwin.gateway.protocols.canopen.sdo.block import MAX_REPEATS, SdoBlockDownload, SdoBlockUpload, crc16
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import Done, Failed, SdoTransfer, SendFrame, Stray, WaitForFrame
 
 MS = 1_000_000
 TIMEOUT = 500 * MS

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from fieldtwin.gateway.protocols.canopen import abort_codes
-from fieldtwin.gateway.protocols.canopen.sdo import (
+from fieldtwin.gateway.protocols.canopen.sdo import abort_codes
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import (
     MAX_STRAYS,
     Done,
     Failed,

@@ -13,8 +13,8 @@ from support import eventually
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout
-from fieldtwin.gateway.protocols.canopen.late_replies import MAX_OUTSTANDING, PROBES, LateReplies
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sdo.late_replies import MAX_OUTSTANDING, PROBES, LateReplies
 
 M, N = (0x2000, 0), (0x2000, 1)
 

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ReplyTimeout
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import WHOLE_S
 
 EVERY_S = 0.34
 """7 bytes in less than 350 ms: a little faster than the slowest node that is not cut off earlier."""

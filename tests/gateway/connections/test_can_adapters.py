@@ -8,12 +8,12 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.commissioning.scan.canopen import CanScanner, CanScanOptions
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
-from fieldtwin.gateway.connections.can_adapter import AdapterConnection
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.slcan_port import SlcanPort
+from fieldtwin.gateway.connections.can.adapter import AdapterConnection
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.gateway.connections.can_link import query_link, read_link
+from fieldtwin.gateway.connections.can.netlink import query_link, read_link
 
 
 def attribute(kind: int, payload: bytes) -> bytes:

@@ -16,7 +16,7 @@ from support import run
 from fieldtwin.emulators import codec as emulated
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.models.modbus.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.events import Consumer

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from support import eventually, run
 
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.models.packet_link import LinkImpairments, PacketLink
+from fieldtwin.emulators.models.modbus.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.modbus.packet_link import LinkImpairments, PacketLink
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, FileInvalid, NotAllowed

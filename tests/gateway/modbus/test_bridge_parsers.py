@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import ModbusExceptionReply, UsageError
-from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
-from fieldtwin.gateway.protocols.modbus.framings import make_framer
-from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, Access, examine
-from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
-from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuRequests
-from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frames.selection import make_framer
+from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS, Access, examine
+from fieldtwin.gateway.protocols.modbus.server.forward import Forwarded
+from fieldtwin.gateway.protocols.modbus.server.line import LineRequest, RtuRequests
+from fieldtwin.gateway.protocols.modbus.server.mbap import MbapRequests, TcpRequest
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 from fieldtwin.gateway.runtime.bridge.cache import ReplyCache
 from fieldtwin.gateway.runtime.bridge.policy import ALLOWED, AllowRule, Policy, network, within

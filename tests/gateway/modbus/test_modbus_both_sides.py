@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply
-from fieldtwin.gateway.protocols.modbus.ascii import AsciiFramer
-from fieldtwin.gateway.protocols.modbus.framing import Framer
-from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
-from fieldtwin.gateway.protocols.modbus.replies import Reply
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.protocols.modbus.frames.ascii import AsciiFramer
+from fieldtwin.gateway.protocols.modbus.frames.framing import Framer
+from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer, UdpFramer
+from fieldtwin.gateway.protocols.modbus.frames.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests.data import (
     ReadBits,
     ReadRegisters,
     ReadWriteRegisters,
@@ -29,8 +28,9 @@ from fieldtwin.gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
-from fieldtwin.gateway.protocols.modbus.server import examine
+from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
+from fieldtwin.gateway.protocols.modbus.server.analysis import examine
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 UNIT = 1

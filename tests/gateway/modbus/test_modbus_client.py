@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import (
     VerifyFailed,
 )
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing
 
 
 def test_a_read_over_rtu() -> None:

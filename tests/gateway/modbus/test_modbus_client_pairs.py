@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.errors import (
     ReplyTimeout,
 )
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.frames.selection import Framing
 
 
 def test_mb_003_after_a_truncated_reply_the_next_request_is_clean() -> None:

@@ -16,11 +16,11 @@ import pytest
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.protocols.modbus.server_line import LOST_AFTER, LineRequest, RtuRequests
-from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests
+from fieldtwin.gateway.protocols.modbus.server.line import LOST_AFTER, LineRequest, RtuRequests
+from fieldtwin.gateway.protocols.modbus.server.mbap import MbapRequests
 
 CHUNK = 1 << 20
 CHUNKS = 100

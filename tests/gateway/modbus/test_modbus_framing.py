@@ -8,13 +8,10 @@ from collections.abc import Iterable
 import pytest
 
 from fieldtwin.gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError, WrongSize
-from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
-from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
-from fieldtwin.gateway.protocols.modbus.replies import RegistersReply, Reply
-from fieldtwin.gateway.protocols.modbus.request import Request
-from fieldtwin.gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.frames.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests.data import (
     MaskWriteRegister,
     ReadBits,
     ReadRegisters,
@@ -23,7 +20,10 @@ from fieldtwin.gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReadDeviceIdentification, ReportServerId
+from fieldtwin.gateway.protocols.modbus.requests.replies import RegistersReply, Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 MS = 1_000_000

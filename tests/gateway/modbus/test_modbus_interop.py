@@ -16,13 +16,13 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from support import run
 
-from fieldtwin.gateway.connections.serial_line import SerialConnection
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.serial.line import SerialConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.requests.identity import ReadDeviceIdentification
 from fieldtwin.gateway.wallclock import WallClock
 
 INPUTS = [(i * 257) & 0xFFFF for i in range(125)]

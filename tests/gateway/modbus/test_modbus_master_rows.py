@@ -17,10 +17,11 @@ from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
 from fieldtwin.gateway.core import errors
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.protocols.modbus import diagnostics, files, identity, refusals, requests, user
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.replies import Reply
-from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import data as requests
+from fieldtwin.gateway.protocols.modbus.requests import diagnostics, files, identity, refusals, user
+from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 ROWS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_master_rows.toml").read_text())["row"]
 MS = 1_000_000

@@ -9,17 +9,13 @@ from pymodbus.pdu.bit_message import ReadCoilsResponse
 from pymodbus.pdu.register_message import ReadHoldingRegistersResponse
 
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, WireError
-from fieldtwin.gateway.protocols.modbus import pdus
-from fieldtwin.gateway.protocols.modbus.ascii import AsciiFramer, lrc
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog, Loopback
-from fieldtwin.gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
-from fieldtwin.gateway.protocols.modbus.framing import Framer
-from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
-from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
-from fieldtwin.gateway.protocols.modbus.replies import RegistersReply, Reply
-from fieldtwin.gateway.protocols.modbus.request import Request, parse_reply
-from fieldtwin.gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.protocols.modbus.frames.ascii import AsciiFramer, lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.framing import Framer
+from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer, UdpFramer
+from fieldtwin.gateway.protocols.modbus.frames.rtu import MOST_HUNTED, RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests import pdus
+from fieldtwin.gateway.protocols.modbus.requests.data import (
     MaskWriteRegister,
     ReadBits,
     ReadRegisters,
@@ -29,9 +25,22 @@ from fieldtwin.gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from fieldtwin.gateway.protocols.modbus.rtu import MOST_HUNTED, RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests.diagnostics import (
+    Diagnostics,
+    GetCommEventCounter,
+    GetCommEventLog,
+    Loopback,
+)
+from fieldtwin.gateway.protocols.modbus.requests.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
+from fieldtwin.gateway.protocols.modbus.requests.identity import (
+    ReadDeviceIdentification,
+    ReadExceptionStatus,
+    ReportServerId,
+)
+from fieldtwin.gateway.protocols.modbus.requests.replies import RegistersReply, Reply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request, parse_reply
+from fieldtwin.gateway.protocols.modbus.requests.user import CountedShape, FixedShape, UserFunction
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
-from fieldtwin.gateway.protocols.modbus.user import CountedShape, FixedShape, UserFunction
 
 UNIT = 1
 TIMEOUT_NS = 1_000_000_000

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 from fieldtwin.gateway.core import errors
-from fieldtwin.gateway.protocols.modbus import diagnostics, files, identity, requests, user
-from fieldtwin.gateway.protocols.modbus.framing import Framer
-from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
-from fieldtwin.gateway.protocols.modbus.replies import Reply
-from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.frames.framing import Framer
+from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.frames.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.requests import data as requests
+from fieldtwin.gateway.protocols.modbus.requests import diagnostics, files, identity, user
+from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 VECTORS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_master.toml").read_text())["vector"]

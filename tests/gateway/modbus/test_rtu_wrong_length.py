@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.rtu_receiver import FRAME_GAP_NS
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.receiver import FRAME_GAP_NS
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.gateway.protocols.modbus.server_line import RtuRequests
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.server.line import RtuRequests
 
 WRONG = {
     "registers, byte count below the length": "10 0001 0001 02 0A0B 0C0D",

@@ -14,8 +14,8 @@ from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.protocols.modbus.server import examine
-from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.protocols.modbus.server.analysis import examine
+from fieldtwin.gateway.protocols.modbus.server.forward import ForwardedReply
 from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, BridgeQueue, BridgeRequest
 from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable

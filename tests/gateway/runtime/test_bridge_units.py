@@ -11,9 +11,9 @@ import pytest
 from bridge_rig import ANY_PORT, WRITERS, read_adu, refused, rig, take
 from support import eventually, run
 
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
+from fieldtwin.gateway.protocols.modbus.requests.refusals import GatewayRefusal
 from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 
 

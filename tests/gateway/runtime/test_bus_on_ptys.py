@@ -13,10 +13,10 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig

@@ -14,11 +14,11 @@ import pytest
 from canopen_slave_rig import NODE, RICH, U16, Rig, pdo, var
 
 from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Situation
-from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_runner import BusRunner
-from fieldtwin.emulators.endpoints.faulty_can import FaultyCan
+from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.faulty.can import FaultyCan
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -35,10 +35,10 @@ from fieldtwin.gateway.core.values import Reason, TagValue
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
-from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt import NmtState
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.nmt.heartbeat import HeartbeatConsumer
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 
 BUS_OFF = CanErrorState.BUS_OFF
 WHERE = Endpoint.parse("can:fieldtwin/127.0.0.1:1")

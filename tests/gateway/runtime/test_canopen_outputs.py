@@ -20,7 +20,7 @@ from support import eventually
 
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
@@ -32,7 +32,7 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.canopen_rpdo import usable
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
-from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.bus import HeldBack
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus

@@ -27,7 +27,9 @@ from fieldtwin.gateway.core.values import DATA, Quality, Reason, TagValue
 from fieldtwin.gateway.runtime.image_io import ImageExchange
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
-from fieldtwin.plc.forces import Forces
+from fieldtwin.plc.cycle.forces import Forces
+from fieldtwin.plc.cycle.publishing import OutputImage
+from fieldtwin.plc.cycle.scan import Scan
 from fieldtwin.plc.program import (
     Message,
     Outbox,
@@ -38,8 +40,6 @@ from fieldtwin.plc.program import (
     var_input,
     var_output,
 )
-from fieldtwin.plc.publishing import OutputImage
-from fieldtwin.plc.scan import Scan
 
 MS = 1_000_000
 LIMIT_MS = 30

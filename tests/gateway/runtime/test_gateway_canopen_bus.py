@@ -9,7 +9,7 @@ import pytest
 from gateway_canopen_rig import NODE, PROFILE, SDO_TO_NODE, rig
 from support import eventually, run
 
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver

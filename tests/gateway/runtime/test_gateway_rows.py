@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
-from fieldtwin.gateway.connections.listeners import ClientConnection
+from fieldtwin.gateway.connections.sockets.listeners import ClientConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
+from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS, WRITE_FUNCTIONS
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy

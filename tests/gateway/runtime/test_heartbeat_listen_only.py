@@ -16,7 +16,7 @@ from support import eventually, run
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.devices.config import Heartbeat
-from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
+from fieldtwin.gateway.protocols.canopen.nmt.heartbeat import HeartbeatConsumer
 from fieldtwin.twin.site.schema import HeartbeatForm
 
 LISTEN = Heartbeat(None, 150)

@@ -14,7 +14,7 @@ from modbus_virtual import run_virtually
 from virtual_bus import LINE, VirtualBus, run_bus
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.register_functions import UnitLimits
+from fieldtwin.emulators.modbus.functions.registers import UnitLimits
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable

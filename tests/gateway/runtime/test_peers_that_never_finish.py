@@ -21,10 +21,10 @@ from modbus_virtual import run_virtually
 from support import eventually, run
 from test_gateway_modbus_bus import TWO_GROUPS, bank, config
 
-from fieldtwin.emulators.endpoints import bus_server
-from fieldtwin.emulators.endpoints.bus_hello import BusHello
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.emulators.endpoints.can import bus_server
+from fieldtwin.emulators.endpoints.can.bus_hello import BusHello
+from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core import control
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection
@@ -33,7 +33,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.sdo import (
+from fieldtwin.gateway.protocols.canopen.sdo.block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.canopen.sdo.transfers import (
     WHOLE_NS_PER_BYTE,
     WHOLE_TIMEOUTS,
     Failed,
@@ -43,7 +44,6 @@ from fieldtwin.gateway.protocols.canopen.sdo import (
     SendFrame,
     WaitForFrame,
 )
-from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.runtime.bridge import tcp as bridge_tcp
 from fieldtwin.gateway.runtime.tags import TagTable

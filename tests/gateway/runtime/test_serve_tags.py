@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import (

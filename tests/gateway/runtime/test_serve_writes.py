@@ -13,7 +13,7 @@ from gateway_rig import FieldBus, RunningBus, profile, running_bus, unit
 from support import eventually, run
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply

@@ -12,7 +12,7 @@ from gateway_rig import LAN, PROFILES, FieldBus, running_bus
 from support import eventually, run
 
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.modbus.mailbox_modem import ModemPair
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.values import COMMAND, RESPONSE

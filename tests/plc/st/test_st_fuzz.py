@@ -17,7 +17,7 @@ from st_bench import scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.values import Quality, TagValue
-from fieldtwin.plc.st.compile import compile_text
+from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.program import program_class
 from fieldtwin.plc.st.values import LogicError
 

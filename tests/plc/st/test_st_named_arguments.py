@@ -14,7 +14,7 @@ import pytest
 from st_bench import program, run, value
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.st.standard import FUNCTIONS
+from fieldtwin.plc.st.compiler.standard import FUNCTIONS
 from fieldtwin.plc.st.types import ELEMENTARY
 
 S = 1_000_000_000

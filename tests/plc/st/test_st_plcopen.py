@@ -8,8 +8,8 @@ import pytest
 from st_bench import program, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.st.plcopen import is_plcopen, to_st
 from fieldtwin.plc.st.program import load_file
+from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 
 EXPORT = """<?xml version="1.0" encoding="utf-8"?>
 <project xmlns="http://www.plcopen.org/xml/tc6_0200" xmlns:xhtml="http://www.w3.org/1999/xhtml">

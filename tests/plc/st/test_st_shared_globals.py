@@ -13,8 +13,8 @@ from st_bench import scan
 
 from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for, load_program
-from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.plc.runner import TaskRunner
+from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runtime.runner import TaskRunner
 
 MS = 1_000_000
 TEXT = """

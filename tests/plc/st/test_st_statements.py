@@ -12,8 +12,8 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.blocks import BLOCKS as STANDARD_BLOCKS
+from fieldtwin.plc.cycle.scan import failed
 from fieldtwin.plc.program import ProgramFailed, Role
-from fieldtwin.plc.scan import failed
 
 
 def test_if_takes_the_first_branch_that_holds() -> None:

@@ -19,8 +19,8 @@ from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
-from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable

@@ -22,9 +22,9 @@ from thread_rig import SCHEMA, Twin, WatchedCarrier, equal, value
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.sockets.listeners import TcpListener
+from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable

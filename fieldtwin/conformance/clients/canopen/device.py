@@ -5,7 +5,7 @@ Pure: frames and `now` in, frames out. A node is created by the first request or
 
 from __future__ import annotations
 
-from fieldtwin.emulators.canopen.sdo_server import SdoServer
+from fieldtwin.emulators.canopen.sdo.server import SdoServer
 
 TIMEOUT_NS = 2_000_000_000
 LONG_BYTES = 1000

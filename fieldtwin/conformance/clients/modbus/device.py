@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 from fieldtwin.emulators.modbus.ascii import AsciiReceiver, lrc
 from fieldtwin.emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
-from fieldtwin.emulators.modbus.rtu_receiver import RtuReceiver, with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import RtuReceiver, with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 
 READS = frozenset({0x01, 0x02, 0x03, 0x04})

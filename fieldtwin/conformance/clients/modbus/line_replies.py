@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 from fieldtwin.conformance.clients.modbus.setup import Move, ReplyFunction, RequestContext, Say, Unplug
-from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 
 SPLIT_S = 0.016
 """The latency timer of a usual USB adapter."""

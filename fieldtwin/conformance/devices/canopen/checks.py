@@ -5,7 +5,7 @@ from __future__ import annotations
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.canopen.connection import Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere
-from fieldtwin.gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import UNKNOWN_SPECIFIER
 
 
 def aborted(reply: SdoReply, *codes: int) -> str:

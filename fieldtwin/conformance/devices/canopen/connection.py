@@ -15,8 +15,8 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost
-from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
-from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import meaning
 
 READS = frozenset({2, 3, 4, 5})
 """Client command specifiers that write nothing: upload, its segments, abort, block upload (7.2.4.3)."""

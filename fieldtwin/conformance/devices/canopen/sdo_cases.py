@@ -15,7 +15,7 @@ from fieldtwin.conformance.devices.canopen.checks import (
 from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
+from fieldtwin.gateway.protocols.canopen.sdo.block import crc16
 
 TOGGLE, UNKNOWN, BLOCK_SIZE = 0x0503_0000, 0x0504_0001, 0x0504_0002
 UNLIKELY = (0x5FFE, 0x5F0D, 0x2FFD, 0x1FFE)

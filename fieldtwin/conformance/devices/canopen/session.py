@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import NotAllowed, Unreachable
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.gateway.wallclock import WallClock
 
 NAMES = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}

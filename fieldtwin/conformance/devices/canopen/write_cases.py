@@ -12,8 +12,8 @@ from fieldtwin.conformance.core.case import Finding, Impact
 from fieldtwin.conformance.devices.canopen.checks import aborted, must_abort, present, verdict
 from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, Key, NodeConnection, SdoReply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
-from fieldtwin.gateway.protocols.canopen.datatypes import DataType
-from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
+from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.sdo.block import crc16
 
 UNKNOWN, CRC, READ_ONLY = 0x0504_0001, 0x0504_0004, 0x0601_0002
 TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x0607_0012, 0x0607_0013, 0x0609_0031, 0x0609_0032

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from fieldtwin.gateway.protocols.modbus.ascii import lrc
-from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
-from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_lengths
+from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frames.shapes import MAX_FRAME, frame_lengths
 
 NO_TRANSACTION = -1
 _STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]

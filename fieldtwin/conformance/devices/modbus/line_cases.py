@@ -12,8 +12,8 @@ from fieldtwin.conformance.devices.modbus.checks import answers_good, silent_the
 from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.frames import ascii_frame, framed
 from fieldtwin.conformance.devices.modbus.learn import read_of
-from fieldtwin.gateway.protocols.modbus.ascii import lrc
-from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 LONG_PAUSE_S = 0.1
 """Ends any RTU frame at any baud rate from 1200 on."""

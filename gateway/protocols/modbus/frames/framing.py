@@ -1,0 +1,86 @@
+"""The interface of a framing: it turns a request PDU into a frame, and received bytes into the PDU of the awaited
+reply.
+
+The modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides which bytes are the reply, and whether the
+reply is complete and undamaged; the request checks the reply's content. A framing has no clock: `now_ns` is passed.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from fieldtwin.gateway.core.errors import WireError
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
+
+
+class Framer(ABC):
+    """The framing of one link. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
+
+    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those that belong to no exchange, and
+    `foreign_frames` complete frames of other devices. All three only increase.
+    """
+
+    confirms_transmission: bool = False
+    """Whether a reply identifies its request, so that a late reply needs no quarantine."""
+
+    has_broadcast: bool = False
+    """Whether unit 0 addresses all units and none answers (SL 2.1); otherwise it is an ordinary unit (TG 4.4.1.2)."""
+
+    datagrams: bool = False
+    """Whether the link preserves message boundaries: then each `feed` gets exactly one datagram."""
+
+    gap_ns: int = 0
+    """How long the link must be silent before `settle` is called; 0 means never."""
+
+    t35_ns: int = 0
+    """The silence that must precede a frame; 0 means none."""
+
+    rest_ns: int = 0
+    """The longest delay with which the rest of a damaged frame may arrive."""
+
+    def __init__(self) -> None:
+        self.late_bytes = 0
+        self.noise_bytes = 0
+        self.foreign_frames = 0
+        self.strays: dict[int, int] = {}
+        """Unit IDs whose reply came while no reply, or that of another unit, was awaited, and its time in ns; 0 means
+        just now.
+        """
+
+    def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
+        """Note a frame of `unit` that no request awaited.
+
+        Exception 0A or 0B comes from a gateway and does not show that the unit is alive.
+        """
+        if not (len(pdu) >= 2 and pdu[0] & 0x80 and pdu[1] in (0x0A, 0x0B)):
+            self.strays[unit] = now_ns
+
+    @abstractmethod
+    def wire_length(self, pdu_length: int) -> int:
+        """Return the number of characters of a frame whose PDU has `pdu_length` bytes."""
+
+    @abstractmethod
+    def begin(self, unit: int, request: Request[Any]) -> bytes:
+        """Return the frame of `request` and await its reply from now on. The previous exchange is forgotten."""
+
+    @abstractmethod
+    def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        """Take the bytes that arrived; return the reply PDU when it is complete. Raises `CrcError` or `Desync`."""
+
+    def settle(self) -> bytes | None:
+        """Stop waiting for the rest of a frame that is not our reply, because the link was silent for `gap_ns`.
+
+        Returns as `feed`.
+        """
+        return None
+
+    @abstractmethod
+    def overdue(self, waited_s: float) -> WireError:
+        """Return the error for a reply that did not arrive in time: `ReplyTimeout`, or an error that describes what arrived
+        instead.
+        """
+
+    @abstractmethod
+    def drained(self, data: bytes) -> None:
+        """Count bytes that arrived while no reply was awaited, and stay synchronised with the stream."""

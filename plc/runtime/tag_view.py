@@ -1,0 +1,85 @@
+"""The process image as users see it.
+
+Each tag has value, quality, source time, age, unit, limits, force, and the value that programs see.
+
+It is read between scans, from the image itself, so that it shows what the gateway gets. This module must not know how
+requests arrive, and must not change anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from typing import Any
+
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, Image, TagSpec
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.cycle.forces import Force
+from fieldtwin.plc.runtime.runner import TaskRunner
+
+MAX_AT_ONCE = 64
+"""How many tags one answer may have: a request between two scans must not delay the next one. It takes some 1 ms,
+including the encoding."""
+
+
+def matches(tag: str, pattern: str) -> bool:
+    """Return whether a tag matches a pattern: ``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all tags of ``ctd``."""
+    return fnmatchcase(tag, pattern) or tag.startswith(f"{pattern}.")
+
+
+class TagView:
+    """The view of the tags in the image that `runner` uses."""
+
+    def __init__(self, image: Image, runner: TaskRunner) -> None:
+        self._runner = runner
+        self._outputs = image.reader(OUTPUTS)
+        self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}
+
+    def names(self) -> list[str]:
+        """Return every tag once, inputs first."""
+        return list(self._specs[INPUTS] | self._specs[OUTPUTS])
+
+    def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
+        """Return the tags as data for JSON, in the order of `names`. A tag of both regions has two entries, the input first.
+
+        Raises `UsageError` for more than `MAX_AT_ONCE` tags, or for an unknown one. `now_ns` is monotonic, the tags'
+        clock, and `utc_ns` the same instant.
+        """
+        if len(names) > MAX_AT_ONCE:
+            raise UsageError("too many tags at once", expected=f"at most {MAX_AT_ONCE}", got=str(len(names)))
+        runner, snapshot, rows = self._runner, self._outputs.snapshot(), []
+        for name in names:
+            row = {}
+            if spec := self._specs[INPUTS].get(name):
+                row = _row(runner.as_limited(spec), runner.input(name), runner.forces.inputs.get(name), now_ns, utc_ns)
+                seen = {
+                    variable: {"value": as_seen.value, "quality": str(as_seen.quality)}
+                    for variable, as_seen in runner.seen_otherwise(name).items()
+                }
+                rows.append({**row, "side": "input", "seen": seen})
+            if spec := self._specs[OUTPUTS].get(name):
+                row = _row(
+                    runner.as_limited(spec), snapshot.value(name), runner.forces.outputs.get(name), now_ns, utc_ns
+                )
+                rows.append({**row, "side": "output", "seen": {}})
+            if not row:
+                raise UsageError(f"no tag {name!r} in the process image", expected="one that `image` lists")
+        return rows
+
+
+def _row(spec: TagSpec, value: TagValue, force: Force | None, now_ns: int, utc_ns: int) -> dict[str, Any]:
+    if force is not None:
+        value = TagValue(force.value, Quality.SIMULATED, t_ns=force.since_ns)
+    time_ns = utc_ns - now_ns + value.t_ns
+    return {
+        "tag": spec.name,
+        "kind": spec.kind.value,
+        **value.describe(now_ns),
+        "time": datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds") if value.t_ns else None,
+        "unit": spec.unit,
+        "words": dict(spec.words),
+        "limits": list(spec.limits) if spec.limits is not None else None,
+        "forced": {"value": force.value, "by": force.by, "age_s": (now_ns - force.since_ns) / 1e9} if force else None,
+    }

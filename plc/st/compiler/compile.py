@@ -1,0 +1,357 @@
+"""Compiles a unit of Structured Text to Python, once: classes for structures and function blocks, functions, and a
+class for each PROGRAM.
+
+The Python code carries the line numbers of the source, so that an error in a scan names the line that the user wrote.
+The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs it in a separate namespace.
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass, replace
+from types import CodeType
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.assignments import Assignments
+from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.located import without_addresses
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
+from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.parse import parse
+
+MAX_CALLS = 64
+"""The longest chain of POUs that call each other."""
+_API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramVariable:
+    """A variable of a PROGRAM that can be bound to a tag.
+
+    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts."""
+
+    name: str
+    role: str
+    kind: ty.Type
+    retain: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledProgram:
+    name: str
+    variables: tuple[ProgramVariable, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledUnit:
+    """A compiled unit. `code` defines everything when it is executed with ``_v``, ``_c`` and ``_blocks``; `python` is
+    its text, for reading."""
+
+    path: str
+    code: CodeType
+    python: str
+    programs: tuple[CompiledProgram, ...]
+
+
+def compile_text(text: str, path: str = "") -> CompiledUnit:
+    """Compile a text. Raises `FileInvalid` with line and column for any error."""
+    return compile_unit(parse(text, path), path)
+
+
+def compile_unit(unit: t.SourceUnit, path: str = "") -> CompiledUnit:
+    try:
+        return _Unit(without_addresses(unit), path).compiled()
+    except RecursionError as e:
+        raise FileInvalid("nested too deep", path=path) from e
+
+
+class _Unit:
+    def __init__(self, unit: t.SourceUnit, path: str) -> None:
+        self.env = Environment(path)
+        self.out = CodeWriter()
+        self.unit = unit
+        self._outputs: dict[str, frozenset[str]] = {}
+        """By class of a PROGRAM: its outputs, as attributes."""
+        self._check_names()
+        self.declarations = Declarations(self.env, unit, self.out)
+        self._declare_global_constants()
+        self.declarations.resolve()
+        self._declare_globals()
+        for pou in unit.pous:
+            if pou.kind == "FUNCTION":
+                with self.declarations.within(pou):
+                    self.env.functions[pou.name.lower()] = self._signature(pou)
+
+    def compiled(self) -> CompiledUnit:
+        programs = []
+        for pou in self.unit.pous:
+            with self.declarations.within(pou):
+                if pou.kind == "FUNCTION":
+                    self._write_function(pou)
+                elif pou.kind == "FUNCTION_BLOCK":
+                    self._write_block(pou)
+                else:
+                    programs.append(self._write_program(pou))
+        self._refuse_recursion()
+        self._write_globals()
+        text = "\n".join(line for line, _ in self.out.lines) + "\n"
+        return CompiledUnit(self.env.path, self._code(text), text, tuple(programs))
+
+    def _check_names(self) -> None:
+        seen: set[str] = set()
+        for pou in self.unit.pous:
+            if pou.name.lower() in seen or pou.name.upper() in ty.ELEMENTARY:
+                self.env.fail(pou.pos, f"{pou.name} is declared twice")
+            seen.add(pou.name.lower())
+
+    def _code(self, text: str) -> CodeType:
+        lines = [source for _, source in self.out.lines]
+        last = 1
+        for n, source in enumerate(lines):
+            last = lines[n] = source or last
+        try:
+            tree = ast.parse(text)
+            for node in ast.walk(tree):
+                if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
+                    node.lineno = node.end_lineno = lines[min(node.lineno, len(lines)) - 1]
+                    node.col_offset = node.end_col_offset = 0
+            for statement in tree.body:
+                if isinstance(statement, ast.ClassDef) and statement.name in self._outputs:
+                    Assignments(self._outputs[statement.name]).visit(statement)
+            ast.fix_missing_locations(tree)
+            return compile(tree, self.env.path or "<st>", "exec")
+        except (SyntaxError, MemoryError, RecursionError) as e:  # Python's limits; those of this compiler are narrower
+            at = e.lineno if isinstance(e, SyntaxError) and e.lineno else 1
+            line = lines[min(at, len(lines)) - 1]
+            raise FileInvalid(f"too deep for the compiler: {e}", path=self.env.path, line=line, column=1) from e
+
+    # -- variables --------------------------------------------------------------------------------------------------------
+
+    def _declare_global_constants(self) -> None:
+        """Declare the constants whose value is known at once, because types may use them in their limits."""
+        for block in self.unit.globals:
+            for v in block.variables if "CONSTANT" in block.qualifiers else ():
+                if isinstance(v.type, t.NamedType) and v.type.name.upper() in ty.ELEMENTARY:
+                    symbol = self.declarations.constant(v, f"_G.v_{v.name.lower()}")
+                    if symbol is not None:
+                        self.env.globals[v.name.lower()] = symbol
+
+    def _declare_globals(self) -> None:
+        seen: set[str] = set()
+        for block in self.unit.globals:
+            self._no_retain(block, "a VAR_GLOBAL")
+            for v in block.variables:
+                self._no_address(v)
+                if v.name.lower() in seen:
+                    self.env.fail(v.pos, f"{v.name} is declared twice")
+                seen.add(v.name.lower())
+                self.env.globals[v.name.lower()] = self._symbol(v, block, f"_G.v_{v.name.lower()}")
+        if seen:
+            first = self.unit.globals[0].pos
+            self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
+
+    def _write_globals(self) -> None:
+        """Write the code of the global variables, after all code that they may need and before any program is created."""
+        self.out.line("class _Globals: pass")
+        self.out.line("_G = _Globals()")
+        for block in self.unit.globals:
+            for v in block.variables:
+                symbol = self.env.globals[v.name.lower()]
+                if symbol.constant is None:
+                    self.out.line(f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos)
+
+    def _no_retain(self, block: t.VarBlock, what: str) -> None:
+        if block.qualifiers & {"RETAIN", "PERSISTENT"}:
+            self.env.fail(block.pos, f"{what} cannot be RETAIN", hint="a PROGRAM's VAR RETAIN can, also a block in it")
+
+    def _no_address(self, v: t.VarDecl) -> None:
+        if v.location:
+            self.env.fail(
+                v.pos, f"{v.name} AT {v.location}: addresses are not supported",
+                hint="declare it as VAR_INPUT or VAR_OUTPUT and bind it to a tag in the system file",
+            )  # fmt: skip
+
+    def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
+        kind = self.declarations.type_of(v.type, block.kind)
+        if "CONSTANT" not in block.qualifiers:
+            return Symbol(v.name, kind, code, writable=block.kind != "VAR_INPUT")
+        return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
+
+    def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
+        """Return all variables of a POU. `prefix`: where they are kept; VAR_TEMP is always local to a call."""
+        symbols: dict[str, Symbol] = {}
+        for block in pou.blocks:
+            if pou.kind != "PROGRAM":
+                self._no_retain(block, f"a variable of a {pou.kind}")
+            for v in block.variables:
+                key = v.name.lower()
+                self._no_address(v)
+                if key in symbols:
+                    self.env.fail(v.pos, f"{v.name} is declared twice")
+                if block.kind == "VAR_EXTERNAL":
+                    symbols[key] = self._external(v)
+                    continue
+                code = f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{key}"
+                symbols[key] = self._symbol(v, block, code)
+                if block.kind == "VAR_IN_OUT" and not by_reference(symbols[key].type):
+                    symbols[key] = replace(symbols[key], code=f"{code}.v", reference=code)
+        own = (symbols[v.name.lower()].type for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables)
+        self.declarations.bounded(pou.pos, own)
+        return symbols
+
+    def _external(self, v: t.VarDecl) -> Symbol:
+        found = self.env.globals.get(v.name.lower())
+        if found is None:
+            self.env.unknown(v.pos, "a global variable", v.name, [s.name for s in self.env.globals.values()])
+        if found.type != self.declarations.type_of(v.type):
+            self.env.fail(v.pos, f"{v.name} is declared with another type", expected=str(found.type))
+        return found
+
+    def _initialise(self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...]) -> None:
+        for block in pou.blocks:
+            if block.kind in kinds:
+                for v in block.variables:
+                    symbol = symbols[v.name.lower()]
+                    if symbol.constant is None:
+                        self.out.line(
+                            f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos
+                        )
+
+    # -- functions --------------------------------------------------------------------------------------------------------
+
+    def _signature(self, pou: t.Pou) -> Signature:
+        assert pou.returns is not None
+        found: dict[str, list[Parameter]] = {"VAR_INPUT": [], "VAR_IN_OUT": [], "VAR_OUTPUT": []}
+        for block in pou.blocks:
+            for v in block.variables:
+                if block.kind in found:
+                    kind = self.declarations.type_of(v.type)
+                    initial = self.declarations.shared(self.declarations.initial(kind, v.initial, v.type))
+                    found[block.kind].append(Parameter(v.name, kind, initial))
+        return Signature(
+            pou.name,
+            self.declarations.type_of(pou.returns),
+            tuple(found["VAR_INPUT"]),
+            tuple(found["VAR_IN_OUT"]),
+            tuple(found["VAR_OUTPUT"]),
+        )
+
+    def _write_function(self, pou: t.Pou) -> None:
+        signature = self.env.functions[pou.name.lower()]
+        key = pou.name.lower()
+        symbols = self._symbols(pou, "")
+        if key in symbols:
+            self.env.fail(pou.pos, f"{pou.name} is the name of the function's result, and is declared again")
+        symbols.setdefault(key, Symbol(pou.name, signature.returns, f"v_{key}"))
+        arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
+        body = Statements(self.env, symbols, self.out, pou.name.lower())
+        results = [f"v_{key}", *(f"v_{p.name.lower()}" for p in signature.outputs)]
+        body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
+        with self.out.block(f"def f_{key}({arguments}):", pou.pos):
+            self.out.step(pou.pos)
+            self.out.line(f"v_{key} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
+            self._initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
+            body.body(pou.body)
+            self.out.line(body.leave, pou.pos)
+
+    # -- function blocks and programs -------------------------------------------------------------------------------------
+
+    def _write_block(self, pou: t.Pou) -> None:
+        symbols = self._symbols(pou, "self.")
+        self._note_parts(pou, symbols)
+        kept = [s.code.split(".")[1] for s in symbols.values() if s.code.startswith("self.")]
+        with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
+            self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
+            in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
+            self.out.line(f"in_outs = {tuple(in_outs)}")
+            with self.out.block("def __init__(self):"):
+                self._initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
+                for block in pou.blocks:
+                    if block.kind == "VAR_IN_OUT":
+                        for v in block.variables:
+                            self.out.line(f"self.v_{v.name.lower()} = None")
+            with self.out.block("def execute(self, now_ns):"):
+                self.out.step(pou.pos)
+                self._initialise(pou, symbols, ("VAR_TEMP",))
+                Statements(self.env, symbols, self.out, pou.name.lower()).body(pou.body)
+
+    def _write_program(self, pou: t.Pou) -> CompiledProgram:
+        symbols = self._symbols(pou, "self.")
+        self._note_parts(pou, symbols)
+        variables = []
+        for block in pou.blocks:
+            role = {"VAR_INPUT": "input", "VAR_OUTPUT": "output", "VAR": "local"}.get(block.kind)
+            if block.kind == "VAR_IN_OUT":
+                self.env.fail(
+                    block.pos, "a PROGRAM has no VAR_IN_OUT", hint="VAR_INPUT and VAR_OUTPUT are bound to tags"
+                )
+            retain = bool(block.qualifiers & {"RETAIN", "PERSISTENT"})
+            for v in block.variables if role else ():
+                if "CONSTANT" not in block.qualifiers:
+                    kind = symbols[v.name.lower()].type
+                    self._check_interface(v, kind, role or "")
+                    if v.name in _API or v.name.startswith("st_"):
+                        self.env.fail(v.pos, f"a PROGRAM's variable needs another name than {v.name}")
+                    if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
+                        self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
+                    variables.append(ProgramVariable(v.name, role or "", kind, retain))
+        outputs = frozenset(f"v_{v.name.lower()}" for v in variables if v.role == "output")
+        self._outputs[f"P_{pou.name.lower()}"] = outputs
+        with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
+            with self.out.block("def __init__(self):"):
+                self._initialise_program(pou, symbols)
+            with self.out.block("def execute(self):"):
+                self._initialise(pou, symbols, ("VAR_TEMP",))
+                body = Statements(self.env, symbols, self.out, pou.name.lower())
+                body.program_inputs = {v.name for v in variables if v.role == "input"}
+                body.body(pou.body)
+        return CompiledProgram(pou.name, tuple(variables))
+
+    def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
+        """Initialise all variables with their initial values; messages are passed in from outside."""
+        for block in pou.blocks:
+            if block.kind in ("VAR", "VAR_INPUT", "VAR_OUTPUT"):
+                for v in block.variables:
+                    symbol = symbols[v.name.lower()]
+                    if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
+                        self.out.line(f"{symbol.code} = ()", v.pos)
+                    elif symbol.constant is None:
+                        self.out.line(
+                            f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos
+                        )
+
+    def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
+        if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block):
+            self.env.fail(
+                v.pos,
+                f"{v.name} cannot be bound to a tag",
+                expected="BOOL, a number, a time, an enumeration or MESSAGES",
+                got=str(kind),
+            )
+
+    def _note_parts(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
+        for v in (v for b in pou.blocks for v in b.variables):
+            kind = symbols[v.name.lower()].type
+            if by_reference(kind) and isinstance(kind, ty.Block):
+                self.env.calls.setdefault(pou.name.lower(), {}).setdefault(kind.name.lower(), v.pos)
+
+    def _refuse_recursion(self) -> None:
+        """Refuse a POU that calls itself, directly or through others (IEC 61131-3, 6.6.1.5)."""
+
+        def walk(name: str, path: tuple[str, ...]) -> None:
+            if len(path) > MAX_CALLS:
+                pos = next(iter(self.env.calls[path[-2]].values()))
+                self.env.fail(pos, "calls nested too deep", expected=f"at most {MAX_CALLS}")
+            for callee, pos in self.env.calls.get(name, {}).items():
+                if callee in path:
+                    self.env.fail(pos, f"{callee} calls itself: {' -> '.join((*path[path.index(callee) :], callee))}")
+                if callee not in done:
+                    walk(callee, (*path, callee))
+            done.add(name)
+
+        done: set[str] = set()
+        for name in list(self.env.calls):
+            walk(name, (name,))

@@ -1,0 +1,183 @@
+"""Type conversions by name: INT_TO_REAL, TO_DINT, TRUNC, REAL_TRUNC_INT... (IEC 61131-3, 6.6.2.5.2).
+
+A conversion from real to integer rounds to the nearest, ties to even; TRUNC truncates, and gives a DINT (REAL_TRUNC_LINT and
+similar functions give other types). A number that the target cannot hold is an error at run time. A conversion between integer or
+bit string types, however, keeps only the bits that fit, as the standard requires. As a number, TIME counts ms, and LTIME ns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.scope import Compiling, Value
+from fieldtwin.plc.st.syntax import tree as t
+
+Write = Callable[[Compiling, t.Call, list[t.Expr]], Value]
+"""Writes a call. Its arguments are given in the order of the function's parameters."""
+_NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
+_DIGITS = {32: 7, 64: 15}
+
+
+def conversion(name: str) -> Write | None:
+    """Return the conversion function with this name (in capitals), or None."""
+    if name == "TRUNC":
+        return lambda x, call, given: _convert(x, call, given[0], None, ty.DINT, cut=True)
+    if "BCD_" in name and (found := _BCD.get(name)) is not None:
+        return found
+    source, word, target = name.rpartition("_TRUNC_")
+    if word and target in _NAMES:
+        return _made(_NAMES.get(source), _NAMES[target], cut=True) if source in _NAMES else None
+    source, word, target = name.rpartition("_TO_")
+    if word and source in _NAMES and target in _NAMES:
+        return _made(_NAMES[source], _NAMES[target], cut=False)
+    if name.startswith("TO_") and name[3:] in _NAMES:
+        return _made(None, _NAMES[name[3:]], cut=False)
+    return None
+
+
+def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Write:
+    return lambda x, call, given: _convert(x, call, given[0], source, target, cut)
+
+
+def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
+    value = x.value(expr)
+    kind = ty.plain(value.type)
+    if source is not None and not isinstance(source, ty.String):
+        code: str | None = x.coerced(value, source, expr.pos, f"the argument of {call.ref.name}")
+        kind = source
+    else:
+        code = value.code
+        if isinstance(source, ty.String) and not isinstance(kind, ty.String):
+            x.env.fail(expr.pos, f"the argument of {call.ref.name}", expected="a string", got=str(kind))
+    if isinstance(kind, ty.AnyInt):
+        kind = ty.LINT if ty.fits(kind, ty.LINT) else ty.ULINT
+    elif isinstance(kind, ty.AnyReal):
+        kind = ty.LREAL
+    elif isinstance(kind, ty.Enum):
+        kind = ty.DINT
+    assert code is not None
+    made = _of_string(code, target) if isinstance(kind, ty.String) else _of_value(code, kind, target, cut)
+    if made is None:
+        x.env.fail(call.pos, f"there is no conversion from {kind} to {target}")
+    if isinstance(kind, ty.String) and isinstance(target, ty.String):
+        target = ty.String(kind.length, target.wide)
+    return Value(made, target)
+
+
+def _of_string(code: str, target: ty.Type) -> str | None:
+    if isinstance(target, ty.String):
+        return code if target.wide else f"{code}.encode('latin-1', 'replace').decode('latin-1')"
+    assert isinstance(target, ty.Elementary)
+    if target.kind in ("int", "bits"):
+        return f"_v.number_of({code}, {target.low}, {target.high})"
+    if target.kind == "real":
+        return f"_v.real(_v.real_of({code}))" if target.bits == 32 else f"_v.real_of({code})"
+    return f"({code}.strip().upper() in ('TRUE', '1'))" if target.kind == "bool" else None
+
+
+def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | None:
+    if not isinstance(kind, ty.Elementary):
+        return None
+    if isinstance(target, ty.String):
+        return _text(code, kind)
+    assert isinstance(target, ty.Elementary)
+    whole = ("int", "bits", "bool")
+    if kind.kind in whole and target.kind in whole:
+        return _between_integers(code, kind, target)
+    if kind.kind in whole and target.kind == "real":
+        return f"_v.real({code})" if target.bits == 32 else f"float({code})"
+    if kind.kind == "real":
+        return _of_real(code, target, cut)
+    if kind.kind == "duration" or target.kind == "duration":
+        return _of_time(code, kind, target)
+    if kind.kind == "dt" and target.kind in ("date", "tod"):
+        return f"({code} // {ty.DAY_NS} * {ty.DAY_NS})" if target.kind == "date" else f"({code} % {ty.DAY_NS})"
+    return code if kind.kind == target.kind or (kind.kind == "date" and target.kind == "dt") else None
+
+
+def _between_integers(code: str, kind: ty.Elementary, target: ty.Elementary) -> str:
+    if target.kind == "bool":
+        return f"({code} != 0)"
+    if target.low <= kind.low and kind.high <= target.high:
+        return f"int({code})" if kind.kind == "bool" else code
+    return f"_v.signed({code}, {target.bits})" if target.low < 0 else f"({code} & {target.high})"
+
+
+def _of_real(code: str, target: ty.Elementary, cut: bool) -> str | None:
+    if target.kind == "real":
+        return f"_v.real({code})" if target.bits == 32 else code
+    if target.kind in ("int", "bits"):
+        return f"_v.{'truncated' if cut else 'to_integer'}({code}, {target.low}, {target.high})"
+    if target.kind == "bool":
+        return f"({code} != 0.0)"
+    if target.kind == "duration":
+        return f"_v.to_integer({code} * {_unit(target)}, {target.low}, {target.high})"
+    return None
+
+
+def _unit(kind: ty.Elementary) -> int:
+    """Return the unit, in ns, in which a duration is converted to a number."""
+    return 1 if kind.name == "LTIME" else 1_000_000
+
+
+def _of_time(code: str, kind: ty.Elementary, target: ty.Elementary) -> str | None:
+    if kind.kind == target.kind:
+        return code
+    if kind.kind in ("int", "bits") and target.kind == "duration":
+        return f"_v.signed({code} * {_unit(target)}, 64)"
+    if target.kind in ("int", "bits"):
+        count = code if _unit(kind) == 1 else f"_v.divide({code}, {_unit(kind)})"
+        return _between_integers(f"({count})", ty.LINT, target)
+    if target.kind == "real":
+        return f"_v.real({code} / {_unit(kind)})" if target.bits == 32 else f"({code} / {_unit(kind)})"
+    return None
+
+
+def _text(code: str, kind: ty.Elementary) -> str | None:
+    if kind.kind == "bool":
+        return f"('TRUE' if {code} else 'FALSE')"
+    if kind.kind == "real":
+        return f"_v.real_text({code}, {_DIGITS[kind.bits]})"
+    if kind.kind == "duration":
+        return f"_v.duration_text({code}, {chr(39)}{'LT' if kind.name == 'LTIME' else 'T'}{chr(39)})"
+    name = {"date": "date_text", "tod": "tod_text", "dt": "moment_text"}.get(kind.kind)
+    return f"_v.{name}({code})" if name else f"str({code})"
+
+
+# -- binary coded decimals (Table 22): a digit in four bits ---------------------------------------------------------------
+
+_UNSIGNED, _BITS = ("USINT", "UINT", "UDINT", "ULINT"), ("BYTE", "WORD", "DWORD", "LWORD")
+
+
+def _from_bcd(source: str, target: ty.Elementary) -> Write:
+    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+        value = x.value(given[0])
+        wanted = ty.ELEMENTARY[source] if source else None
+        if wanted is not None:
+            code = x.coerced(value, wanted, given[0].pos, f"the argument of {call.ref.name}")
+        elif ty.is_kind(value.type, "bits"):
+            code = value.code
+        else:
+            x.env.fail(given[0].pos, f"the argument of {call.ref.name}", expected="a bit string", got=str(value.type))
+        return Value(f"_v.of_bcd({code}, {target.high})", target)
+
+    return write
+
+
+def _to_bcd(source: str, target: ty.Elementary) -> Write:
+    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+        value = x.value(given[0])
+        kind = ty.ELEMENTARY[source] if source else ty.ULINT
+        code = x.coerced(value, kind, given[0].pos, f"the argument of {call.ref.name}")
+        return Value(f"_v.to_bcd({code}, {target.bits})", target)
+
+    return write
+
+
+_BCD: dict[str, Write] = {
+    **{f"{bits}_BCD_TO_{number}": _from_bcd(bits, ty.ELEMENTARY[number]) for bits in _BITS for number in _UNSIGNED},
+    **{f"BCD_TO_{number}": _from_bcd("", ty.ELEMENTARY[number]) for number in _UNSIGNED},
+    **{f"{number}_TO_BCD_{bits}": _to_bcd(number, ty.ELEMENTARY[bits]) for number in _UNSIGNED for bits in _BITS},
+    **{f"TO_BCD_{bits}": _to_bcd("", ty.ELEMENTARY[bits]) for bits in _BITS},
+}

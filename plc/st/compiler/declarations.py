@@ -1,0 +1,322 @@
+"""Declarations: type names to types, initial values to Python, structures to Python classes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from fieldtwin.gateway.core.image.layout import MAX_DEPTH, MAX_MESSAGE_BYTES
+from fieldtwin.plc.blocks import BLOCKS
+from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.expressions import Expressions
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
+from fieldtwin.plc.st.syntax import tree as t
+
+MAX_REPEATED = 100
+"""The longest Python expression, in characters, that is repeated wherever it is needed."""
+_STANDARD = ty.standard_blocks(BLOCKS)
+
+
+class Declarations:
+    """The types of a unit. Each is resolved when it is first needed, so they may be declared in any order."""
+
+    def __init__(self, env: Environment, unit: t.SourceUnit, out: CodeWriter) -> None:
+        self.env = env
+        self.out = out
+        self.scope: dict[str, Symbol] = {}
+        """The constants of the POU whose declarations are being read."""
+        self._constants: dict[str, dict[str, Symbol]] = {}
+        self._deep = 0
+        self._unit = unit
+        self._types: dict[str, t.TypeDecl] = {}
+        self._blocks = {p.name.lower(): p for p in unit.pous if p.kind == "FUNCTION_BLOCK"}
+        self._open: list[str] = []
+        for declared in unit.types:
+            if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
+                env.fail(declared.pos, f"type {declared.name} is declared twice")
+            self._types[declared.name.lower()] = declared
+            if isinstance(declared, t.EnumDecl):
+                self._declare_enum(declared)
+
+    def resolve(self) -> None:
+        """Resolve all types, after the global constants are known, because limits may use them."""
+        for declared in self._unit.types:
+            self.named(declared.name, declared.pos)
+
+    @contextmanager
+    def within(self, pou: t.Pou) -> Iterator[None]:
+        """Make the constants of `pou` available to limits and initial values."""
+        before = self.scope
+        self.scope = self._constants.setdefault(pou.name.lower(), {})
+        if not self.scope:
+            for block in pou.blocks:
+                for v in block.variables if "CONSTANT" in block.qualifiers else ():
+                    found = self.constant(v, f"v_{v.name.lower()}")
+                    if found is not None:
+                        self.scope[v.name.lower()] = found
+        yield
+        self.scope = before
+
+    def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
+        """Return a CONSTANT with its value; None if the value is not elementary, or too long to be written at each use."""
+        if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
+            return None
+        kind = self.type_of(v.type)
+        compiler = self._expressions()
+        value = compiler.settled(compiler.value(v.initial, kind), v.initial.pos)
+        text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
+        if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
+            return None
+        return Symbol(v.name, kind, text, writable=False, constant=value.constant)
+
+    def _expressions(self) -> Expressions:
+        compiler = Expressions(self.env, self.scope, CodeWriter())
+        compiler.only_constants = True
+        return compiler
+
+    def shared(self, code: str) -> str:
+        """Return `code`, or, if it is long, the call of a function that contains it, so that the code is written only once."""
+        if len(code) <= MAX_REPEATED:
+            return code
+        name = f"_new{len(self.out.lines)}"
+        with self.out.block(f"def {name}():"):
+            self.out.line(f"return {code}")
+        return f"{name}()"
+
+    # -- types ----------------------------------------------------------------------------------------------------------
+
+    def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
+        """Return the type of a type specification. `role` is VAR_INPUT or VAR_OUTPUT if MESSAGES is allowed here."""
+        if isinstance(spec, t.NamedType):
+            return self.named(spec.name, spec.pos)
+        if isinstance(spec, t.ArrayType):
+            return self._array(spec)
+        if isinstance(spec, t.SubrangeType):
+            return self._subrange(spec)
+        if isinstance(spec, t.StringType):
+            length = ty.DEFAULT_STRING if spec.length is None else self._constant(spec.length, "the length of a string")
+            if not 1 <= length <= ty.MAX_STRING:
+                self.env.fail(spec.pos, "the length of a string", expected=f"1 to {ty.MAX_STRING}", got=str(length))
+            return ty.String(length, spec.wide)
+        return self._messages(spec, role)
+
+    def _array(self, spec: t.ArrayType) -> ty.Array:
+        if self._deep >= ty.MAX_NESTED:
+            self.env.fail(spec.pos, "arrays nested too deep", expected=f"at most {ty.MAX_NESTED}")
+        ranges = tuple((self._constant(a, "an index"), self._constant(b, "an index")) for a, b in spec.ranges)
+        if any(low > high for low, high in ranges):
+            self.env.fail(spec.pos, "an empty range of indices")
+        self._deep += 1
+        of = self.type_of(spec.of)
+        self._deep -= 1
+        if isinstance(of, ty.MessagesIn | ty.MessagesOut):
+            self.env.fail(spec.pos, "an array of MESSAGES")
+        made = ty.Array(ranges, of)
+        self.bounded(spec.pos, [made])
+        return made
+
+    def bounded(self, pos: t.Pos, kinds: Iterable[ty.Type]) -> tuple[int, int]:
+        """Return the size and the nesting depth of variables of these types. Raises `FileInvalid` beyond the limits."""
+        found = list(kinds)
+        total, nested = sum(map(ty.elements, found)), max(map(ty.nested, found), default=0)
+        if total > ty.MAX_ELEMENTS:
+            self.env.fail(pos, "too much data", expected=f"at most {ty.MAX_ELEMENTS} elements", got=str(total))
+        if nested > ty.MAX_NESTED:
+            self.env.fail(pos, "arrays, structures and blocks nested too deep", expected=f"at most {ty.MAX_NESTED}")
+        return total, nested
+
+    def _messages(self, spec: t.MessagesType, role: str) -> ty.Type:
+        if role == "VAR_INPUT" and spec.max_bytes is None:
+            return ty.MessagesIn()
+        if role != "VAR_OUTPUT":
+            self.env.fail(
+                spec.pos,
+                "MESSAGES are not allowed here",
+                expected="MESSAGES as VAR_INPUT, MESSAGES[bytes, depth] as VAR_OUTPUT of a PROGRAM",
+            )
+        max_bytes = MESSAGE_BYTES if spec.max_bytes is None else self._constant(spec.max_bytes, "the longest message")
+        depth = MESSAGE_DEPTH if spec.depth is None else self._constant(spec.depth, "the depth")
+        if not (1 <= max_bytes <= MAX_MESSAGE_BYTES and 1 <= depth <= MAX_DEPTH):
+            self.env.fail(
+                spec.pos,
+                "MESSAGES of an impossible size",
+                expected=f"1 to {MAX_MESSAGE_BYTES} bytes, depth 1 to {MAX_DEPTH}",
+            )
+        return ty.MessagesOut(max_bytes, depth)
+
+    def named(self, name: str, pos: t.Pos) -> ty.Type:
+        key = name.lower()
+        found = ty.ELEMENTARY.get(name.upper()) or self.env.types.get(key)
+        if found is not None:
+            return found
+        if key in self._open:
+            self.env.fail(pos, f"type {name} contains itself")
+        if len(self._open) > ty.MAX_NESTED:
+            self.env.fail(pos, "arrays, structures and blocks nested too deep", expected=f"at most {ty.MAX_NESTED}")
+        self._open.append(key)
+        if key in self._types:
+            found = self._declared(self._types[key])
+        elif key in self._blocks:
+            found = self._block(self._blocks[key])
+        elif key in _STANDARD:
+            found = _STANDARD[key]
+        else:
+            known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
+            self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
+        self._open.pop()
+        self.env.types[key] = found
+        return found
+
+    def _declared(self, declared: t.TypeDecl) -> ty.Type:
+        if isinstance(declared, t.StructDecl):
+            fields: dict[str, tuple[str, ty.Type]] = {}
+            for field in declared.fields:
+                if field.name.lower() in fields:
+                    self.env.fail(field.pos, f"{field.name} is declared twice")
+                fields[field.name.lower()] = (field.name, self.type_of(field.type))
+            total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
+            struct = ty.Struct(declared.name, fields, total, nested + 1)
+            self._write_struct(struct, declared)
+            return struct
+        assert isinstance(declared, t.AliasDecl)
+        kind = self.type_of(declared.type)
+        if declared.initial is not None:
+            code = self.initial(kind, declared.initial)
+            self.env.type_initials[declared.name.lower()] = self.shared(code)
+        return kind
+
+    def _declare_enum(self, declared: t.EnumDecl) -> None:
+        values: dict[str, int] = {}
+        number = 0
+        for name, stated in declared.values:
+            number = number if stated is None else stated
+            if name.lower() in {v.lower() for v in values}:
+                self.env.fail(declared.pos, f"{declared.name} has the value {name} twice")
+            values[name] = number
+            number += 1
+        first = next(iter(values.values()))
+        enum = ty.Enum(declared.name, values, first)
+        if isinstance(declared.initial, t.Ref):
+            lower = {k.lower(): v for k, v in values.items()}
+            if declared.initial.name.lower() not in lower:
+                self.env.unknown(declared.pos, f"in {declared.name}, a value", declared.initial.name, list(values))
+            enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()])
+        self.env.types[declared.name.lower()] = enum
+        for name, value in values.items():
+            self.env.enum_values.setdefault(name.lower(), []).append((enum, value))
+
+    def _subrange(self, spec: t.SubrangeType) -> ty.Subrange:
+        base = self.named(spec.name, spec.pos)
+        low, high = self._constant(spec.low, "a limit"), self._constant(spec.high, "a limit")
+        if not (isinstance(base, ty.Elementary) and base.kind == "int" and base.low <= low <= high <= base.high):
+            self.env.fail(
+                spec.pos, "a subrange", expected="limits inside an integer type", got=f"{base}({low}..{high})"
+            )
+        return ty.Subrange(base, low, high)
+
+    def _block(self, pou: t.Pou) -> ty.Block:
+        members: dict[str, dict[str, tuple[str, ty.Type]]] = {"VAR_INPUT": {}, "VAR_OUTPUT": {}, "VAR_IN_OUT": {}}
+        held: list[ty.Type] = []
+        with self.within(pou):
+            for block in pou.blocks:
+                for v in block.variables if block.kind in (*members, "VAR") else ():
+                    kind = self.type_of(v.type)  # also finds a block that contains itself
+                    if block.kind != "VAR_IN_OUT":
+                        held.append(kind)
+                    if block.kind in members:
+                        members[block.kind][v.name.lower()] = (v.name, kind)
+        total, nested = self.bounded(pou.pos, held)
+        inputs, outputs, in_outs = members.values()
+        return ty.Block(pou.name, inputs, outputs, in_outs, elements=total, nested=nested + 1)
+
+    def _constant(self, expr: t.Expr, what: str) -> int:
+        return self._expressions().constant_integer(expr, what)
+
+    # -- initial values -------------------------------------------------------------------------------------------------
+
+    def initial(self, kind: ty.Type, init: t.Init | None, spec: t.TypeSpec | None = None) -> str:
+        """Return the Python expression of a new variable's value."""
+        if init is None:
+            named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
+            return self.env.type_initials.get(named) or self._default(kind)
+        if isinstance(init, t.InitArray):
+            return self._initial_array(kind, init)
+        if isinstance(init, t.InitStruct):
+            return self._initial_struct(kind, init)
+        compiler = self._expressions()
+        code = compiler.coerced(compiler.value(init, kind), kind, init.pos, "an initial value")
+        if compiler.out.lines:
+            self.env.fail(init.pos, "too deep an expression for an initial value")
+        return code
+
+    def _default(self, kind: ty.Type) -> str:
+        if isinstance(kind, ty.Subrange):
+            return str(min(max(0, kind.low), kind.high))
+        if isinstance(kind, ty.Elementary):
+            return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
+        if isinstance(kind, ty.String):
+            return "''"
+        if isinstance(kind, ty.Enum):
+            return str(kind.initial)
+        if isinstance(kind, ty.Struct):
+            return f"S_{kind.name.lower()}()"
+        if isinstance(kind, ty.Block):
+            return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{kind.name.lower()}()"
+        assert isinstance(kind, ty.Array)
+        code = self._default(kind.of)
+        for low, high in reversed(kind.ranges):
+            code = f"[{code} for _ in range({high - low + 1})]"
+        return code
+
+    def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
+        if not isinstance(kind, ty.Array):
+            self.env.fail(init.pos, "an array value for a type that is not an array", got=str(kind))
+        items, count = [], 0
+        total = ty.elements(ty.Array(kind.ranges, ty.INT))
+        for often, item in init.items:
+            if often < 0 or count + often > total:
+                self.env.fail(init.pos, "more values than elements", expected=f"at most {total}")
+            count += often
+            code = self.initial(kind.of, item)
+            items.append(code if often == 1 else f"*({code} for _ in range({often}))")
+        if count < total:
+            items.append(f"*({self._default(kind.of)} for _ in range({total - count}))")
+        sizes = tuple(high - low + 1 for low, high in kind.ranges[1:])
+        return f"_v.shaped([{', '.join(items)}], {sizes})" if sizes else f"[{', '.join(items)}]"
+
+    def _initial_struct(self, kind: ty.Type, init: t.InitStruct) -> str:
+        members = kind.fields if isinstance(kind, ty.Struct) else kind.inputs if isinstance(kind, ty.Block) else None
+        if members is None:
+            self.env.fail(init.pos, "a structure value for a type that is not a structure", got=str(kind))
+        given = []
+        for name, item in init.members:
+            if name.lower() not in members:
+                self.env.unknown(init.pos, f"in {kind}, a member", name, [n for n, _ in members.values()])
+            member, of = members[name.lower()]
+            attribute = f"m_{name.lower()}" if isinstance(kind, ty.Struct) else f"v_{name.lower()}"
+            if isinstance(kind, ty.Block) and kind.standard:
+                attribute = member
+            given.append(f"{attribute}={self.initial(of, item)}")
+        return f"_v.with_members({', '.join([self._default(kind), *given])})"
+
+    def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
+        out, names = self.out, [f"m_{name}" for name in struct.fields]
+        with out.block(f"class S_{struct.name.lower()}:", declared.pos):
+            out.line(f"__slots__ = ({', '.join(map(repr, names))},)")
+            with out.block("def __init__(self):"):
+                for field in declared.fields:
+                    kind = struct.fields[field.name.lower()][1]
+                    out.line(
+                        f"self.m_{field.name.lower()} = {self.initial(kind, field.initial, field.type)}", field.pos
+                    )
+            with out.block("def copy(self):"):
+                out.line(f"new = S_{struct.name.lower()}.__new__(S_{struct.name.lower()})")
+                for name, (_, kind) in zip(names, struct.fields.values(), strict=True):
+                    code = f"self.{name}"
+                    if isinstance(kind, ty.Array):
+                        code = f"_v.copied({code})"
+                    elif isinstance(kind, ty.Struct):
+                        code += ".copy()"
+                    out.line(f"new.{name} = {code}")
+                out.line("return new")

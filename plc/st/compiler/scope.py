@@ -1,0 +1,172 @@
+"""The names of a unit and their meaning during compilation, the errors that compiling raises, and the code that it
+writes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NoReturn, Protocol
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.syntax.source import shortened
+from fieldtwin.plc.st.syntax.tree import Expr, Pos
+
+COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
+"""Operators of Structured Text and their Python form."""
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """A variable: its Python expression, and its value if it is a constant. `reference`: for a VAR_IN_OUT of an
+    elementary type, the expression of the object that refers to the caller's variable
+    (`fieldtwin.plc.st.references`)."""
+
+    name: str
+    type: ty.Type
+    code: str
+    writable: bool = True
+    constant: Any = None
+    reference: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A compiled expression. `place` says that it is a variable or a part of one. `constant` is its value if it is known.
+
+    `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
+    """
+
+    code: str
+    type: ty.Type
+    constant: Any = None
+    place: bool = False
+    writable: bool = False
+    reference: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    name: str
+    type: ty.Type
+    initial: str
+    """Python expression of the initial value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """The signature of a user's function. The compiled function returns a tuple if it has outputs."""
+
+    name: str
+    returns: ty.Type
+    inputs: tuple[Parameter, ...]
+    in_outs: tuple[Parameter, ...]
+    outputs: tuple[Parameter, ...]
+
+
+def by_reference(kind: ty.Type) -> bool:
+    """Return whether a VAR_IN_OUT of this type is passed as the object itself; other types need an object that refers
+    to them."""
+    return isinstance(kind, ty.Array | ty.Struct | ty.Block)
+
+
+@dataclass
+class Environment:
+    """All declarations of a unit, by names in lower case."""
+
+    path: str = ""
+    types: dict[str, ty.Type] = field(default_factory=dict)
+    type_initials: dict[str, str] = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+    globals: dict[str, Symbol] = field(default_factory=dict)
+    enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
+    calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
+    """By POU: the POUs that it calls or contains, with the first position of each."""
+
+    def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
+        return FileInvalid(
+            message, path=self.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
+        )
+
+    def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
+        raise self.error(pos, message, expected=expected, got=got, hint=hint)
+
+    def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
+        self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known))
+
+
+class Compiling(Protocol):
+    """The compiler of expressions (`expressions.Expressions`), as a standard function uses it."""
+
+    env: Environment
+    symbols: dict[str, Symbol]
+    program_inputs: set[str]
+    wanted: ty.Type | None
+
+    def value(self, expr: Expr, wanted: ty.Type | None = None) -> Value: ...
+
+    def declared(self, *exprs: Expr) -> ty.Type | None: ...
+
+    def known(self, expr: Expr, result: float) -> Value: ...
+
+    def coerced(self, value: Value, target: ty.Type, pos: Pos, what: str = "") -> str: ...
+
+    def condition(self, expr: Expr, what: str) -> str: ...
+
+
+def wrapped(code: str, kind: ty.Elementary) -> str:
+    """Return `code` reduced to the width of `kind`."""
+    if kind.kind == "real":
+        return f"_v.real({code})" if kind.bits == 32 else f"({code})"
+    if kind.low < 0:
+        return f"(({code} + {-kind.low} & {kind.high - kind.low}) - {-kind.low})"
+    return f"({code} & {kind.high})"
+
+
+class CodeWriter:
+    """The Python code being written: its lines, each with the line of the source."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int]] = []
+        self._depth = 0
+        self._temporaries = 0
+
+    def line(self, code: str, pos: Pos | None = None) -> None:
+        self.lines.append(("    " * self._depth + code, pos.line if pos else 0))
+
+    @contextmanager
+    def block(self, head: str, pos: Pos | None = None) -> Iterator[None]:
+        """Write `head` and an indented body, ``pass`` if nothing is written into it."""
+        self.line(head, pos)
+        self._depth += 1
+        before = len(self.lines)
+        yield
+        if len(self.lines) == before:
+            self.line("pass", pos)
+        self._depth -= 1
+
+    def step(self, pos: Pos | None = None) -> None:
+        """Count one loop iteration or call against the limit of the scan (`fieldtwin.plc.st.resource.MAX_STEPS`)."""
+        self.line("_c.left -= 1", pos)
+        self.line("if _c.left < 0: _c.too_long()", pos)
+
+    @property
+    def depth(self) -> int:
+        """Return the number of blocks that enclose the next line."""
+        return self._depth
+
+    def since(self, mark: int) -> list[tuple[str, int]]:
+        """Remove and return the lines after the first `mark` lines, without their present indentation."""
+        taken = [(code[4 * self._depth :], line) for code, line in self.lines[mark:]]
+        del self.lines[mark:]
+        return taken
+
+    def again(self, lines: list[tuple[str, int]]) -> None:
+        """Write lines that `since` returned, with the present indentation."""
+        self.lines += [("    " * self._depth + code, line) for code, line in lines]
+
+    def temporary(self) -> str:
+        self._temporaries += 1
+        return f"_{self._temporaries}"

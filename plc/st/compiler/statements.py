@@ -1,0 +1,281 @@
+"""Compiles statements to Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.expressions import Expressions
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, wrapped
+from fieldtwin.plc.st.syntax import tree as t
+
+MAX_DEEP = 60
+"""How deep statements may be nested."""
+MAX_LOOPS = 18
+"""How deep loops may be nested: Python's limit is 20."""
+MAX_CONTINUES = 50
+"""How many CONTINUEs one REPEAT may have: the condition is written out for each."""
+_CHAIN = 48
+"""The longest chain of elif: a longer chain is split, because Python nests each branch in the one before."""
+
+
+class Statements(Expressions):
+    """The compiler of a body. `leave` is the Python statement for RETURN."""
+
+    leave = "return"
+
+    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: CodeWriter, pou: str = "") -> None:
+        super().__init__(env, symbols, out, pou)
+        self._loops: list[t.Expr | None] = []  # the loops around the statement; for a REPEAT its condition
+        self._continues: dict[int, int] = {}
+        self._inside = 0
+
+    def body(self, statements: tuple[t.Statement, ...]) -> None:
+        if self._inside >= MAX_DEEP and statements:
+            self.env.fail(statements[0].pos, "statements nested too deep", expected=f"at most {MAX_DEEP} levels")
+        self._inside += 1
+        for statement in statements:
+            getattr(self, f"_{type(statement).__name__.lower()}")(statement)
+        self._inside -= 1
+
+    # -- assignment and calls -----------------------------------------------------------------------------------------
+
+    def _assign(self, s: t.Assign) -> None:
+        self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
+
+    def _callstatement(self, s: t.CallStatement) -> None:
+        call = s.call
+        known = call.ref.name.lower() in self.symbols or call.ref.name.lower() in self.env.globals
+        if call.ref.selectors or known:
+            instance = self.reference(call.ref)
+            if not isinstance(instance.type, ty.Block):
+                self.env.fail(
+                    call.pos, f"{call.ref.name} cannot be called", expected="a function block", got=str(instance.type)
+                )
+            self._block_call(call, instance.code, instance.type)
+        else:
+            self.out.line(self.value(call).code, s.pos)
+
+    def _block_call(self, call: t.Call, code: str, block: ty.Block) -> None:
+        if "[" in code:  # compute the place once
+            place = self.out.temporary()
+            self.out.line(f"{place} = {code}", call.pos)
+            code = place
+        cells: dict[str, str] = {}
+        names = [member for member, _ in (*block.inputs.values(), *block.in_outs.values())]
+        given = bind(self.env, call, names, str(block))
+        for name, argument in given.items():
+            assert argument.value is not None
+            if name in block.inputs:
+                member, kind = block.inputs[name]
+                value = self.coerced(self.value(argument.value, kind), kind, argument.pos, f"{member} of {block}")
+                self.out.line(f"{code}.{_attribute(block, name, member)} = {value}", call.pos)
+            else:
+                member, kind = block.in_outs[name]
+                handed = self.in_out(argument.value, member, kind, call, str(block), cells)
+                self.out.line(f"{code}.v_{name} = {handed}", call.pos)
+        for name, (member, _) in block.in_outs.items():
+            if name not in given:
+                self.env.fail(call.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
+        self.out.line(f"{code}.execute(_c.now_ns)", call.pos)
+        self.take_back(cells, call.pos)
+        for argument in (a for a in call.arguments if a.target is not None):
+            name = argument.name.lower()
+            if name not in block.outputs:
+                self.env.unknown(
+                    argument.pos, f"in {block}, an output", argument.name, [m for m, _ in block.outputs.values()]
+                )
+            member, kind = block.outputs[name]
+            self.take(argument, Value(f"{code}.{_attribute(block, name, member)}", kind))
+
+    # -- selection ----------------------------------------------------------------------------------------------------
+
+    def _if(self, s: t.If) -> None:
+        if len(s.branches) <= _CHAIN:
+            self._chain(s.branches, lambda: self.body(s.otherwise), bool(s.otherwise), s.pos)
+            return
+        done = self.out.temporary()
+        self.out.line(f"{done} = False", s.pos)
+        for n in range(0, len(s.branches), _CHAIN):
+            with self.out.block(f"if not {done}:", s.pos):
+                self.out.line(f"{done} = True", s.pos)
+                self._chain(s.branches[n : n + _CHAIN], lambda: self.out.line(f"{done} = False", s.pos), True, s.pos)
+        if s.otherwise:
+            with self.out.block(f"if not {done}:", s.pos):
+                self.body(s.otherwise)
+
+    def _chain(
+        self,
+        branches: tuple[tuple[t.Expr, tuple[t.Statement, ...]], ...],
+        otherwise: Callable[[], None],
+        more: bool,
+        pos: t.Pos,
+    ) -> None:
+        """Write a chain of if and elif, and `otherwise` as the else branch if there is `more`.
+
+        A condition that needs lines before it begins a new chain inside the else branch of the previous chain."""
+        with ExitStack() as inside:
+            word = "if"
+            for condition, body in branches:
+                mark = len(self.out.lines)
+                code = self.condition(condition, "IF")
+                prepared = self.out.since(mark)
+                if prepared and word == "elif":
+                    if self.out.depth >= MAX_DEEP:
+                        self.env.fail(condition.pos, "too many conditions with calls in one IF")
+                    inside.enter_context(self.out.block("else:", pos))
+                    word = "if"
+                self.out.again(prepared)
+                with self.out.block(f"{word} {code}:", condition.pos):
+                    self.body(body)
+                word = "elif"
+            if more:
+                with self.out.block("else:", pos):
+                    otherwise()
+
+    def _case(self, s: t.Case) -> None:
+        selector = self.value(s.selector)
+        kind = ty.plain(selector.type)
+        if not (ty.is_kind(kind, "int", "bits") or isinstance(kind, ty.Enum)):
+            self.env.fail(
+                s.selector.pos, "the selector of CASE", expected="a whole number or an enumeration", got=str(kind)
+            )
+        name = self.out.temporary()
+        self.out.line(f"{name} = {selector.code}", s.pos)
+        labels = [[(*self._label(label, kind), label.pos) for label in of] for of, _ in s.branches]
+        self._check_labels([label for of in labels for label in of])
+        bodies = [body for _, body in s.branches]
+        places = [of[0].pos for of, _ in s.branches]
+        if len(bodies) <= _CHAIN:
+            tests = [
+                " or ".join(f"{name} == {low}" if low == high else f"{low} <= {name} <= {high}" for low, high, _ in of)
+                for of in labels
+            ]
+        else:
+            rows = sorted((low, high, n) for n, of in enumerate(labels) for low, high, _ in of)
+            lows, highs, numbers = (tuple(column) for column in zip(*rows, strict=True))
+            self.out.line(f"{name} = _v.branch({name}, {lows}, {highs}, {numbers})", s.pos)
+            tests = [f"{name} == {n}" for n in range(len(bodies))]
+        self._cases(name, list(zip(tests, bodies, places, strict=True)), 0, s)
+
+    def _cases(self, name: str, rows: list[tuple[str, tuple[t.Statement, ...], t.Pos]], first: int, s: t.Case) -> None:
+        """Write the branches of a CASE as a chain of conditions.
+
+        If there are many, they are selected by number, in nested halves.
+        """
+        if len(rows) > _CHAIN:
+            half = len(rows) // 2
+            with self.out.block(f"if 0 <= {name} < {first + half}:", s.pos):
+                self._cases(name, rows[:half], first, s)
+            with self.out.block(f"elif {name} >= {first + half}:", s.pos):
+                self._cases(name, rows[half:], first + half, s)
+            if s.otherwise and len(rows) == len(s.branches):
+                with self.out.block("else:", s.pos):
+                    self.body(s.otherwise)
+            return
+        word = "if"
+        for test, body, pos in rows:
+            with self.out.block(f"{word} {test}:", pos):
+                self.body(body)
+            word = "elif"
+        if s.otherwise and len(rows) == len(s.branches):
+            with self.out.block("else:" if word == "elif" else "if True:", s.pos):
+                self.body(s.otherwise)
+
+    def _label(self, label: t.CaseLabel, kind: ty.Type) -> tuple[int, int]:
+        ends = []
+        for expr in (label.low, label.high or label.low):
+            value = self.value(expr)
+            whole = ty.is_kind(value.type, "int", "bits") or isinstance(value.type, ty.Enum)
+            if value.constant is None or not whole or ty.common(value.type, kind) is None:
+                self.env.fail(expr.pos, "a label of CASE", expected=f"a constant of {kind}", got=str(value.type))
+            ends.append(int(value.constant))
+        low, high = ends
+        if low > high:
+            self.env.fail(label.pos, "an empty range", got=f"{low}..{high}")
+        return low, high
+
+    def _check_labels(self, labels: list[tuple[int, int, t.Pos]]) -> None:
+        """Check that no two labels overlap; the error names the later one."""
+        before: tuple[int, int, t.Pos] | None = None
+        for label in sorted(labels, key=lambda each: each[:2]):
+            if before is not None and label[0] <= before[1]:
+                low, high, pos = max(before, label, key=lambda each: (each[2].line, each[2].column))
+                got = str(low) if low == high else f"{low}..{high}"
+                self.env.fail(pos, "a label that another branch also has", got=got)
+            before = label
+
+    # -- iteration ----------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _loop(self, head: str, pos: t.Pos, until: t.Expr | None = None) -> Iterator[None]:
+        if len(self._loops) >= MAX_LOOPS:
+            self.env.fail(pos, "loops nested too deep", expected=f"at most {MAX_LOOPS}")
+        self._loops.append(until)
+        with self.out.block(head, pos):
+            self.out.step(pos)
+            yield
+        self._loops.pop()
+
+    def _for(self, s: t.For) -> None:
+        """Compile FOR. Limits and step are computed once. Afterwards the variable is the first value past the limit, as
+        in C."""
+        target = self.writable(s.variable)
+        kind = target.type
+        if not isinstance(kind, ty.Elementary) or kind.kind != "int":
+            self.env.fail(s.variable.pos, "the variable of FOR", expected="an integer", got=str(kind))
+        if target.code.count(".m_") != len(s.variable.selectors):
+            self.env.fail(s.variable.pos, "the variable of FOR", expected="a variable, or a member of a structure")
+        first, last = (self.coerced(self.value(e), kind, e.pos, "a limit of FOR") for e in (s.first, s.last))
+        taken, code = self.out.temporary(), f"range({first}, {last} + 1)"
+        if s.step is not None:
+            code = f"_v.steps({first}, {last}, {self.coerced(self.value(s.step), kind, s.step.pos, 'the step of FOR')})"
+        self.out.line(f"{taken} = {code}", s.pos)
+        own = target.code in (f"v_{s.variable.name.lower()}", f"self.v_{s.variable.name.lower()}")
+        head = taken if own else f"_v.unaltered({taken}, lambda: {target.code})"
+        self.controls.append(target.code)
+        with self._loop(f"for {target.code} in {head}:", s.pos):
+            self.body(s.body)
+        self.controls.pop()
+        with self.out.block("else:", s.pos):
+            self.out.line(f"{target.code} = {wrapped(f'_v.beyond({taken})', kind)}", s.pos)
+
+    def _while(self, s: t.While) -> None:
+        with self._loop("while True:", s.pos):
+            code = self.condition(s.condition, "WHILE")
+            with self.out.block(f"if not {code}:", s.condition.pos):
+                self.out.line("break", s.condition.pos)
+            self.body(s.body)
+
+    def _repeat(self, s: t.Repeat) -> None:
+        with self._loop("while True:", s.pos, s.until):
+            self.body(s.body)
+            self._until(s.until)
+
+    def _until(self, condition: t.Expr) -> None:
+        code = self.condition(condition, "REPEAT")
+        with self.out.block(f"if {code}:", condition.pos):
+            self.out.line("break", condition.pos)
+
+    def _jump(self, s: t.Jump) -> None:
+        if s.word == "RETURN":
+            self.out.line(self.leave, s.pos)
+            return
+        if not self._loops:
+            self.env.fail(s.pos, f"{s.word} outside a loop")
+        if s.word == "EXIT":
+            self.out.line("break", s.pos)
+            return
+        until = self._loops[-1]
+        if until is not None:  # CONTINUE in REPEAT goes to its condition
+            self._continues[id(until)] = self._continues.get(id(until), 0) + 1
+            if self._continues[id(until)] > MAX_CONTINUES:
+                self.env.fail(s.pos, "too many CONTINUEs in one REPEAT", expected=f"at most {MAX_CONTINUES}")
+            self._until(until)
+        self.out.line("continue", s.pos)
+
+
+def _attribute(block: ty.Block, name: str, member: str) -> str:
+    return member if block.standard else f"v_{name}"

@@ -1,0 +1,355 @@
+"""Parse Structured Text to a tree, with lark (LALR). An error has line, column, and the tokens that were expected."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from lark import Lark, Token, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken, v_args
+from lark.exceptions import UnexpectedInput, VisitError
+from lark.lexer import PatternStr
+from lark.tree import Meta
+from lark.visitors import Transformer_NonRecursive
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.source import MAX_NAME, blanked, shortened
+
+MAX_EXPECTED = 8
+"""How many of the expected tokens an error names."""
+
+_READABLE = {
+    "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
+    "DURATION": "a duration", "DATE": "a date", "TIME_OF_DAY": "a time of day", "DATE_AND_TIME": "a date",
+    "STRING_LITERAL": "a string", "WSTRING_LITERAL": "a string", "ENUM_REF": "a name", "VAR_KIND": "VAR", "SEMICOLON": ";",
+    "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
+    "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
+    "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
+}  # fmt: skip
+
+
+def parse(text: str, path: str = "") -> t.SourceUnit:
+    """Return the tree of `text`. Raises `FileInvalid` with line and column."""
+    text = blanked(text, path)
+    try:
+        return _Build().transform(_parser().parse(text))  # type: ignore[no-any-return]
+    except UnexpectedInput as e:
+        raise _invalid(e, text, path) from e
+    except VisitError as e:
+        if not isinstance(e.orig_exc, _Bad):
+            raise
+        raise e.orig_exc.at(path) from e
+
+
+@cache
+def _parser() -> Lark:
+    grammar = resources.files("fieldtwin.plc.st").joinpath("grammar.lark").read_text(encoding="utf-8")
+    return Lark(grammar, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII)
+
+
+class _Bad(Exception):
+    """A token that is well formed but has no valid meaning."""
+
+    def __init__(self, token: Token, message: str) -> None:
+        super().__init__(message)
+        self.token = token
+
+    def at(self, path: str) -> FileInvalid:
+        where = _pos(self.token)
+        return FileInvalid(str(self), path=path, line=where.line, column=where.column, got=shortened(str(self.token)))
+
+
+def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
+    if isinstance(e, UnexpectedToken) and e.token.type != "$END":
+        got, line, column = str(e.token), e.line, e.column
+        names = e.accepts or e.expected
+    elif isinstance(e, UnexpectedCharacters):
+        got, line, column = e.char, e.line, e.column
+        names = e.allowed or set()
+    else:  # the end of the text
+        before = text.rstrip()
+        got, line, column = "the end of the file", before.count("\n") + 1, len(before) - before.rfind("\n")
+        names = getattr(e, "accepts", None) or (set() if isinstance(e, UnexpectedEOF) else e.expected)  # type: ignore[attr-defined]
+    readable = sorted({_readable(name) for name in names})
+    more = f" and {len(readable) - MAX_EXPECTED} more" if len(readable) > MAX_EXPECTED else ""
+    return FileInvalid(
+        "not Structured Text",
+        path=path,
+        line=line,
+        column=column,
+        got=shortened(got if got.isprintable() else repr(got)),
+        expected=", ".join(readable[:MAX_EXPECTED]) + more,
+    )
+
+
+@cache
+def _readable(name: str) -> str:
+    for terminal in _parser().terminals:
+        if terminal.name == name and isinstance(terminal.pattern, PatternStr):
+            return str(terminal.pattern.value)
+    return _READABLE.get(name, name)
+
+
+def _pos(where: Meta | Token) -> t.Pos:
+    return t.Pos(where.line or 1, where.column or 1)
+
+
+@v_args(meta=True)
+class _Build(Transformer_NonRecursive[Token, Any]):
+    """The transformer that builds the tree bottom up: children are already nodes, tokens are still tokens.
+
+    It is not recursive, so the nesting depth has no limit."""
+
+    def NAME(self, token: Token) -> Token:
+        if len(token) > MAX_NAME:
+            raise _Bad(token, f"a name of more than {MAX_NAME} characters")
+        return token
+
+    def start(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
+        types = tuple(one for item in items if isinstance(item, list) for one in item)
+        return t.SourceUnit(
+            types,
+            tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock)),
+            tuple(i for i in items if isinstance(i, t.Pou)),
+        )
+
+    def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock, ...]:
+        """Return the globals of a configuration, and those of its resources."""
+        return tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock))
+
+    resource = configuration
+
+    def task(self, meta: Meta, items: list[Any]) -> None:
+        return None
+
+    instance = task_value = task
+
+    def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
+        name, *rest = items
+        returns = rest.pop(0) if kind == "FUNCTION" else None
+        return t.Pou(_pos(name), kind, str(name), returns, tuple(rest[:-1]), rest[-1])
+
+    def program(self, meta: Meta, items: list[Any]) -> t.Pou:
+        return self._pou("PROGRAM", meta, items)
+
+    def function(self, meta: Meta, items: list[Any]) -> t.Pou:
+        return self._pou("FUNCTION", meta, items)
+
+    def function_block(self, meta: Meta, items: list[Any]) -> t.Pou:
+        return self._pou("FUNCTION_BLOCK", meta, items)
+
+    # -- declarations
+
+    def global_vars(self, meta: Meta, items: list[Any]) -> t.VarBlock:
+        return self.var_block(meta, items)
+
+    def var_block(self, meta: Meta, items: list[Any]) -> t.VarBlock:
+        kind, *rest = items
+        qualifiers = frozenset(i.upper() for i in rest if isinstance(i, str))
+        variables = tuple(v for i in rest if not isinstance(i, str) for v in i)
+        return t.VarBlock(_pos(kind), kind.upper(), qualifiers, variables)
+
+    def qualifier(self, meta: Meta, items: list[Any]) -> str:
+        return str(items[0])
+
+    def var_decl(self, meta: Meta, items: list[Any]) -> list[t.VarDecl]:
+        names = [i for i in items if isinstance(i, Token)]
+        location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
+        spec, initial = _spec(items), _initial(items)
+        return [t.VarDecl(_pos(n), str(n), spec, initial, location) for n in names]
+
+    def location(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
+        return "at", str(items[0])
+
+    def initial(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
+        return "initial", items[0]
+
+    def field(self, meta: Meta, items: list[Any]) -> list[t.VarDecl]:
+        return self.var_decl(meta, items)
+
+    def type_block(self, meta: Meta, items: list[Any]) -> list[Any]:
+        return items
+
+    def struct_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
+        name, *fields = items
+        return t.StructDecl(_pos(name), str(name), tuple(f for group in fields for f in group))
+
+    def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
+        name, *rest = items
+        values = tuple(i for i in rest if i[0] != "initial")
+        return t.EnumDecl(_pos(name), str(name), values, _initial(rest))
+
+    def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
+        return str(items[0]), items[1] if len(items) > 1 else None
+
+    def signed_integer(self, meta: Meta, items: list[Any]) -> int:
+        number = _integer(items[-1])
+        return -number if str(items[0]) == "-" else number
+
+    def alias_decl(self, meta: Meta, items: list[Any]) -> t.AliasDecl:
+        return t.AliasDecl(_pos(items[0]), str(items[0]), _spec(items), _initial(items))
+
+    def named_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
+        return t.NamedType(_pos(meta), str(items[0]))
+
+    def subrange_type(self, meta: Meta, items: list[Any]) -> t.SubrangeType:
+        return t.SubrangeType(_pos(meta), str(items[0]), items[1], items[2])
+
+    def string_type(self, meta: Meta, items: list[Any]) -> t.StringType:
+        return t.StringType(_pos(meta), items[0].upper() == "WSTRING", items[1] if len(items) > 1 else None)
+
+    def messages_type(self, meta: Meta, items: list[Any]) -> t.MessagesType:
+        sizes = [*items[1:], None, None]
+        return t.MessagesType(_pos(meta), sizes[0], sizes[1])
+
+    def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
+        return t.ArrayType(_pos(meta), tuple(items[:-1]), items[-1])
+
+    def range(self, meta: Meta, items: list[Any]) -> tuple[t.Expr, t.Expr]:
+        return items[0], items[1]
+
+    def bound(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return items[0]  # type: ignore[no-any-return]
+
+    def init_expression(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return items[0]  # type: ignore[no-any-return]
+
+    def init_array(self, meta: Meta, items: list[Any]) -> t.InitArray:
+        return t.InitArray(_pos(meta), tuple(items))
+
+    def one_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init]:
+        return 1, items[0]
+
+    def repeated_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init | None]:
+        return _integer(items[0]), items[1] if len(items) > 1 else None
+
+    def init_struct(self, meta: Meta, items: list[Any]) -> t.InitStruct:
+        return t.InitStruct(_pos(meta), tuple(items))
+
+    def member_init(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
+        return str(items[0]), items[1]
+
+    # -- statements
+
+    def body(self, meta: Meta, items: list[Any]) -> tuple[t.Statement, ...]:
+        return tuple(i for i in items if i is not None)
+
+    def empty(self, meta: Meta, items: list[Any]) -> None:
+        return None
+
+    def assign(self, meta: Meta, items: list[Any]) -> t.Assign:
+        return t.Assign(_pos(meta), items[0], items[1])
+
+    def call_statement(self, meta: Meta, items: list[Any]) -> t.CallStatement:
+        return t.CallStatement(_pos(meta), items[0])
+
+    def if_statement(self, meta: Meta, items: list[Any]) -> t.If:
+        otherwise = items.pop()[1] if len(items) % 2 else ()
+        return t.If(_pos(meta), tuple(zip(items[::2], items[1::2], strict=True)), otherwise)
+
+    def else_part(self, meta: Meta, items: list[Any]) -> tuple[str, tuple[t.Statement, ...]]:
+        return "else", items[0]
+
+    def case_statement(self, meta: Meta, items: list[Any]) -> t.Case:
+        selector, *rest = items
+        otherwise = rest.pop()[1] if rest and rest[-1][0] == "else" else ()
+        return t.Case(_pos(meta), selector, tuple(rest), otherwise)
+
+    def case_branch(self, meta: Meta, items: list[Any]) -> tuple[tuple[t.CaseLabel, ...], tuple[t.Statement, ...]]:
+        return tuple(items[:-1]), items[-1]
+
+    def case_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
+        return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
+
+    def next_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
+        return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
+
+    def case_number(self, meta: Meta, items: list[Any]) -> t.Expr:
+        literal = t.Literal(_pos(meta), items[-1].type, str(items[-1]))
+        return t.Unary(_pos(meta), "-", literal) if str(items[0]) == "-" else literal
+
+    def case_name(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return t.Ref(_pos(meta), str(items[0]))
+
+    def case_enum(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return t.Literal(_pos(meta), "ENUM_REF", str(items[0]))
+
+    def for_statement(self, meta: Meta, items: list[Any]) -> t.For:
+        variable, first, last, *step, body = items
+        return t.For(_pos(meta), variable, first, last, step[0] if step else None, body)
+
+    def while_statement(self, meta: Meta, items: list[Any]) -> t.While:
+        return t.While(_pos(meta), items[0], items[1])
+
+    def repeat_statement(self, meta: Meta, items: list[Any]) -> t.Repeat:
+        return t.Repeat(_pos(meta), items[0], items[1])
+
+    def exit(self, meta: Meta, items: list[Any]) -> t.Jump:
+        return t.Jump(_pos(meta), "EXIT")
+
+    def continue_(self, meta: Meta, items: list[Any]) -> t.Jump:
+        return t.Jump(_pos(meta), "CONTINUE")
+
+    def return_(self, meta: Meta, items: list[Any]) -> t.Jump:
+        return t.Jump(_pos(meta), "RETURN")
+
+    # -- expressions
+
+    def binary(self, meta: Meta, items: list[Any]) -> t.Binary:
+        return t.Binary(_pos(items[1]), items[1].upper(), items[0], items[2])
+
+    def unary(self, meta: Meta, items: list[Any]) -> t.Unary:
+        return t.Unary(_pos(meta), items[0].upper(), items[1])
+
+    def call(self, meta: Meta, items: list[Any]) -> t.Call:
+        return t.Call(_pos(meta), items[0], tuple(items[1:]))
+
+    def operator(self, meta: Meta, items: list[Any]) -> t.Ref:
+        return t.Ref(_pos(meta), str(items[0]))
+
+    def positional(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(_pos(meta), "", items[0])
+
+    def named(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(_pos(meta), str(items[0]), items[1])
+
+    def output(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(_pos(meta), str(items[-2]), None, items[-1], inverted=len(items) == 3)
+
+    def reference(self, meta: Meta, items: list[Any]) -> t.Ref:
+        return t.Ref(_pos(meta), str(items[0]), tuple(items[1:]))
+
+    def member(self, meta: Meta, items: list[Any]) -> t.Member:
+        return t.Member(_pos(meta), str(items[0]))
+
+    def bit(self, meta: Meta, items: list[Any]) -> t.Bit:
+        return t.Bit(_pos(meta), _integer(items[0]))
+
+    def index(self, meta: Meta, items: list[Any]) -> t.Index:
+        return t.Index(_pos(meta), tuple(items))
+
+    def literal(self, meta: Meta, items: list[Any]) -> t.Literal:
+        return t.Literal(_pos(meta), items[0].type, str(items[0]))
+
+
+def _spec(items: list[Any]) -> t.TypeSpec:
+    return next(i for i in items if isinstance(i, t.TypeSpec))
+
+
+def _initial(items: list[Any]) -> t.Init | None:
+    return next((i[1] for i in items if isinstance(i, tuple) and i[0] == "initial"), None)
+
+
+def _integer(token: Token) -> int:
+    """Return the value of an integer literal: underscores, ``16#``, ``8#``, ``2#``, with or without a type before
+    it."""
+    *_, base, digits = ["10", *token.replace("_", "").split("#")]
+    try:
+        return int(digits, int(base))
+    except ValueError as e:
+        raise _Bad(token, "not a whole number that any type holds") from e
+
+
+__all__ = ["parse"]

@@ -109,7 +109,7 @@ async def device(port: int) -> None:
 
 async def measure(port: int, frames: int, trips: int) -> tuple[float, float, float, int]:
     """Return frames/s to the other process, median and 99th percentile of a round trip in us, and frames lost or out of order."""
-    from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
+    from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint
 

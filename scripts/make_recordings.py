@@ -18,10 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not on the path
     sys.path.insert(0, str(ROOT))
 
-from fieldtwin.emulators.models.synthetic import (
-    cast,
-    tilt,
-)
+from fieldtwin.emulators.models.synthetic import cast, tilt  # noqa: E402
 from fieldtwin.gateway.core.files.recording import RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1

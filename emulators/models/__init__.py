@@ -1,0 +1,1 @@
+"""The models behind emulated devices, by protocol."""

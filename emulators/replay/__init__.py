@@ -1,0 +1,1 @@
+"""Emulated devices that answer from a recording of exchanges."""

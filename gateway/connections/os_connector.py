@@ -67,7 +67,7 @@ class OsConnector(Connector):
 
                 return await SocketCanConnection.open(endpoint, bitrate)
             case "fieldtwin":
-                from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
+                from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
 
                 return await SoftBusConnection.open(endpoint, bitrate)
             case _:

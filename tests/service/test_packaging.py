@@ -23,7 +23,7 @@ PACKAGES = (ROOT / "docs" / "reference" / "packages.md").read_text()
 def unit() -> configparser.ConfigParser:
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     parser.optionxform = str  # type: ignore[assignment,method-assign]
-    parser.read(ROOT / "packaging" / "systemd" / "fieldtwin.service")
+    parser.read(ROOT / "packaging" / "systemd" / "fieldtwin@.service")
     return parser
 
 

@@ -11,7 +11,8 @@ from support import run
 from fieldtwin.emulators.endpoints.can.bus_hello import BusHello, unpack_hello
 from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can.software_end import open_can_end
-from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
+from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
+from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError

@@ -12,7 +12,8 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
-from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
+from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
+from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection

@@ -14,7 +14,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.can.bus_hello import FD_VERSION, VERSION, BusHello, Status, unpack_hello
 from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can.software_end import open_can_end
-from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
+from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -14,9 +14,10 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
 from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
-from fieldtwin.twin.thread.core import Effect, IncomingLogs, Keep, NoteLost, Open, OutgoingLog
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
+from fieldtwin.twin.thread.incoming import Effect, IncomingLogs, Keep, NoteLost, Open
 from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
+from fieldtwin.twin.thread.outgoing import OutgoingLog
 from fieldtwin.twin.thread.status import ThreadStatus
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S

@@ -6,7 +6,7 @@ frame stays unfinished. Pure: it takes bytes and ``now`` and returns complete fr
 
 The line also carries requests to and responses from other units. To distinguish them, the receiver tries both lengths. It assumes
 that the first byte of the buffer begins a frame, so later bytes may wait until that frame is complete. If the first byte proves
-to be noise, the receiver tries every following byte (`rtu_hunt`), and only a correct checksum counts.
+to be noise, the receiver tries every following byte (`hunt`), and only a correct checksum counts.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A serial port as a `ByteConnection`, on systems whose ports have descriptors (`serial_threads` is for other systems).
+"""A serial port as a `ByteConnection`, on systems whose ports have descriptors (`threads` is for other systems).
 
-`serial_port` finds, locks and configures the port. Reading and writing are non-blocking operations of the event loop on
+`port` finds, locks and configures the port. Reading and writing are non-blocking operations of the event loop on
 the descriptor, so a port needs no thread and a chunk is delivered when the driver has it.
 
 This module must not know a protocol: no frames, gaps or unit IDs. A frame that arrives in five pieces, because a USB
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, c
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError
 
-with suppress(ImportError):  # Windows: `serial_threads` is used there
+with suppress(ImportError):  # Windows: `threads` is used there
     import termios
 
 DRAIN_LIMIT_S = 1.0

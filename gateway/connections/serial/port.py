@@ -1,7 +1,7 @@
 """Open a serial port. This is the only file of the gateway that imports ``serial``.
 
 pyserial finds, locks and configures the port: it knows the baud rates and peculiarities of each system, including the
-COM ports of Windows. `serial_line` and `serial_threads` transfer the bytes.
+COM ports of Windows. `line` and `threads` transfer the bytes.
 """
 
 from __future__ import annotations

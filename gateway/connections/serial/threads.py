@@ -1,6 +1,6 @@
 """A serial port as a `ByteConnection` on systems whose ports have no descriptors for an event loop: Windows' COM ports.
 
-One thread reads and another writes; both wait in pyserial. Delivery is slower than in `serial_line` by the time that it
+One thread reads and another writes; both wait in pyserial. Delivery is slower than in `line` by the time that it
 takes to wake a thread; otherwise the two are the same. This module must not know a protocol.
 """
 

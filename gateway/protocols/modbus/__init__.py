@@ -1,5 +1,5 @@
-"""The Modbus client: requests, framings, one transaction at a time, and the client around them.
+"""The Modbus client, one transaction at a time, and the gateway's Modbus servers, above requests and framings.
 
-This package handles bytes and is given a clock. It does not know which device, bus or process it serves. Only `pdus` imports
-pymodbus.
+This package handles bytes and is given a clock. It does not know which device, bus or process it serves. Only `requests.pdus`
+imports pymodbus.
 """

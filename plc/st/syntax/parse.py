@@ -45,7 +45,7 @@ def parse(text: str, path: str = "") -> t.SourceUnit:
 
 @cache
 def _parser() -> Lark:
-    grammar = resources.files("fieldtwin.plc.st").joinpath("grammar.lark").read_text(encoding="utf-8")
+    grammar = resources.files("fieldtwin.plc.st.syntax").joinpath("grammar.lark").read_text(encoding="utf-8")
     return Lark(grammar, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII)
 
 

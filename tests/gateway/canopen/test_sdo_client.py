@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from fieldtwin.gateway.protocols.canopen.sdo import abort_codes
 from fieldtwin.gateway.protocols.canopen.sdo.transfers import (
     MAX_STRAYS,
     Done,
@@ -20,6 +19,7 @@ from fieldtwin.gateway.protocols.canopen.sdo.transfers import (
     SendFrame,
     Step,
     Stray,
+    abort_codes,
 )
 
 MS = 1_000_000

@@ -14,7 +14,6 @@ from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.gateway.protocols.modbus.frames.framing import Framer
 from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer, UdpFramer
 from fieldtwin.gateway.protocols.modbus.frames.rtu import MOST_HUNTED, RtuFramer
-from fieldtwin.gateway.protocols.modbus.requests import pdus
 from fieldtwin.gateway.protocols.modbus.requests.data import (
     MaskWriteRegister,
     ReadBits,
@@ -24,6 +23,7 @@ from fieldtwin.gateway.protocols.modbus.requests.data import (
     WriteCoils,
     WriteRegister,
     WriteRegisters,
+    pdus,
 )
 from fieldtwin.gateway.protocols.modbus.requests.diagnostics import (
     Diagnostics,

@@ -13,7 +13,6 @@ from thread_frames_rig import EVENTS, SCHEMA
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.store.event import Event, Kind, merged, without
-from fieldtwin.twin.thread.core import WINDOW, Effect, IncomingLogs, Keep, NoteLost, Open, OutgoingLog
 from fieldtwin.twin.thread.frames import (
     Ack,
     Ask,
@@ -23,6 +22,8 @@ from fieldtwin.twin.thread.frames import (
     Lost,
     Refused,
 )
+from fieldtwin.twin.thread.incoming import Effect, IncomingLogs, Keep, NoteLost, Open
+from fieldtwin.twin.thread.outgoing import WINDOW, OutgoingLog
 
 
 @dataclass

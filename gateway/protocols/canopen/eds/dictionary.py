@@ -1,7 +1,7 @@
 """The object dictionary of a node as its EDS or DCF describes it, in immutable form.
 
 This is the only file of the gateway that imports the `canopen` package, whose reader turns text into objects. That
-reader tolerates few errors and reports no line numbers: `eds_text` repairs the text before, `eds_values` reads the
+reader tolerates few errors and reports no line numbers: `text` repairs the text before, `values` reads the
 values, and errors of the package are translated here. This module does not communicate with a node.
 """
 

@@ -27,7 +27,7 @@ _NUMBER = re.compile(r"^(0x[0-9a-f]+|[0-9]+)$", re.IGNORECASE)
 _TEXT_KEYS = ("ParameterName", "AccessType", "DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
 _MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation", "DownloadFile")
 _VALUE_KEYS = frozenset({"DefaultValue", "ParameterValue", "LowLimit", "HighLimit", "DownloadFile"})
-"""Keys that `eds_values` reads; they are not passed to the `canopen` reader."""
+"""Keys that `values` reads; they are not passed to the `canopen` reader."""
 _NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "CompactSubObj": "0", "NrOfEntries": "0"}
 """Keys that hold a number, and the default for an empty one (CiA 306, 4.6.3.2); no default if the key is required."""
 

@@ -2,7 +2,7 @@
 
 A transfer is a pure object: `start` returns the request, `feed` takes a received frame and returns the next step,
 `expire` ends the transfer when its time is over. It knows no bus, no clock and no other transfer; `late_replies`
-decides which replies may belong to an *earlier* transfer. Block transfers are in `sdo_block`.
+decides which replies may belong to an *earlier* transfer. Block transfers are in `block`.
 
 A frame is not accepted as a reply if it has fewer than 8 bytes (`tolerate_short` pads it: CO-026), a different COB-ID or a
 different multiplexor (index and subindex), or if it is a remote or extended frame. Such strays are counted, do not prolong the

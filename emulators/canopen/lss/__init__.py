@@ -1,0 +1,1 @@
+"""The LSS slave of the emulated node (CiA 305)."""

@@ -1,0 +1,1 @@
+"""Connections that inject faults: streams of bytes, CAN frames, and datagrams."""

@@ -1,0 +1,1 @@
+"""The Modbus functions of a unit, by the data that they access."""

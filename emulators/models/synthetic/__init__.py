@@ -1,0 +1,1 @@
+"""Models of the environment that generate the shipped synthetic recordings."""

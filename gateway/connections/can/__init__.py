@@ -1,0 +1,1 @@
+"""CAN buses: SocketCAN, adapters that python-can knows, and the software bus."""

@@ -1,0 +1,1 @@
+"""Network management: the states of nodes, the commands that change them, and the heartbeats that report them."""

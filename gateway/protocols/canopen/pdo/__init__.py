@@ -1,0 +1,1 @@
+"""Process data: the mapping of objects to PDOs, and the SYNC messages that trigger PDOs."""

@@ -1,0 +1,1 @@
+"""Reading a Structured Text or PLCopen XML file into a tree."""

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """31 units on a serial line at 19200 8N1, 30 of them silent: which share of its polls does the unit that answers keep?
 
-    benchmarks/dead_units.py [--runs 1] [--seconds 150] [--quick]
+    benchmarks/dead_units.py [--runs 1] [--seconds 150] [--quick] [--peers minimalmodbus,modbus_tk=PYTHON] [--json FILE]
 
 A process models the line and the one unit on a pty, in real time: the characters of request and reply, 5 ms of response time,
 silence for all other units. It records the time and unit of each request. Every unit is polled for one register every 500 ms,
@@ -62,30 +62,7 @@ class Idle(Program):
     def execute(self, scan):
         pass
 """
-PEER = """
-import asyncio, logging, sys
-from pymodbus.client import AsyncModbusSerialClient
-from pymodbus.exceptions import ModbusException
-logging.disable(logging.CRITICAL)
-
-async def main(port, units, period_s):
-    client = AsyncModbusSerialClient(port, baudrate=19200, parity="N", timeout=1.0, retries=1)
-    await client.connect()
-    loop = asyncio.get_running_loop()
-    due = loop.time()
-    while True:
-        for unit in range(1, units + 1):
-            try:
-                if not client.connected:
-                    await client.connect()
-                await client.read_holding_registers(0, count=1, device_id=unit)
-            except ModbusException:
-                pass
-        due = max(due + period_s, loop.time())
-        await asyncio.sleep(due - loop.time())
-
-asyncio.run(main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3])))
-"""
+POLLER = Path(__file__).resolve().parents[1] / "scripts/league_programs/dead_line_poller.py"
 
 
 def line_with_one_unit(fd: int, heard: Connection) -> None:
@@ -141,9 +118,9 @@ async def our_polls(port: str, seconds: float) -> None:
             await gateway.end(5.0)
 
 
-async def peer_polls(port: str, seconds: float) -> None:
-    """Let pymodbus poll for this time."""
-    process = await asyncio.create_subprocess_exec(python(), "-c", PEER, port, str(UNITS), str(PERIOD_S))
+async def peer_polls(port: str, seconds: float, library: str, interpreter: str) -> None:
+    """Let a third-party library poll for this time."""
+    process = await asyncio.create_subprocess_exec(interpreter, str(POLLER), library, port, str(UNITS), str(PERIOD_S))
     try:
         await asyncio.sleep(seconds)
         assert process.returncode is None, process.returncode
@@ -162,7 +139,7 @@ def worst_minute(times: list[float], first: float, seconds: float) -> float:
     return min(shares)
 
 
-def measure(name: str, seconds: float) -> tuple[float, float]:
+def measure(name: str, seconds: float, interpreter: str = "") -> tuple[float, float]:
     """Return the share of its polls that the live unit keeps, in its worst minute and in total."""
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -171,12 +148,14 @@ def measure(name: str, seconds: float) -> tuple[float, float]:
     field.start()
     heard: list[tuple[float, int]] = []
     try:
-        polls = our_polls if name == "fieldtwin" else peer_polls
 
         async def listening() -> None:
             loop = asyncio.get_running_loop()
             loop.add_reader(ours.fileno(), lambda: heard.append(ours.recv()))
-            await polls(os.ttyname(slave), seconds + 5.0)
+            if name == "fieldtwin":
+                await our_polls(os.ttyname(slave), seconds + 5.0)
+            else:
+                await peer_polls(os.ttyname(slave), seconds + 5.0, name, interpreter or python())
             loop.remove_reader(ours.fileno())
 
         asyncio.run(listening())
@@ -201,18 +180,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=150.0, help="at least 60")
+    parser.add_argument("--peers", default="", help="further libraries, each with the Python that has it")
+    parser.add_argument("--json", type=Path, help="write the shares to a file")
     parser.add_argument("--quick", action="store_true", help="one run of one minute")
     options = parser.parse_args()
     runs, seconds = (1, WINDOW_S) if options.quick else (options.runs, max(options.seconds, WINDOW_S))
     if find_spec("pymodbus") is None:
         print("pymodbus is not installed: no comparison")
         return 2
-    worst: dict[str, list[float]] = {"fieldtwin": [], "pymodbus": []}
+    peers = dict(peer.partition("=")[::2] for peer in options.peers.split(",") if peer)
+    worst: dict[str, list[float]] = {"fieldtwin": [], "pymodbus": [], **{name: [] for name in peers}}
     whole: dict[str, list[float]] = {name: [] for name in worst}
     before = cpu_ticks()
     for _ in range(runs):
         for name in worst:
-            least, all_of_it = measure(name, seconds)
+            least, all_of_it = measure(name, seconds, peers.get(name, ""))
             worst[name].append(least)
             whole[name].append(all_of_it)
     stolen, spent = (b - a for a, b in zip(before, cpu_ticks(), strict=True))
@@ -220,6 +202,9 @@ def main() -> int:
     for name in worst:
         print(f"  {name:<40} {median(worst[name]):>10.1%} {median(whole[name]):>10.1%}")
     print(f"  {'ratio':<40} {'':>10} {ratio(whole['fieldtwin'], whole['pymodbus']):>10.1f}")
+    if options.json:
+        shares = [{"name": n, "worst_minute": median(worst[n]), "whole": median(whole[n])} for n in worst]
+        options.json.write_bytes(msgspec.json.encode(shares))
     steal = stolen / max(spent, 1)
     print(f"  load {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs, steal {steal:.1%}\n")
     if steal > MOST_STEAL:

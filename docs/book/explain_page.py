@@ -1,4 +1,4 @@
-"""Generate the reference page of everything that `fieldtwin explain` knows: codes, words and test cases, each with an anchor."""
+"""Generate the reference page of the codes and words that `fieldtwin explain` knows. Test cases have separate pages."""
 
 from __future__ import annotations
 
@@ -15,21 +15,25 @@ HEADINGS = {
     "error": "Errors",
     "exit code": "Exit codes",
     "fault": "Faults",
-    "test case": "Test cases",
 }
 
 
 def explain_page() -> str:
-    """Return the page as Markdown. Its anchors are the IDs, such as ``#mb-015a`` and ``#exception-02``."""
+    """Return the page as Markdown. Its anchors are the IDs, such as ``#exit-4`` and ``#exception-02``."""
     parts = [
         "# Codes and words\n",
         "Each entry is what `fieldtwin explain` prints: the meaning, what to do, and the source. Words can be copied from a"
-        " message as they are.\n",
+        " message as they are. [Test cases](cases/README.md) have their own pages.\n",
     ]
-    for kind, entries in groupby(everything(), key=lambda entry: entry.kind):
+    for kind, entries in groupby(described(), key=lambda entry: entry.kind):
         parts.append(f"## {HEADINGS[kind]}\n")
         parts += [_entry(entry) for entry in entries]
     return "\n".join(parts)
+
+
+def described() -> list[Explanation]:
+    """Return the entries of this page."""
+    return [entry for entry in everything() if not entry.page]
 
 
 def anchor(entry: Explanation) -> str:

@@ -24,6 +24,7 @@ from explain_page import explain_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
 from league import league_page  # noqa: E402
 from paper_page import paper_page  # noqa: E402
+from troubleshooting_page import troubleshooting_page  # noqa: E402
 
 PAPERS = {  # file of the repository: page of the book
     "README.md": "readme.md",
@@ -43,7 +44,8 @@ FOLDERS = {"docs/decisions": "decisions/README.md", "docs": "index.md", "example
 FOLDERS |= {f"docs/{kind}": f"{kind}/README.md" for kind in KINDS}
 GENERATED = (
     *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
-    *("reference/explanations.md", "reference/paper.md", "reference/league.md", "reference/cases/README.md"),
+    *("reference/explanations.md", "reference/paper.md", "reference/league.md"),
+    *("reference/cases/README.md", "reference/troubleshooting.md"),
 )
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
@@ -150,6 +152,7 @@ def generated() -> dict[str, str]:
         "reference/explanations.md": explain_page(),
         "reference/paper.md": paper_page(),
         "reference/league.md": league_page(),
+        "reference/troubleshooting.md": troubleshooting_page(),
         **case_pages(),
     }
 

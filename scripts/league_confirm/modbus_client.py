@@ -106,7 +106,7 @@ REFUSE: dict[str, tuple[int, Callable[[Request], list[Step]]]] = {
     "MB-007": (3, lambda q: [q.frame(poison(q), unit=q.unit + 1) + q.frame(q.values(FIRST))]),
     "MB-011": (3, lambda q: [bytes((q.unit, q.pdu[0] ^ 0x40)) + q.frame(q.pdu)[2:]]),
     "MB-013": (1, lambda q: [1.5 * TIMEOUT_S, q.frame(poison(q))]),
-    "MB-014": (3, lambda q: [q.frame(q.values(FIRST)) + q.frame(poison(q))]),
+    "MB-014": (3, lambda q: [q.frame(q.values(FIRST)), 0.003, q.frame(poison(q))]),
     "MB-015a": (3, lambda q: [q.frame(poison(q), unit=q.unit + 1)]),
     "MB-016": (3, lambda q: [odd_function(q)]),
     "MB-017a": (3, lambda q: [q.frame(poison(q, -1))]),

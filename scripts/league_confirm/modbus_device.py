@@ -209,13 +209,11 @@ def after_unknown(wire: Wire) -> str:
 
 
 def high_function(wire: Wire) -> str:
-    heard = [wire.ask(bytes((0x53 | 0x80, 0, 0))) for _ in range(2)]
-    allowed = (None, bytes((0xD3, 1)))
-    return (
-        ""
-        if heard[0] == heard[1] and heard[0] in allowed
-        else f"answers {[h.hex(' ') if h else 'silence' for h in heard]}"
-    )
+    heard = [wire.ask(bytes((0x83, 0, 0, 0, 1))) for _ in range(2)]
+    if not wire.ask(READ):
+        return "it does not answer the next request"
+    said = [h.hex(" ") if h else "silence" for h in heard]
+    return "" if heard[0] == heard[1] and heard[0] in (None, bytes((0x83, 1))) else f"answers {', '.join(said)}"
 
 
 def broadcast_write(wire: Wire) -> str:

@@ -6,6 +6,7 @@ emulated parts are dashed. Pure: facts in, text out.
 
 from __future__ import annotations
 
+from fieldtwin.reports.drawing.themes import themed
 from fieldtwin.reports.drawing.wiring import DrawnBus, Station, Wiring
 from fieldtwin.reports.markup import Child, Markup, el
 
@@ -19,19 +20,23 @@ LONGEST = 44
 WIRE, LOGIC = 90, 34
 """The maximum length of a text in a device's box, next to a bus, in the controller. A tooltip shows the whole text."""
 
-STYLE = Markup("""
-svg.wires { font: 12px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace;
-  --ground: #fff; --ink: #17233a; --soft: #55627a; --box: #f3f6fb; --edge: #9fb0cb; --logic: #fff8e8; --logic-edge: #d1b06b;
-  --line: #2b5597; --emulated: #a8500f }
-@media (prefers-color-scheme: dark) { svg.wires {
-  --ground: #14181f; --ink: #e8edf6; --soft: #a3b0c5; --box: #1f2733; --edge: #4b5d7b; --logic: #2c2718; --logic-edge: #85713b;
-  --line: #7fb0f5; --emulated: #f0a763 } }
+LIGHT = {
+    "ground": "#fff", "ink": "#17233a", "soft": "#55627a", "box": "#f3f6fb", "edge": "#9fb0cb", "logic": "#fff8e8",
+    "logic-edge": "#d1b06b", "line": "#2b5597", "emulated": "#a8500f",
+}  # fmt: skip
+DARK = {
+    "ground": "#14181f", "ink": "#e8edf6", "soft": "#a3b0c5", "box": "#1f2733", "edge": "#4b5d7b", "logic": "#2c2718",
+    "logic-edge": "#85713b", "line": "#7fb0f5", "emulated": "#f0a763",
+}  # fmt: skip
+RULES = """
+svg.wires { font: 12px "DejaVu Sans Mono", ui-monospace, SFMono-Regular, Menlo, Consolas, monospace }
 .ground { fill: var(--ground) } text { fill: var(--ink); white-space: pre } .name { font-weight: 600 } .soft { fill: var(--soft) }
 .box { fill: var(--box); stroke: var(--edge) } .logic { fill: var(--logic); stroke: var(--logic-edge) }
 .line { fill: none; stroke: var(--line); stroke-width: 2.5 } .port { fill: var(--line) }
 .emulated { stroke: var(--emulated); stroke-dasharray: 6 4 } .says { fill: var(--emulated) }
 .halo { stroke: var(--ground); stroke-width: 5; paint-order: stroke }
-""")
+"""
+STYLE = Markup(f"\n{themed(RULES, LIGHT, DARK)}\n")
 
 
 def svg(wires: Wiring) -> str:

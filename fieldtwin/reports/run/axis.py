@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.reports.markup import Markup, el
 
-WIDTH = 1180.0
+WIDTH = 900.0
 LEFT = 176.0
 RIGHT = 14.0
 CHAR = 6.3

@@ -17,7 +17,9 @@ _NAME = re.compile(r"var\(--([\w-]+)\)")
 def themed(rules: str, light: Mapping[str, str], dark: Mapping[str, str]) -> str:
     """Return `rules` with each `var(--name)` as the colour in `light`, and in a media query as the colour in `dark`.
 
-    A colour with an opacity (`#rrggbbaa`) becomes two declarations. `rules` is CSS without nested blocks. Raises KeyError for a name without a colour.
+    A colour with an opacity (`#rrggbbaa`) becomes two declarations. `rules` is CSS without nested blocks.
+
+    Raises KeyError for a name without a colour.
     """
     plain, other = [], []
     for match in _RULE.finditer(rules):

@@ -20,6 +20,7 @@ from fieldtwin.cli.broken_pipe import VERDICTS, survive_broken_stderr, survive_b
 from fieldtwin.gateway.core.files.nearest import nearest
 
 COMMANDS = {
+    "new": ("fieldtwin.cli.system.new_command", "Write a working site into a new folder."),
     "run": ("fieldtwin.cli.run.run_command", "Run a system: the plant, or its prototype."),
     "simulate": (
         "fieldtwin.cli.run.simulate_command",
@@ -118,7 +119,7 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("run", "simulate", "reload", "emulate", "with", "plc"),
+        *("new", "run", "simulate", "reload", "emulate", "with", "plc"),
         *("topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (

@@ -219,7 +219,8 @@ class FieldSimulator:
         if profile.sampled is None:
             replay, unit_id = self._replay(emulated)
             return recorded_device(profile, kind, replay, unit_id, form.identity, config.name)
-        return sampled_device(profile, kind, self._signals(emulated), form.identity, config.name)
+        period_s = int(form.values.get(profile.sampled.period, 0))
+        return sampled_device(profile, kind, self._signals(emulated), form.identity, config.name, period_s)
 
     def _modem(self, config: DeviceConfig, emulated: EmulatedDevice) -> MailboxModem:
         """Return a transmitter: in a network's acoustic channel, or with its own far modem and link."""

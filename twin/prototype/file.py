@@ -293,6 +293,15 @@ def _check_stated(
             )
     if form.busy is not None and profile.protocol != "modbus":
         raise file.error((*loc, "busy"), "no key of this protocol", expected="a Modbus device")
+    if profile.sampled is not None:
+        period = profile.sampled.period
+        for tag, value in form.values.items():
+            if tag != period or not isinstance(value, int) or isinstance(value, bool):
+                expected = (
+                    f"only `{period}: SECONDS`, a whole number; signals give the other values of a sensor that samples"
+                )
+                errors.add(file.error((*loc, "values", tag), "a value of a register", expected=expected))
+        return
     if form.values and ((form.model != "profile" and form.simulation is None) or profile.protocol != "modbus"):
         expected = "`model: profile` or a simulation, of a Modbus device"
         raise file.error((*loc, "values"), "values of registers", expected=expected)

@@ -9,6 +9,7 @@ from pathlib import Path
 from random import Random
 
 from fieldtwin.emulators.journal import DeviceValueLog
+from fieldtwin.emulators.models.sampled_sensor import sampled_tags
 from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
 from fieldtwin.emulators.simulation.inputs import number_of
 from fieldtwin.emulators.simulation.python_model import PythonModel
@@ -158,6 +159,15 @@ class Simulations:
                 expected="`plays: {TAG: NAME}`",
                 got=", ".join(simulation.names),
             )
+        if profile.sampled is not None:
+            missing = [tag.name for tag in sampled_tags(profile, form.identity) if tag.name not in plays]
+            if missing:
+                raise self._file.error(
+                    ("devices", device, "simulation"),
+                    f"{form.simulation!r} does not compute every value that {device} samples",
+                    expected=f"also {', '.join(missing)}",
+                    got=", ".join(plays),
+                )
         return SimulatedSignals(simulation, plays, self._file.path)
 
     def connect(self, journals: Mapping[str, DeviceValueLog]) -> None:

@@ -367,7 +367,7 @@ def _as_text(formula: object) -> object:
     return repr(formula) if isinstance(formula, int | float) and not isinstance(formula, bool) else formula
 
 
-Formula = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | int | float | bool)]
+Formula = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | int | float)]
 
 
 class SimulationForm(SiteModel):

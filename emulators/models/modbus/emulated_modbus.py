@@ -78,10 +78,18 @@ def register_device(
 
 
 def sampled_device(
-    profile: DeviceProfile, kind: ConnectionKind, signals: Signals, identity: Mapping[str, str], name: str = ""
+    profile: DeviceProfile,
+    kind: ConnectionKind,
+    signals: Signals,
+    identity: Mapping[str, str],
+    name: str = "",
+    period_s: int = 0,
 ) -> EmulatedModbus:
-    """Return a sensor that samples `signals` and puts its samples into a queue for its client."""
-    bank = SampledSensor(profile, signals, identity)
+    """Return a sensor that samples `signals` and puts its samples into a queue for its client.
+
+    `period_s` is its first sampling period in seconds; with 0 it waits for a client to write one.
+    """
+    bank = SampledSensor(profile, signals, identity, period_s)
     seen = DistortedRegisters(bank, bank.peek, profile, bank.journal, bank.own_tags, bank.distortions)
     return EmulatedModbus(_unit(profile, kind, seen, signals, name), bank.journal, bank.distortions)
 

@@ -1,15 +1,16 @@
 """A sensor that takes samples: its registers come from a profile, its values from recorded signals.
 
-After a client has written a period in seconds into the tag that the profile names, a sample is taken every period, the first one
-immediately. A period of 0 is standby, a negative one is off. A sample holds the values of all signals of the recording at one
-instant of the emulator's clock; the `instrument_time` register holds this instant in milliseconds if the profile has such a
-register. The sensor is a function of time: nothing here waits, and samples that are due are taken at the next access.
+The sensor takes a sample every period, the first one immediately. The period in seconds is the one that a client has written into
+the tag that the profile names, or the sensor has it from the beginning. A period of 0 is standby, a negative one is off. A sample
+holds the values of all signals of the recording at one instant of the emulator's clock; the `instrument_time` register holds this
+instant in milliseconds if the profile has such a register. The sensor is a function of time: nothing here waits, and samples that
+are due are taken at the next access.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from fieldtwin.emulators.codec import decode, encode
 from fieldtwin.emulators.distortion import Distortions
@@ -29,10 +30,20 @@ OWN = ("status", "instrument_time")
 """Tags that the model fills itself, besides the sample counter and the period."""
 
 
-class SampledSensor(RegisterBank):
-    """The register bank of a sampling sensor. `identity` gives text tags their values (a serial number)."""
+def sampled_tags(profile: DeviceProfile, identity: Iterable[str]) -> list[Tag]:
+    """Return the tags whose values a sampling sensor takes from signals: its numbers, except those that it fills itself."""
+    assert profile.sampled is not None
+    own = {*OWN, profile.sampled.period, profile.sampled.count, *identity}
+    return [t for t in profile.tags.values() if t.name not in own and not t.is_text]
 
-    def __init__(self, profile: DeviceProfile, player: Signals, identity: Mapping[str, str]) -> None:
+
+class SampledSensor(RegisterBank):
+    """The register bank of a sampling sensor. `identity` gives text tags their values (a serial number).
+
+    `period_s` is the sampling period that it has at first, in seconds.
+    """
+
+    def __init__(self, profile: DeviceProfile, player: Signals, identity: Mapping[str, str], period_s: int = 0) -> None:
         if profile.sampled is None:
             raise FileInvalid("the profile has no `sampled`", path=profile.path, expected="`sampled:`")
         self.journal = DeviceValueLog()
@@ -43,8 +54,7 @@ class SampledSensor(RegisterBank):
         self._tags = profile.tags
         self._period_tag = profile.tags[profile.sampled.period]
         self._count_tag = profile.tags[profile.sampled.count]
-        own = {*OWN, profile.sampled.period, profile.sampled.count, *identity}
-        self._signals = [t for t in profile.tags.values() if t.name not in own and not t.is_text]
+        self._signals = sampled_tags(profile, identity)
         for tag in self._signals:
             player.at(player.start_ns, tag.name)  # refuse a recording that lacks a signal of the device
         self._cells = MapBank(_spans(profile), self._on_write)
@@ -59,6 +69,9 @@ class SampledSensor(RegisterBank):
         for tag in profile.tags.values():  # a text without an identity is empty, and is read as such
             if tag.is_text and tag.readable and tag.name not in identity:
                 self._note(tag, player.start_ns)
+        if period_s:
+            self._put(self._period_tag, period_s, player.start_ns)
+            self._set_period(period_s, player.start_ns)
 
     @staticmethod
     def _tag(name: str, profile: DeviceProfile) -> Tag:

@@ -24,6 +24,7 @@ from fieldtwin.commissioning.scan.canopen import ALL_NODES, CanScanner, CanScanO
 from fieldtwin.commissioning.scan.modbus import FoundUnit, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import with_settings
 from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, WireError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.new_site.devices import is_shipped
 from fieldtwin.new_site.wishes import DeviceWish
@@ -87,7 +88,11 @@ async def _add_unit(
         _take(found, f"unit {address}", url, address, best, names)
         return
     name = f"unit_{address}"
-    text = await draft(url, address, name, words)
+    try:
+        text = await draft(url, address, name, words)
+    except (FileInvalid, WireError, Unreachable) as e:
+        found.remarks.append(f"unit {address}: no profile fits, and no draft is possible, so it is left out ({e})")
+        return
     found.devices.append(DeviceWish(name, name, url, address, text))
     found.remarks.append(
         f"unit {address}: no profile fits; profiles/{name}.yaml is a draft of input and holding registers 0 to 499, "

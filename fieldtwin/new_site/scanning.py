@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fieldtwin.commissioning.access.progress import Progress
-from fieldtwin.commissioning.access.reading import Target
-from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.access.progress import PhaseProgress
+from fieldtwin.commissioning.access.reading import DeviceTarget
+from fieldtwin.commissioning.dump.dump import DumpJob
 from fieldtwin.commissioning.dump.file import load_dump
 from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.commissioning.identify.canopen import identify_canopen
@@ -50,7 +50,7 @@ async def scan_endpoint(
     known: Iterable[DeviceProfile],
     *,
     words: str,
-    on_progress: Callable[[Progress], None] = lambda _: None,
+    on_progress: Callable[[PhaseProgress], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Scanned:
     """Scan `url`, identify each device, and draft a profile for a Modbus unit that no profile fits.
@@ -102,8 +102,8 @@ async def _add_unit(
 
 async def draft(url: str, address: int, name: str, words: str) -> str:
     """Return the text of a draft profile, from several passes over the first registers of a Modbus unit."""
-    job = Job(
-        Target(url, address, timeout_s=IDENTIFY_TIMEOUT_S),
+    job = DumpJob(
+        DeviceTarget(url, address, timeout_s=IDENTIFY_TIMEOUT_S),
         spans=register_spans(DRAFT_RANGES),
         passes=DRAFT_PASSES,
         every_s=DRAFT_EVERY_S,

@@ -1,4 +1,4 @@
-"""`fieldtwin new` as a process: questions on a terminal, interruptions, scans of emulated devices, and real-time runs of the result."""
+"""`fieldtwin new` as a process: questions on a terminal, interruptions, scans of emulated devices, real-time runs."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def site_devices(wishes: Iterable[DeviceWish], profiles: tuple[Path, ...] = ()) 
 
 
 def _with_names(wishes: list[DeviceWish]) -> list[DeviceWish]:
-    """Give every device a name of its own: the user's, or one made of the profile's name, with a number if needed."""
+    """Give every device a unique name: the user's, or one made of the profile's name, with a number if needed."""
     used: set[str] = set()
     for wish in wishes:
         if wish.name in used:

@@ -89,7 +89,7 @@ def limits_of(profile: DeviceProfile, tag: Tag) -> Limits:
 
 
 def commanded(profile: DeviceProfile, watched: Tag | None) -> Output | None:
-    """Return the output that a program may command without knowledge of the process; None if there is none.
+    """Return the output that a program may command without knowledge of the process; None if the device has no such tag.
 
     That is the sampling period of a sensor that samples, or the first setpoint that is polled, has a range and is not marked as
     dangerous, of a device whose watched value is measured.

@@ -79,12 +79,12 @@ class Terminal:
                 os.read(self._main, 4096)
             except OSError:
                 break
-        os.close(self._main)
         try:
             return self.process.wait(PATIENCE_S)
         finally:
             self.process.kill()
             self.process.wait()
+            os.close(self._main)
 
 
 def test_questions_on_a_terminal(tmp_path: Path) -> None:

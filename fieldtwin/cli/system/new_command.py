@@ -93,6 +93,10 @@ def command(folder: Path, devices: DeviceChoices, parts: FileChoices, profiles: 
     wishes = [parse_device(text) for text in devices.devices]
     for text in devices.scans:
         wishes += _scanned(text, profiles, asking)
+    if devices.scans and not wishes:
+        raise Unreachable(
+            "the scan found no device for the new site", hint="fieldtwin infer drafts a profile from a dump"
+        )
     if asking and not wishes:
         wishes = _ask_for_devices(profiles)
     chosen = site_devices(wishes, profiles)
@@ -177,8 +181,6 @@ def _scanned(text: str, profiles: tuple[Path, ...], asking: bool) -> list[Device
         _say(remark)
     if found.stopped and not (asking and click.confirm("The scan is not complete. Go on?", default=False, err=True)):
         raise click.Abort
-    if not found.devices:
-        raise Unreachable(
-            "the scan found no device that a profile fits", where=url, hint="fieldtwin scan shows the replies"
-        )
+    if not (found.devices or found.remarks):
+        raise Unreachable("the scan found no device", where=url, hint="fieldtwin scan shows the replies")
     return found.devices

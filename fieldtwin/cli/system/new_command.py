@@ -157,7 +157,7 @@ def _ask_for_devices(profiles: tuple[Path, ...]) -> list[DeviceWish]:
 
 
 def _scanned(text: str, profiles: tuple[Path, ...], asking: bool) -> list[DeviceWish]:
-    """Return the devices at ``ENDPOINT[#LIST]``. Raises `Unreachable` if there is none."""
+    """Return the devices at ``ENDPOINT[#LIST]``. Raises `Unreachable` if nothing answers."""
     from fieldtwin.cli.device.identify_command import known_profiles
     from fieldtwin.cli.device.scan_command import numbers
     from fieldtwin.cli.device.scan_progress import ScanProgress

@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
-from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.new_site.limits import NEVER_POLLED, Limits, Output, commanded, limits_of, supervised
 from fieldtwin.new_site.wishes import EXAMPLE, LONGEST_NAME, MOST_DEVICES, DeviceWish, name_from
 from fieldtwin.twin.site.data_files import data_root, find

@@ -15,7 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from fieldtwin import installation
 from fieldtwin.__about__ import __version__
-from fieldtwin.emulators.models.sampled_sensor import sampled_tags
+from fieldtwin.emulators.models.modbus.sampled_sensor import sampled_tags
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.new_site.devices import TEMPLATES, SiteBus, SiteDevice

@@ -9,7 +9,7 @@ from pathlib import Path
 from random import Random
 
 from fieldtwin.emulators.journal import DeviceValueLog
-from fieldtwin.emulators.models.sampled_sensor import sampled_tags
+from fieldtwin.emulators.models.modbus.sampled_sensor import sampled_tags
 from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
 from fieldtwin.emulators.simulation.inputs import number_of
 from fieldtwin.emulators.simulation.python_model import PythonModel

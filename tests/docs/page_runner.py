@@ -80,7 +80,7 @@ def agrees(shown: str, seen: str, numbers: bool = False) -> bool:
 
 
 def _without_numbers(text: str) -> str:
-    return re.sub(r" +", " ", re.sub(r"\d+(?:\.\d+)?(?:e-?\d+)?", "0", text.replace("-0", " 0")))
+    return re.sub(r" +", " ", re.sub(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", "0", text))
 
 
 def _bare(text: str) -> str:

@@ -125,3 +125,12 @@ def test_python_of_the_pages_compiles_and_imports_existing_names():
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ours:
                 module = import_module(node.module)
                 assert all(hasattr(module, name.name) for name in node.names), f"{page}: {ast.unparse(node)}"
+
+
+def test_compose_files_of_the_pages_use_existing_options():
+    files = [(page, found) for page, body in fences("yaml") if "services" in (found := yaml.safe_load(body))]
+    assert {page for page, _ in files} >= {"docs/tutorials/pump-station.md", "docs/tutorials/own-controller.md"}
+    for page, found in files:
+        for service in found["services"].values():
+            if str(service.get("image", "")).startswith("fieldtwin:"):
+                assert unknown(["fieldtwin", *service["command"]]) == "", page

@@ -540,8 +540,15 @@ def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
     for key, code, said in stated:
         if said and allowed is not None and code not in allowed:
             raise file.error((key,), f"function {code:02X}h is not in `limits: functions`", expected=str(code))
-    if form.identification and not {0, 1, 2} <= form.identification.keys():
-        raise file.error(("identification",), "vendor, product code and revision", expected="objects 0, 1 and 2")
+    basic = {0: "0 (vendor)", 1: "1 (product code)", 2: "2 (revision)"}
+    if form.identification and (
+        missing := [name for number, name in basic.items() if number not in form.identification]
+    ):
+        raise file.error(
+            ("identification",),
+            f"`identification` has no {' and no '.join(missing)}",
+            expected="the texts of the objects 0, 1 and 2, which every device with function 2Bh/0Eh has",
+        )
 
 
 def _check_references(file: YamlFile, p: DeviceProfile) -> None:

@@ -138,3 +138,13 @@ def test_the_hash_depends_on_the_content_and_not_on_the_notation() -> None:
     styled = read("# a comment\nprotocol: modbus\ntags:\n  a:\n    at: 40001\n")
     other = read("protocol: modbus\ntags:\n  a: {at: 40002}\n")
     assert plain.hash == styled.hash != other.hash
+
+
+def test_an_identification_names_the_text_that_it_lacks() -> None:
+    with pytest.raises(FileInvalid, match=r"p\.yaml:4:1: `identification` has no 2 \(revision\)"):
+        read("protocol: modbus\nidentification: {0: Example, 1: FM-300}\ntags: {a: {at: 30001}}\n")
+
+
+def test_an_address_that_is_no_address_is_refused_with_the_forms_of_a_coil_too() -> None:
+    with pytest.raises(FileInvalid, match=r"00001 \(coil\).*coil:0"):
+        read("protocol: modbus\ntags: {a: {at: 1, type: bool}}\n")

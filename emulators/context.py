@@ -120,7 +120,7 @@ class VirtualContext:
         self.taken = 0
         self.dropped = 0
         self._left = 0
-        self._held = 0  # the remaining recordings that were added one by one; their number is limited
+        self._held = 0  # number of recordings from `add` that were not replayed yet; at most `max_entries`
         self._fixed = commands is not None
         self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
         self._order: deque[_Series] = deque()  # one entry for each added recording that is not known to be gone

@@ -69,7 +69,7 @@ class FaultFrame:
 
     @property
     def spared(self) -> bool:
-        """Return whether no fault may strike the frame."""
+        """Return whether faults must leave the frame unchanged."""
         return (
             self.framing is Framing.MQTT
             and self.data != b""

@@ -24,7 +24,7 @@ def check_link(spec: FaultSpec) -> None:
 
 
 def check_can_link(spec: FaultSpec) -> None:
-    """Do the same as `check_link` for a link between two CAN buses."""
+    """Raise `WrongAim` for a fault that a link between two CAN buses cannot inject."""
     _check_kind(spec, InjectionPoint.CAN, "one of a CAN bus")
     _check_names(spec, "unit, cob_id, index")
     if issubclass(spec.kind, BusFault):

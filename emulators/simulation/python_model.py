@@ -39,7 +39,7 @@ class PythonModel:
 
     def __init__(self, path: Path, name: str, start: Mapping[str, float]) -> None:
         self.where = f"{path}:{name}"
-        self._file = str(path.absolute())  # as in a traceback
+        self._file = str(path.absolute())  # the form in which a traceback names the file
         module = _load(path)
         made = getattr(module, name, None)
         if not isinstance(made, type) or not callable(getattr(made, "step", None)):

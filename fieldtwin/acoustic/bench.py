@@ -95,7 +95,7 @@ class NetworkBench:
         return next(iter(self.parts.values())).bench.now_s()
 
     async def sleep_until_s(self, t_s: float) -> None:
-        for part in self.parts.values():  # after the first, the others no longer wait but read at once
+        for part in self.parts.values():  # the first call waits; the others return at once
             await part.bench.sleep_until_s(t_s - part.trace.offset_ns / NS_PER_S)
 
     def names(self) -> list[str]:

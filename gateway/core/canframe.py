@@ -67,7 +67,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
             self._check_fd()
             return
         if 0 <= self.can_id <= 0x7FF and length <= 8 and self.dlc <= 8:
-            return  # valid with any flags
+            return  # a short standard identifier is valid for data, remote and error frames alike
         limit = 0x1FFFFFFF if self.extended or self.error else 0x7FF
         if not 0 <= self.can_id <= limit or len(self.data) > 8 or self.dlc > 8:
             raise Desync(

@@ -134,7 +134,7 @@ def test_a_column_can_be_chosen(tmp_path: Path) -> None:
         import_cnv(path, out, columns={"salinity": "sal00"})
 
 
-def test_missing_columns_are_named_with_those_that_are_there(tmp_path: Path) -> None:
+def test_missing_columns_are_named_with_the_existing_ones(tmp_path: Path) -> None:
     path = write(tmp_path, cnv(("depSM: Depth", "t090C: Temperature", "sal00: Salinity")))
     with pytest.raises(FileInvalid) as caught:
         import_cnv(path, tmp_path / "out.jsonl")

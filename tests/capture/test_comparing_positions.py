@@ -121,7 +121,7 @@ def test_a_frozen_device_is_never_met(value: int) -> None:
         (40, 50, 60, 60, 60, 61),
     ],
 )
-def test_another_dialogue_is_a_difference(values: tuple[int, ...]) -> None:
+def test_a_different_sequence_of_requests_is_a_difference(values: tuple[int, ...]) -> None:
     left = iter(values)
     result = compared(RAMP, lambda unit, pdu: registers(7, next(left)))
     assert (result.met, result.inconclusive) == (False, False)

@@ -276,7 +276,7 @@ def size(text: str) -> int:
     return int(last or first) - int(first) + 1
 
 
-def test_a_wrong_size_is_a_hint_and_no_more() -> None:
+def test_a_wrong_size_is_only_a_hint() -> None:
     sweep = Sweep(RegisterRange("holding", 0, 16))
     part = sweep.asking()
     next(part)

@@ -136,7 +136,7 @@ def test_rtu_over_tcp_is_scanned_as_a_line_is() -> None:
     run_virtually(main())
 
 
-def test_a_real_server_of_ours_is_found() -> None:
+def test_a_real_fieldtwin_server_is_found() -> None:
     async def main() -> None:
         device = unit(bank([CellSpan("holding", 0, 4)]))
         host = Host(lambda u: device.respond(b"\x03\x00\x00\x00\x01", 0) if u == 5 else b"\x83\x0b")

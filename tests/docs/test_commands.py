@@ -85,7 +85,7 @@ def unknown(words: list[str]) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_commands_of_a_page_are_there(page):
+def test_every_command_on_a_page_exists(page):
     wrong = [f"{' '.join(words)}: {why}" for words in shown(page.read_text("utf-8")) if (why := unknown(words))]
     wrong = [line for line in wrong if not line.startswith(MISSPELT)]
     assert not wrong, "\n".join(wrong)

@@ -76,7 +76,7 @@ def test_a_page_that_installs_in_another_way_is_refused(release: ModuleType, che
     assert wrong.startswith("README.md:1:")
 
 
-def test_what_is_left_to_do_is_named(release: ModuleType, checkout: Path) -> None:
+def test_remaining_release_steps_are_named(release: ModuleType, checkout: Path) -> None:
     git(checkout, "tag", "-d", "v0.1.0")
     (checkout / "CHANGELOG.md").write_text("# Changelog\n\n## 0.1.0 (unreleased)\n")
     tag, changes, date = release.unfinished(checkout)

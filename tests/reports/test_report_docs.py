@@ -29,7 +29,7 @@ def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert "the sensor is quick" in Path("report.xml").read_text(encoding="utf-8")
 
 
-def test_the_options_of_the_page_are_there() -> None:
+def test_every_option_on_the_page_exists() -> None:
     from fieldtwin.cli.recordings.trace_command import command
 
     options = {o for p in command.params for o in p.opts}

@@ -144,7 +144,7 @@ def test_a_run_as_waveforms(tmp_path: Path) -> None:
     assert word(found["line1.problem"][1][1]) == "ctd no reply"
 
 
-def test_names_that_no_viewer_takes(tmp_path: Path) -> None:
+def test_names_that_waveform_viewers_reject_are_replaced(tmp_path: Path) -> None:
     events = [
         note(0, TraceKind.TAG, "a b.c-d", value=1, quality="good"), note(0, TraceKind.TAG, "a b.c+d", value=2, quality="good"),
         note(1, TraceKind.TAG, "a b.c-d", value="off", quality="bad"),

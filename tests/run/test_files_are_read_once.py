@@ -62,7 +62,7 @@ def test_files_that_change_while_a_run_starts_do_not_matter(tmp_path: Path, monk
     assert [fault["name"] for fault in summary["faults"]] == ["delay"]
 
 
-def test_what_is_handed_over_is_equal_and_readable_for_its_owner_only(tmp_path: Path) -> None:
+def test_the_files_handed_over_are_equal_and_readable_for_their_owner_only(tmp_path: Path) -> None:
     system = load_system("observatory")
     prototype = load_prototype(system)
     path = write_resolved(tmp_path / "prototype.pickle", system, prototype)

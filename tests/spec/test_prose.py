@@ -130,7 +130,7 @@ def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp
     assert [path for _, path in ended.opened if path.name.endswith(".prototype.yaml")] == []
 
 
-def test_prose_2_what_is_emulated_is_known_to_the_field_side_alone(standby: Ended) -> None:
+def test_prose_2_only_the_field_simulator_knows_what_is_emulated(standby: Ended) -> None:
     """The run reads the prototype file and hands it to the simulated devices; gateway and PLC get nothing of it."""
     assert "observatory.prototype.yaml" in {path.name for _, path in standby.opened}
     for module in ("fieldtwin.twin.plant.controller", "fieldtwin.plc"):

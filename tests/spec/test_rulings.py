@@ -75,7 +75,7 @@ def test_ChangeBehavior_of_several_commands_sends_all_of_them_in_the_profiles_or
     assert not driver.consumer.queue, "none, although the first of them could be sent"
 
 
-def test_ChangeBehavior_is_what_somebody_at_the_device_writes_by_name() -> None:
+def test_ChangeBehavior_is_a_write_by_name_at_the_device() -> None:
     """Ruling 14: the same map, and the same request on the wire."""
 
     def frames(*arguments: str) -> str:

@@ -125,7 +125,7 @@ def test_ControlLogic_sendRsp_drains_the_sensor_queue_and_emits_payloads_unalter
 
 
 @given(bits=st.binary(max_size=5).filter(lambda b: len(b) != 2))
-def test_ControlLogic_what_is_no_command_changes_nothing(bits: bytes) -> None:
+def test_ControlLogic_data_that_is_not_a_command_changes_nothing(bits: bytes) -> None:
     """Ruling 11: a case that the paper omits gives a typed error, here a count and an entry in the log."""
     ears = Ears()
     ears.send(3)

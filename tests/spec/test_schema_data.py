@@ -15,7 +15,7 @@ KINDS = (DATA, COMMAND, RESPONSE, MEASUREMENT, STATUS, RECORDING)
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(bits=st.binary(max_size=16))
-def test_DATA_is_a_bit_sequence_that_nobody_can_change(kind: type[DATA], bits: bytes) -> None:
+def test_DATA_is_an_immutable_bit_sequence(kind: type[DATA], bits: bytes) -> None:
     made = kind(bits)
     assert made.data == bits
     assert made == kind(bytes(bits))

@@ -105,7 +105,7 @@ def test_Device_Receive_is_Read_ExecuteCommand_Send_with_one_response_per_comman
             nothing_left.read()
 
 
-def test_Device_Receive_of_what_is_no_command_answers_nothing() -> None:
+def test_Device_Receive_of_data_that_is_not_a_command_answers_nothing() -> None:
     """Ruling 11: the wire then carries the protocol's own answer, made by the unit and not by the device."""
     device, drivers_end, _ = ctd_device()
     drivers_end.write(NO_COMMAND)
@@ -170,7 +170,7 @@ def test_Transmitter_result_of_a_command_is_a_RESPONSE(tmp_path: Path) -> None:
     run(main())
 
 
-def test_Transmitter_is_told_by_its_mailbox() -> None:
+def test_Transmitter_is_recognised_by_its_mailbox() -> None:
     assert emulator_kind(PROTOCOL.TCP, MODEM) is TransmitterEmulator
     assert emulator_kind(PROTOCOL.RS232, CTD) is SensorEmulator
     assert emulator_kind(PROTOCOL.TCP, CTD) is UnitEmulator

@@ -85,7 +85,7 @@ def test_Monitor_handleMeasurements_emits_each_and_leaves_the_model(numbers: lis
 
 
 @pytest.mark.parametrize("data", [b"", b"\7\0\1", b"\0\0\1\0"])
-def test_Monitor_a_status_that_is_none_changes_nothing_and_is_told(data: bytes) -> None:
+def test_Monitor_reports_an_invalid_status_that_changes_nothing(data: bytes) -> None:
     rig = Rig()
     rig.give(status(5))
     (told,) = rig.give(Event(2, NOW_MS, Kind.STATE, "relay", data))
@@ -110,7 +110,7 @@ def test_Analyze_every_status_has_its_own_verdict_against_the_model_as_it_was_th
     assert [v.finding for v in told] == ["agree", "agree", "mismatch", "agree"]
 
 
-def test_Analyze_says_what_is_outside_of_the_model_bad_or_stale_once_and_when_it_is_over() -> None:
+def test_Analyze_reports_once_each_that_a_value_is_outside_of_the_model_bad_or_stale_and_that_it_recovered() -> None:
     rig = Rig()
     assert rig.give(value(50.0)) == []
     assert [v.finding for v in rig.give(value(150.0), value(151.0))] == ["outside"]

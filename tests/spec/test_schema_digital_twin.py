@@ -194,7 +194,7 @@ def test_Execute_is_bounded_in_rate() -> None:
     assert execute.sent == 3
 
 
-def test_Execute_asks_a_prototype_when_it_was_told_to_and_sends_nothing_without_its_answer() -> None:
+def test_Execute_asks_a_prototype_if_configured_and_sends_nothing_without_its_answer() -> None:
     rig = Rig(what_if=(prototype := Prototype()))
     assert rig.give(value(150.0)) == []
     assert rig.give() == [], "no answer yet"

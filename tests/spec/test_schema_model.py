@@ -76,7 +76,7 @@ def test_EventStateMachine_ProcessEvent_depends_on_the_sign_alone_from_every_sta
 
 
 @given(bits=st.binary(max_size=5).filter(lambda b: len(b) != 2), x=PERIODS)
-def test_EventStateMachine_what_is_no_command_changes_nothing(bits: bytes, x: int) -> None:
+def test_EventStateMachine_data_that_is_not_a_command_changes_nothing(bits: bytes, x: int) -> None:
     machine = EventStateMachine()
     machine.process_event(encode_period(x))
     with pytest.raises(Desync):

@@ -129,7 +129,7 @@ def test_a_bus_that_ends_ends_the_link() -> None:
         (CanFrame(0x605, bytes(8), extended=True), 0),
     ],
 )
-def test_whose_frame_it_is(frame: CanFrame, node: int) -> None:
+def test_a_frame_belongs_to_the_node_of_its_can_id(frame: CanFrame, node: int) -> None:
     assert node_of(frame) == node
 
 

@@ -95,7 +95,7 @@ async def take(port: int, count: int) -> bytes:
     return bytes(data)
 
 
-def test_a_master_that_comes_and_goes(tmp_path: Path) -> None:
+def test_a_master_may_disconnect_and_connect_again(tmp_path: Path) -> None:
     async def main() -> None:
         unit = make_unit()
         slave = RtuSlave({1: unit})

@@ -114,7 +114,7 @@ def test_a_client_that_only_stopped_sending_gets_its_answer() -> None:
     run(main())
 
 
-def test_mb_064_a_reset_ends_the_client_and_nobody_else() -> None:
+def test_mb_064_a_reset_ends_only_that_client() -> None:
     ends: list[str] = []
 
     async def noting(connection: ByteConnection) -> None:

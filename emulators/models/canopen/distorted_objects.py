@@ -51,7 +51,7 @@ class DistortedObjects:
         """The last distorted value of each of them."""
 
     def share(self, distortions: Distortions, names: Mapping[Key, str]) -> None:
-        """Share the `distortions` of a source that itself distorts the tags of the objects `names`."""
+        """Use the `distortions` of the recorded source, which distorts the objects in `names` (key: tag name) itself."""
         self.distortions, self._played = distortions, names
         distortions.counts_given = True
 

@@ -74,7 +74,7 @@ def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
         except StopIteration:
             return
         except Exception as e:
-            said = f"behind message {number}: not a {path.suffix} file: {e or type(e).__name__}"
+            said = f"after message {number}: not a {path.suffix} file: {e or type(e).__name__}"
             raise FileInvalid(said, path=str(path)) from e
         number += 1
         yield message

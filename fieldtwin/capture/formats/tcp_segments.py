@@ -53,7 +53,7 @@ class Segments:
             self.next = (sequence + len(data)) % _SEQUENCES
             return [(0, data)] if not self._waiting else [(0, data), *self._follow()]
         ahead = (sequence - self.next) % _SEQUENCES
-        if ahead >= _SEQUENCES // 2:  # from before: repeated, all of it or the beginning
+        if ahead >= _SEQUENCES // 2:  # a retransmission: only the part after `next` is new
             new = data[_SEQUENCES - ahead :]
             if not new:
                 return []

@@ -23,9 +23,9 @@ class Impact(Enum):
     OBSERVE = "observe"
     """No effect: it only listens."""
     READ = "read"
-    """Reads are answered oddly."""
+    """The simulated device answers reads with faults; the plant behind the master stays unchanged."""
     WRITE = "write"
-    """Writes are answered oddly: the master may repeat them."""
+    """The simulated device answers writes with faults, so the master may repeat them."""
     DISRUPT = "disrupt"
     """The connection is cut, or the line is disturbed for all devices on it."""
 

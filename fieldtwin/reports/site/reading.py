@@ -36,7 +36,7 @@ SUFFIXES = (".json", ".jsonl")
 
 
 class UnknownFileKind(FileInvalid):
-    """The file is of a kind that does not belong into the document."""
+    """The file is of a kind that does not belong in the document."""
 
 
 def read_site(
@@ -88,7 +88,7 @@ def _source(path: Path, piece: DocumentPiece) -> SourceFile:
 
 
 def read_piece(path: Path) -> DocumentPiece:
-    """Read one file. Raises `FileInvalid` if it does not belong into the document."""
+    """Read one file. Raises `FileInvalid` if it does not belong in the document."""
     try:
         with path.open("rb") as file:
             head = file.readline(1 << 20)

@@ -84,7 +84,7 @@ class VirtualBench(AsyncResource):
         self._commands = commands or []
         self._has_topside = has_topside
         self._probe = probes
-        if probes and all(probe.serve for probe in probes):  # memory contains no other endpoints
+        if probes and all(probe.serve for probe in probes):  # in virtual time no probe can connect to a real server
             self.can = self.can | {Can.PROBE}
         self._probes: Probes | None = None
         self.asked_ns: dict[str, deque[int]] = {bus: deque(maxlen=ASKED_KEPT) for bus in system.buses}

@@ -136,7 +136,7 @@ def _question(file: YamlFile, loc: tuple[Key, ...], form: QuestionForm) -> Quest
 
 
 class PythonPlanner:
-    """A planner in user code. Any exception in it becomes a `FileInvalid` that names it. `limits` are its own, if any."""
+    """A planner in user code. Any exception in it becomes a `FileInvalid` that names it. `limits` is its attribute of that name, or None."""
 
     def __init__(self, source: str, name: str, system: System) -> None:
         self._source = source

@@ -14,7 +14,7 @@ from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_REPEATED = 100
-"""The longest Python expression, in characters, that is repeated wherever it is needed."""
+"""The limit, in characters, up to which generated Python code repeats an initial value. A longer one becomes a function."""
 _STANDARD = ty.standard_blocks(BLOCKS)
 
 

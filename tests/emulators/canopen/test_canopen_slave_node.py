@@ -147,7 +147,7 @@ def test_co_036_consumer_starts_with_the_first_heartbeat(rig: Rig) -> None:
     assert len(times(rig.advance(400), "085#3081")) == 1, "monitoring goes on"
 
 
-def test_co_035_a_monitored_node_that_boots_is_watched_anew(rig: Rig) -> None:
+def test_co_035_a_monitored_node_that_boots_is_monitored_again(rig: Rig) -> None:
     rig.write(0x1016, 1, 0x0A << 16 | 100, 4)
     rig.send(0x70A, "05")
     rig.send(0x70A, "00")

@@ -51,7 +51,7 @@ def test_each_end_receives_the_messages_of_the_other(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_modem_hands_over_so_much_and_no_more(tmp_path: Path) -> None:
+def test_a_modem_delivers_a_limited_number_of_bytes(tmp_path: Path) -> None:
     async def main() -> None:
         server = AcousticServer(AcousticMedium(WATER, PLACES, 1), WallClock())
         await server.open(tmp_path / "w")  # and no task runs it

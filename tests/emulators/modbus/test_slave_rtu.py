@@ -209,7 +209,7 @@ def test_mb_008_a_stray_byte_is_noise_and_no_damaged_frame() -> None:
     assert (slave.counters.crc_errors, slave.counters.noise_bytes, slave.counters.frames) == (0, 4, 2)
 
 
-def test_mb_032_a_frame_of_unknown_length_between_others_is_no_noise() -> None:
+def test_mb_032_a_frame_of_unknown_length_between_others_is_not_noise() -> None:
     slave = make_slave()
     Line(slave).bytewise(crc("05 64 010203") + READ)
     assert (slave.counters.noise_bytes, slave.counters.frames) == (0, 2)

@@ -61,7 +61,7 @@ def test_a_modem_waits_while_it_receives() -> None:
     assert sea.take("west", s(6)) == b"two"
 
 
-def test_a_modem_takes_so_much_and_no_more() -> None:
+def test_a_modem_accepts_a_limited_number_of_bytes() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     taken = sum(sea.say("west", bytes([n]), 0) for n in range(10))
     assert taken == QUEUE + 1  # one is in transit

@@ -79,13 +79,13 @@ ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 
 
 @given(number=st.integers(-(1 << 31), (1 << 31) - 1), order=st.sampled_from(ORDERS))
-def test_integers_come_back(number: int, order: str) -> None:
+def test_encoded_integers_decode_to_the_same_value(number: int, order: str) -> None:
     t = tag(f"type: int32, access: rw, order: {order}")
     assert decode(t, encode(t, number), 1).value == number
 
 
 @given(number=st.floats(width=32, allow_nan=False, allow_infinity=False), order=st.sampled_from(ORDERS))
-def test_floats_come_back(number: float, order: str) -> None:
+def test_encoded_floats_decode_to_the_same_value(number: float, order: str) -> None:
     t = tag(f"type: float32, access: rw, order: {order}")
     raw = encode(t, number)
     assert decode(t, raw, 1).value == number
@@ -94,7 +94,7 @@ def test_floats_come_back(number: float, order: str) -> None:
 
 
 @given(number=st.integers(0, 99_999_999), order=st.sampled_from(ORDERS))
-def test_bcd_comes_back(number: int, order: str) -> None:
+def test_encoded_bcd_decodes_to_the_same_value(number: int, order: str) -> None:
     t = tag(f"type: bcd32, access: rw, order: {order}")
     assert decode(t, encode(t, number), 1).value == number
 

@@ -97,7 +97,7 @@ def test_the_deadline_counts_from_the_end_of_transmission() -> None:
     with_client(scenario, serial=SerialSettings(1200, "8N1"))
 
 
-def test_mb_026_a_broadcast_write_waits_for_nobody_but_leaves_time_to_execute() -> None:
+def test_mb_026_a_broadcast_write_expects_no_reply_but_leaves_time_to_execute() -> None:
     async def scenario(client: ModbusClient, device: Device) -> None:
         reply = await client.write_registers(0, 0, [7])
         assert not reply.acknowledged

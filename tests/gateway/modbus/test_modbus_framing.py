@@ -267,7 +267,7 @@ def test_mb_055_an_adu_that_never_ends_costs_one_exchange(cut: int) -> None:
     assert registers(ask(framer, adu(3)[cut:] + adu(4))) == REGISTERS  # the rest came late
 
 
-def test_mb_056_a_late_reply_is_told_by_its_transaction_id() -> None:
+def test_mb_056_a_late_reply_is_recognised_by_its_transaction_id() -> None:
     framer = MbapFramer()
     with pytest.raises(ReplyTimeout):
         ask(framer, b"")

@@ -136,7 +136,7 @@ def test_mb_062_one_dead_unit_costs_the_others_nothing(tmp_path: Path) -> None:
     run(main())
 
 
-def test_mb_028_a_broadcast_goes_out_once_and_nobody_answers(tmp_path: Path) -> None:
+def test_mb_028_a_broadcast_is_sent_once_and_gets_no_reply(tmp_path: Path) -> None:
     async def main() -> None:
         config = BridgeConfig("b", ANY_PORT, to="line", policy=WRITERS, broadcast=True)
         async with rig(tmp_path, config) as r, r.raw() as raw:

@@ -62,7 +62,7 @@ class Watched:
         return (now.value, str(now.quality), str(now.reason)) == (value, quality, reason)
 
 
-def test_mb_066_an_adapter_pulled_and_plugged_in_again_goes_on(tmp_path: Path) -> None:
+def test_mb_066_an_adapter_that_is_plugged_in_again_is_used_again(tmp_path: Path) -> None:
     async def main() -> None:
         watched, cells = Watched(tmp_path), MapBank([CellSpan("holding", 0, 1)])
         cells.poke("holding", 0, 7)
@@ -79,7 +79,7 @@ def test_mb_066_an_adapter_pulled_and_plugged_in_again_goes_on(tmp_path: Path) -
     run(main())
 
 
-def test_mb_067_a_port_that_is_held_is_told_and_tried_again(tmp_path: Path) -> None:
+def test_mb_067_a_port_in_use_is_reported_and_tried_again(tmp_path: Path) -> None:
     async def main() -> None:
         watched, cells = Watched(tmp_path), MapBank([CellSpan("holding", 0, 1)])
         cells.poke("holding", 0, 7)

@@ -82,7 +82,7 @@ def test_mb_062_dead_units_cost_the_others_no_more_than_the_share_of_their_probe
     assert {d.driver.config.address for d in beside.bus.devices if d.online} == set(living)
 
 
-def test_mb_062_a_unit_that_comes_and_goes_has_no_larger_share() -> None:
+def test_mb_062_an_intermittent_unit_has_no_larger_share() -> None:
     """It answers the identification and then nothing more, each time it seems to be back."""
 
     async def main() -> VirtualBus:

@@ -124,7 +124,7 @@ class Mirror(DeviceModel):
         return ModelOutput({(0x2002, 0): situation.objects.number(0x2006)}, {(0x6000, 0): self.steps})
 
 
-def test_a_model_sees_the_current_object_whoever_changed_it() -> None:
+def test_a_model_sees_the_current_object_after_any_change() -> None:
     rig = Rig(context=NodeContext(model=Mirror()))
     assert rig.read(0x2002) == 7  # the data sheet's
     rig.write(0x2006, 0, 9, 2)

@@ -82,7 +82,7 @@ def site(tmp_path: Path) -> Site:
     return Site(tmp_path / "learnt.json")
 
 
-def test_mb_025_what_was_learnt_is_said_and_not_asked_again(site: Site) -> None:
+def test_mb_025_a_learnt_gap_is_reported_and_not_read_again(site: Site) -> None:
     assert site.run() == LearntStatus(
         profile="test/device",
         gaps=["holding:2..4"],

@@ -400,7 +400,7 @@ def test_a_store_at_its_bound_reports_it_keeps_its_data_and_continues_when_there
     run(main())
 
 
-def test_names_that_came_first_when_the_disk_was_full_are_there_when_it_is_not(tmp_path: Path) -> None:
+def test_names_first_written_on_a_full_disk_are_stored_when_there_is_room(tmp_path: Path) -> None:
     """SQLite itself rolls back a transaction that did not fit, including the name of a new tag or origin; a cache must not
     keep them."""
 

@@ -46,7 +46,7 @@ def test_a_folder_of_another_user_is_refused(default: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o1777])
-def test_a_folder_that_others_may_write_to_is_refused(default: Path, mode: int) -> None:
+def test_a_folder_that_other_users_may_write_to_is_refused(default: Path, mode: int) -> None:
     default.mkdir()
     default.chmod(mode)
     with pytest.raises(Unreachable, match="other users have access"):

@@ -85,7 +85,7 @@ def test_the_second_is_refused_while_the_first_answers_and_accepted_when_it_left
     played(tmp_path, main)
 
 
-def test_one_whose_link_was_lost_has_its_place_at_once(tmp_path: Path) -> None:
+def test_a_follower_whose_link_was_lost_regains_its_place_immediately(tmp_path: Path) -> None:
     """Its old connection still exists, half open: it does not answer, and no request is sent on it."""
 
     async def main(place: Place) -> None:

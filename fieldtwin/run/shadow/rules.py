@@ -136,7 +136,10 @@ def _question(file: YamlFile, loc: tuple[Key, ...], form: QuestionForm) -> Quest
 
 
 class PythonPlanner:
-    """A planner in user code. Any exception in it becomes a `FileInvalid` that names it. `limits` is its attribute of that name, or None."""
+    """A planner in user code. Any exception in it becomes a `FileInvalid` that names it.
+
+    `limits` is the planner's attribute of that name, None if it has none.
+    """
 
     def __init__(self, source: str, name: str, system: System) -> None:
         self._source = source

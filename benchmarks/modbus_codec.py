@@ -29,8 +29,8 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import NULLMODEM_HOST
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.protocols.modbus.frames.mbap import MbapFramer
 from fieldtwin.gateway.protocols.modbus.frames.rtu import RtuFramer
@@ -49,7 +49,7 @@ def ours(framing: str, count: int, transactions: int) -> float:
     bank = MapBank([CellSpan("holding", 0, len(VALUES))])
     bank.poke("holding", 0, *VALUES)
     units = {UNIT: ModbusUnit(bank)}
-    slave = MbapSlave(units) if framing == "mbap" else RtuSlave(units)
+    slave = MbapServer(units) if framing == "mbap" else RtuServer(units)
     framer = MbapFramer() if framing == "mbap" else RtuFramer()
     wanted = tuple(VALUES[:count])
 

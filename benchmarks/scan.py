@@ -32,7 +32,7 @@ import asyncio, sys
 from pathlib import Path
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, CellSpan
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
@@ -40,7 +40,7 @@ from fieldtwin.gateway.wallclock import WallClock, run
 
 async def main():
     end = await PtyEnd.open(Path(sys.argv[1]), Endpoint.parse("pty:x"), SerialSettings(9600, "8N1"))
-    slave = RtuSlave({{n: ModbusUnit(MapBank([CellSpan("holding", 0, 10)])) for n in {PRESENT}}})
+    slave = RtuServer({{n: ModbusUnit(MapBank([CellSpan("holding", 0, 10)])) for n in {PRESENT}}})
     print("ready", flush=True)
     await serve_rtu(end, slave, WallClock(), {LATENCY_S})
 

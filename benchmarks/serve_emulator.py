@@ -8,7 +8,7 @@ import sys
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
@@ -18,7 +18,7 @@ async def main(port: int) -> None:
     units = {1: ModbusUnit(MapBank([CellSpan("holding", 0, 100)]))}
     clock = WallClock()
     endpoint = Endpoint.parse(f"tcp://127.0.0.1:{port}")
-    listener = await SocketListener.open(endpoint, lambda c: serve_mbap(c, MbapSlave(units), clock), 256)
+    listener = await SocketListener.open(endpoint, lambda c: serve_mbap(c, MbapServer(units), clock), 256)
     print("ready", flush=True)
     try:
         await asyncio.Event().wait()

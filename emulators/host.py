@@ -21,10 +21,10 @@ from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, se
 from fieldtwin.emulators.endpoints.ports import CanPort, Listening, Ports
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.frames import Framing
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
+from fieldtwin.emulators.modbus.line import LineServer
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.clock import Clock
@@ -121,8 +121,8 @@ class EmulatorHost:
         """Serve `units` on `end`, an open serial line. The host closes it."""
         end = end if faults is None else FaultyEnd(end, faults)
         self._connections.append(end)
-        slave, latency = line_of(wire.plant, units), _latency(wire, units)
-        self._nursery.start(serve_rtu(end, slave, self._clock, latency, echo=wire.echo), f"emulators on {wire.name}")
+        server, latency = line_of(wire.plant, units), _latency(wire, units)
+        self._nursery.start(serve_rtu(end, server, self._clock, latency, echo=wire.echo), f"emulators on {wire.name}")
 
     async def serve_nodes(
         self, name: str, port: CanPort, nodes: Mapping[str, CanopenNode], faults: WireFaults | None = None
@@ -144,22 +144,22 @@ class EmulatorHost:
         socket = await self._ports.datagrams(wire.listen)
         datagrams = socket if faults is None else FaultyDatagrams(socket, faults)
         self._listeners.append(datagrams)
-        slave, latency = MbapSlave(units, any_unit=wire.any_unit), _latency(wire, units)
-        serving = serve_udp(datagrams, slave, self._clock, latency, clients=self._counts(wire.name))
+        server, latency = MbapServer(units, any_unit=wire.any_unit), _latency(wire, units)
+        serving = serve_udp(datagrams, server, self._clock, latency, clients=self._counts(wire.name))
         self._nursery.start(serving, f"emulators on {wire.name}")
         return datagrams.bound
 
     def _line_server(
         self, wire: ModbusWire, units: Mapping[int, ModbusUnit]
     ) -> Callable[[ByteConnection, str], Awaitable[None]]:
-        slave, latency = line_of(wire.plant, units), _latency(wire, units)
+        server, latency = line_of(wire.plant, units), _latency(wire, units)
         counted = CountDifference(self._counts(wire.name), lambda: _traffic(units))
         self._lines.append(counted)
 
         async def serve(end: ByteConnection, client: str) -> None:
             counted.change(client)
             try:
-                await serve_rtu(end, slave, self._clock, latency, echo=wire.echo)
+                await serve_rtu(end, server, self._clock, latency, echo=wire.echo)
             finally:
                 counted.change("")
 
@@ -174,7 +174,7 @@ class EmulatorHost:
             counts = clients.of(client)
             counts.open = True
             try:
-                await serve_mbap(end, MbapSlave(units, counts=counts, any_unit=wire.any_unit), self._clock, latency)
+                await serve_mbap(end, MbapServer(units, counts=counts, any_unit=wire.any_unit), self._clock, latency)
             finally:
                 counts.open = False
 
@@ -232,9 +232,9 @@ class EmulatorHost:
         return self._clients.setdefault(name, ClientCounts())
 
 
-def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineSlave:
+def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineServer:
     """Return the units of a serial line, in the framing of the plant's endpoint."""
-    return AsciiSlave(units) if plant.scheme == "ascii" else RtuSlave(units)
+    return AsciiServer(units) if plant.scheme == "ascii" else RtuServer(units)
 
 
 def framing_of(plant: Endpoint) -> Framing:

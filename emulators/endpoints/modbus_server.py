@@ -13,8 +13,8 @@ from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
 from fieldtwin.emulators.endpoints.ports import Datagrams
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
-from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.line import LineServer, ServedFrame
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -41,7 +41,7 @@ def as_recorded(line: SerialSettings | None = None) -> Latency:
 
 async def serve_rtu(
     connection: ByteConnection,
-    slave: LineSlave,
+    server: LineServer,
     clock: Clock,
     latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
@@ -57,11 +57,11 @@ async def serve_rtu(
     line = connection if isinstance(connection, PtyEnd | FaultyEnd) else None
     try:
         while True:
-            data = await (_read_or_silence(connection, slave) if slave.pending else connection.read())
+            data = await (_read_or_silence(connection, server) if server.pending else connection.read())
             now_ns = clock.monotonic_ns()
             if echo and data:
                 await connection.write(data)
-            exchanges = slave.receive(data, now_ns)
+            exchanges = server.receive(data, now_ns)
             if line is not None and line.paced:
                 await _reply_on_line(line, exchanges, clock, now_ns, latency_s, on_frame)
             else:
@@ -72,43 +72,43 @@ async def serve_rtu(
 
 async def serve_mbap(
     connection: ByteConnection,
-    slave: MbapSlave,
+    server: MbapServer,
     clock: Clock,
     latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
 ) -> None:
     """Serve Modbus TCP on `connection` until cancelled or lost; pipelined requests are answered in order.
 
-    Each connection needs its own `MbapSlave`. The connection is closed when the client's stream can no longer be parsed
+    Each connection needs its own `MbapServer`. The connection is closed when the client's stream can no longer be parsed
     (`desync`). If the latency is zero, the reply is sent from the callback that delivers the request, which takes half
     the time.
     """
     try:
         if isinstance(connection, SocketEnd) and on_frame is None and latency_s == 0.0:
-            await connection.answer_at_once(lambda data: _at_once(slave, data, clock))
-        while slave.desync is None:
+            await connection.answer_at_once(lambda data: _at_once(server, data, clock))
+        while server.desync is None:
             data = await connection.read()
             now_ns = clock.monotonic_ns()
-            await _reply(connection.write, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
+            await _reply(connection.write, server.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
     await connection.aclose()
 
 
-def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
+def _at_once(server: MbapServer, data: bytes, clock: Clock) -> tuple[bytes, bool]:
     """Return the replies to a chunk, and whether the rest of the stream cannot be parsed."""
-    return slave.answer(data, clock.monotonic_ns()), slave.desync is not None
+    return server.answer(data, clock.monotonic_ns()), server.desync is not None
 
 
 async def serve_udp(
     end: Datagrams,
-    slave: MbapSlave,
+    server: MbapServer,
     clock: Clock,
     latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
     clients: ClientCounts | None = None,
 ) -> None:
-    """Serve Modbus TCP ADUs in datagrams until cancelled or closed. All clients share one `slave`, one after the other.
+    """Serve Modbus TCP ADUs in datagrams until cancelled or closed. All clients share one `server`, one after the other.
 
     Each reply is sent in its own datagram to the sender of the request. A datagram that arrives twice is executed
     twice.
@@ -121,19 +121,19 @@ async def serve_udp(
             async def answer(reply: bytes, peer: tuple[str, int] = peer) -> None:
                 await end.send(reply, peer)
 
-            requests, replies = slave.counts.requests, slave.counts.replies
-            exchanges = slave.receive_datagram(data, now_ns)
+            requests, replies = server.counts.requests, server.counts.replies
+            exchanges = server.receive_datagram(data, now_ns)
             if clients is not None:
-                clients.add(f"{peer[0]}:{peer[1]}", slave.counts.requests - requests, slave.counts.replies - replies)
+                clients.add(f"{peer[0]}:{peer[1]}", server.counts.requests - requests, server.counts.replies - replies)
             await _reply(answer, exchanges, clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
 
 
-async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> bytes:
+async def _read_or_silence(connection: ByteConnection, server: LineServer) -> bytes:
     """Return the next bytes of an unfinished frame, or b"" after a pause that ends it."""
     try:
-        async with asyncio.timeout(slave.gap_ns / NS_PER_S):
+        async with asyncio.timeout(server.gap_ns / NS_PER_S):
             return await connection.read()
     except TimeoutError:
         return b""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame
+from fieldtwin.emulators.modbus.line import LineServer, ServedFrame
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 
@@ -92,7 +92,7 @@ class AsciiReceiver:
         del self._buffer[:count]
 
 
-class AsciiSlave(LineSlave):
+class AsciiServer(LineServer):
     """The units of one ASCII line.
 
     `units` maps a unit ID (1 to 247) to its unit; `gap_ns` is the longest pause in a frame.

@@ -60,7 +60,7 @@ class Receiver(Protocol):
     def feed(self, data: bytes, now_ns: int) -> list[bytes]: ...
 
 
-class LineSlave(ABC):
+class LineServer(ABC):
     """The units of one line. `units` maps a unit ID (1 to 247) to its unit."""
 
     check_bytes: int

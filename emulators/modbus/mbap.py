@@ -27,7 +27,7 @@ Allow = Callable[[int, bytes], bool]
 """``(unit ID, PDU)`` -> whether this client may send that request."""
 
 
-class MbapSlave:
+class MbapServer:
     """The units behind one connection. `units` maps a unit ID to its unit.
 
     A single unit also answers requests with the IDs 0 and 255, and echoes them; with `any_unit` it answers every ID, like devices

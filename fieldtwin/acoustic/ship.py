@@ -6,7 +6,7 @@ from fieldtwin.acoustic.network import Network
 from fieldtwin.acoustic.schema import SHIP
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.ports import Listening, Ports
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.modbus.acoustic_link import AcousticLink
 from fieldtwin.emulators.models.modbus.emulated_modbus import unit_limits
@@ -53,9 +53,9 @@ class TopsideModem:
 
     async def open(self, ports: Ports) -> Endpoint:
         """Start to listen and return the endpoint. Raises `EndpointBusy`."""
-        slave = MbapSlave({self.like.system.devices[self.like.modem].address: self._unit})
+        server = MbapServer({self.like.system.devices[self.like.modem].address: self._unit})
         self._listener = await ports.listen(
-            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, slave, self._clock, 0.0), MOST_CLIENTS
+            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, server, self._clock, 0.0), MOST_CLIENTS
         )
         return self._listener.bound
 

@@ -20,7 +20,7 @@ from fieldtwin.emulators.faults.frames import FrameDirection, Framing, understoo
 from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.errors import UsageError
@@ -64,10 +64,10 @@ def test_a_server_id_and_its_data_have_to_fit_one_reply() -> None:
 def test_one_device_answers_any_unit_id_on_tcp_and_echoes_it() -> None:
     unit = ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))
     request = bytes.fromhex("0001 0000 0006 63 03 0000 0001")
-    assert MbapSlave({1: unit}).feed(request, 0) == [bytes.fromhex("0001 0000 0003 63 83 0A")]
-    assert MbapSlave({1: unit}, any_unit=True).feed(request, 0) == [bytes.fromhex("0001 0000 0005 63 03 02 0000")]
+    assert MbapServer({1: unit}).feed(request, 0) == [bytes.fromhex("0001 0000 0003 63 83 0A")]
+    assert MbapServer({1: unit}, any_unit=True).feed(request, 0) == [bytes.fromhex("0001 0000 0005 63 03 02 0000")]
     with pytest.raises(UsageError):
-        MbapSlave({1: unit, 2: unit}, any_unit=True)
+        MbapServer({1: unit, 2: unit}, any_unit=True)
 
 
 @pytest.mark.parametrize(

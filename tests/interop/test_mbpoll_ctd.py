@@ -16,8 +16,8 @@ from support import run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.modbus.emulated_modbus import unit_limits
 from fieldtwin.emulators.models.modbus.sampled_sensor import SampledSensor
@@ -73,12 +73,12 @@ async def ctd(wire: str, folder: Path) -> AsyncIterator[Master]:
     if wire == "rtu":
         end = await PtyEnd.open(folder / "ctd", PLANT, PLANT.serial)
         async with Nursery() as nursery:
-            nursery.start(serve_rtu(end, RtuSlave({1: unit}), clock), "ctd")
+            nursery.start(serve_rtu(end, RtuServer({1: unit}), clock), "ctd")
             yield Master(sensor, "-m", "rtu", "-b", "19200", "-P", "even", "-s", "1", "-a", "1", str(end.link))
         await end.aclose()
         return
     listener = await SocketListener.open(
-        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({1: unit}), clock)
+        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapServer({1: unit}), clock)
     )
     yield Master(sensor, "-m", "tcp", "-p", str(listener.bound.port), "-a", "1", "127.0.0.1")
     await listener.aclose()

@@ -20,10 +20,10 @@ from tshark import dissect
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -86,14 +86,14 @@ async def converse(name: str, wire: str, unit: ModbusUnit, path: Path) -> tuple[
     if wire == "tcp":
         listener = await SocketListener.open(
             Endpoint.parse("tcp://127.0.0.1:0"),
-            lambda connection: serve_mbap(connection, MbapSlave({1: unit}), clock, 0.0, note),
+            lambda connection: serve_mbap(connection, MbapServer({1: unit}), clock, 0.0, note),
         )
         try:
             return await talk(name, wire, str(listener.bound.port)), captured
         finally:
             await listener.aclose()
     end = await PtyEnd.open(path / "line", Endpoint.parse("pty:line"))
-    slave = AsciiSlave({1: unit}) if wire == "ascii" else RtuSlave({1: unit})
+    slave = AsciiServer({1: unit}) if wire == "ascii" else RtuServer({1: unit})
     try:
         async with Nursery() as nursery:
             nursery.start(serve_rtu(end, slave, clock, 0.0, note), "unit")

@@ -15,7 +15,7 @@ from support import eventually
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.sockets.tcp import TcpConnection
@@ -105,7 +105,7 @@ async def rig(
 
     try:
         async with Nursery() as nursery:
-            nursery.start(serve_rtu(end, RtuSlave(units), CLOCK, latency_s, note), "units")
+            nursery.start(serve_rtu(end, RtuServer(units), CLOCK, latency_s, note), "units")
             nursery.start(bus.run(), "bus")
             nursery.start(bridge.run(), "bridge")
             await eventually(lambda: bridge.front.bound is not None and bus.connected)

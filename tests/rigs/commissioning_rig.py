@@ -12,7 +12,7 @@ from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.can.bus_runner import BusRunner
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -52,7 +52,7 @@ class Wired:
     """A connector to one unit: each connection is a Modbus TCP wire in memory. `requests` has the received PDUs."""
 
     def __init__(self, device: ModbusUnit, number: int = 1, latency_s: float = 0.01, mute: Mute | None = None) -> None:
-        self._slave = MbapSlave({number: device})
+        self._slave = MbapServer({number: device})
         self._latency_s = latency_s
         self._mute = mute
         self.requests: list[bytes] = []

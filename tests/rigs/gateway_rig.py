@@ -9,8 +9,8 @@ from pathlib import Path
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.bank import MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import (
@@ -89,9 +89,9 @@ class FieldBus:
 
     async def _serve(self, far: MemoryEnd, endpoint: Endpoint) -> None:
         if endpoint.is_serial:
-            await serve_rtu(far, RtuSlave(self.units), WallClock(), self._latency_s, self._on_frame)
+            await serve_rtu(far, RtuServer(self.units), WallClock(), self._latency_s, self._on_frame)
         else:
-            await serve_mbap(far, MbapSlave(self.units), WallClock(), self._latency_s, self._on_frame)
+            await serve_mbap(far, MbapServer(self.units), WallClock(), self._latency_s, self._on_frame)
 
     def _on_frame(self, direction: Direction, t_ns: int, adu: bytes) -> None:
         if direction is Direction.SENT:

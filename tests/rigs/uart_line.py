@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from commissioning_rig import loop
 from modbus_virtual import VirtualWire
 
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
+from fieldtwin.emulators.modbus.line import LineServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
@@ -102,7 +102,7 @@ class UartLine:
     counters: UartCounters = UartCounters()  # noqa: RUF009  frozen
 
     def __post_init__(self) -> None:
-        self._slave: LineSlave = (AsciiSlave if self.ascii else RtuSlave)(self.devices)
+        self._slave: LineServer = (AsciiServer if self.ascii else RtuServer)(self.devices)
         self._port: _Port | None = None
         self._replies = 0
         self._turn = 0

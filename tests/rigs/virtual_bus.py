@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from modbus_virtual import VirtualLoop, VirtualWire
 
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -69,7 +69,7 @@ class VirtualLine:
         if self.silent(data):
             return
         thinks_s = self.slow.get(data[0], self.latency_s)
-        for reply in RtuSlave(self.units).feed(data, self._loop.monotonic_ns()):
+        for reply in RtuServer(self.units).feed(data, self._loop.monotonic_ns()):
             self._loop.call_later((len(data) + len(reply)) * CHAR_S + thinks_s, self._deliver, reply)
 
     def _on_adu(self, adu: bytes) -> None:
@@ -81,7 +81,7 @@ class VirtualLine:
             refusal = adu[:4] + bytes([0, 3, unit, adu[7] | 0x80, 0x0B])
             self._loop.call_later(self.no_answer[unit], self._deliver, refusal)
         elif unit in self.units:
-            for reply in MbapSlave(self.units).feed(adu, self._loop.monotonic_ns()):
+            for reply in MbapServer(self.units).feed(adu, self._loop.monotonic_ns()):
                 self._loop.call_later(self.slow.get(unit, self.latency_s), self._deliver, reply)
 
     def _deliver(self, reply: bytes) -> None:

@@ -20,7 +20,7 @@ from fieldtwin.cli.main import main
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -37,7 +37,7 @@ async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
         bank.poke("holding", 0, *(100 * number + i for i in range(64)))
     plant = Endpoint.parse(f"rtu:{tmp_path / 'line'}?{LINE}")
     end = await PtyEnd.open(tmp_path / "line", plant, None)
-    slave = RtuSlave({n: ModbusUnit(bank) for n, bank in banks.items()})
+    slave = RtuServer({n: ModbusUnit(bank) for n, bank in banks.items()})
     try:
         async with Nursery() as nursery:
             nursery.start(serve_rtu(end, slave, WallClock()), "units")

@@ -18,7 +18,7 @@ from support import run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -121,7 +121,7 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_plant(tmp_path: Path) -> None
         clock = WallClock()
         bank = MapBank([CellSpan("holding", 0, 300)])
         device = await SocketListener.open(
-            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({7: ModbusUnit(bank)}), clock)
+            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapServer({7: ModbusUnit(bank)}), clock)
         )
         plant = Endpoint.parse(f"rtu:{tmp_path / 'x'}?{LINE}")
         cable = await BridgeCable.open(plant, tmp_path, "plant")

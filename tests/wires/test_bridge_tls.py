@@ -19,7 +19,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.sockets.listeners import TcpListener
@@ -75,7 +75,7 @@ async def bridge(pki: Pki, folder: Path, rules: tuple[AllowRule, ...]) -> AsyncI
     bank = MapBank([CellSpan("holding", 0, 16)])
     bank.poke("holding", 0, 7)
     device = await SocketListener.open(
-        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({1: ModbusUnit(bank)}), CLOCK)
+        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapServer({1: ModbusUnit(bank)}), CLOCK)
     )
     audit = AuditLog(folder / "audit.jsonl", CLOCK)
     bus = ModbusBus(BusConfig("plc", device.bound), [], OsConnector(), CLOCK, TagTable(CLOCK), lambda d: None)

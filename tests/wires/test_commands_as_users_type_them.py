@@ -26,7 +26,7 @@ from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.endpoints.link_ends import TtyEnd
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -145,7 +145,7 @@ def test_a_bridge_reads_through_an_adapter_that_echoes(tmp_path: Path, monkeypat
         end = await PtyEnd.open(tmp_path / "line", target, None)
         bank = MapBank([CellSpan("holding", 0, 8)])
         bank.poke("holding", 0, 7, 8)
-        unit = RtuSlave({1: ModbusUnit(bank)})
+        unit = RtuServer({1: ModbusUnit(bank)})
 
         async def adapter() -> None:
             clock = WallClock()

@@ -14,7 +14,7 @@ from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -31,7 +31,7 @@ def test_a_request_is_in_the_log_when_the_reply_arrives(tmp_path: Path) -> None:
 
         async def serve(connection: ByteConnection) -> None:
             try:
-                await serve_mbap(connection, MbapSlave({1: ModbusUnit(bank)}), WallClock())
+                await serve_mbap(connection, MbapServer({1: ModbusUnit(bank)}), WallClock())
             finally:
                 gone.set()
 

@@ -33,8 +33,8 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
@@ -80,7 +80,7 @@ def our_unit() -> ModbusUnit:
 @asynccontextmanager
 async def our_pty(folder: Path) -> AsyncIterator[str]:
     end = await PtyEnd.open(folder / "line", Endpoint.parse("pty:line"), None)
-    task = asyncio.create_task(serve_rtu(end, RtuSlave({1: our_unit()}), WallClock()))
+    task = asyncio.create_task(serve_rtu(end, RtuServer({1: our_unit()}), WallClock()))
     try:
         yield f"rtu:{folder / 'line'}?baudrate=115200&frame=8N1"
     finally:
@@ -153,7 +153,7 @@ def test_a_dump_that_was_killed_continues(tmp_path: Path) -> None:
     out = tmp_path / "d.jsonl"
 
     async def main() -> None:
-        slave = MbapSlave({1: our_unit()})
+        slave = MbapServer({1: our_unit()})
         listener = await SocketListener.open(
             Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, slave, WallClock(), latency_s=0.002)
         )

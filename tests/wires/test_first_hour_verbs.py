@@ -20,7 +20,7 @@ from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.can.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -39,8 +39,8 @@ async def fieldtwin(*words: str) -> tuple[int, dict[str, Any], str]:
     return program.returncode, json.loads(out), err.decode()
 
 
-def slave() -> RtuSlave:
-    return RtuSlave({5: ModbusUnit(MapBank([CellSpan("holding", 0, 8)]))})
+def slave() -> RtuServer:
+    return RtuServer({5: ModbusUnit(MapBank([CellSpan("holding", 0, 8)]))})
 
 
 async def answer_at(end: PtyEnd, speed: int) -> None:

@@ -15,13 +15,13 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, s
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
 from fieldtwin.emulators.modbus.functions.file_records import FileRecords
 from fieldtwin.emulators.modbus.functions.identification import Identification
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -59,7 +59,7 @@ def make_unit() -> tuple[ModbusUnit, MapBank, FifoQueues]:
 async def client_of(scheme: str, unit: ModbusUnit, tmp_path: Path) -> AsyncIterator[ModbusClient]:
     async with AsyncExitStack() as stack:
         nursery = await stack.enter_async_context(Nursery())
-        line = AsciiSlave({7: unit}) if scheme == "ascii" else RtuSlave({7: unit})
+        line = AsciiServer({7: unit}) if scheme == "ascii" else RtuServer({7: unit})
         if scheme in ("rtu", "ascii"):
             settings = "baudrate=115200&frame=" + ("7E1" if scheme == "ascii" else "8N1")
             plant = Endpoint.parse(f"{scheme}:{tmp_path / 'line'}?{settings}")
@@ -70,7 +70,7 @@ async def client_of(scheme: str, unit: ModbusUnit, tmp_path: Path) -> AsyncItera
         elif scheme == "udp":
             datagrams = await UdpEnd.open(Endpoint.parse("udp://127.0.0.1:0"))
             stack.push_async_callback(datagrams.aclose)
-            nursery.start(serve_udp(datagrams, MbapSlave({7: unit}), CLOCK), "unit")
+            nursery.start(serve_udp(datagrams, MbapServer({7: unit}), CLOCK), "unit")
             endpoint = datagrams.bound
         else:
             files = ""
@@ -87,7 +87,7 @@ async def client_of(scheme: str, unit: ModbusUnit, tmp_path: Path) -> AsyncItera
             listener = await SocketListener.open(
                 listen,
                 lambda c: (
-                    serve_rtu(c, line, CLOCK) if scheme == "rtu+tcp" else serve_mbap(c, MbapSlave({7: unit}), CLOCK)
+                    serve_rtu(c, line, CLOCK) if scheme == "rtu+tcp" else serve_mbap(c, MbapServer({7: unit}), CLOCK)
                 ),
                 4,
             )

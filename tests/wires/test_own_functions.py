@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
@@ -104,7 +104,7 @@ def test_registered_functions_precede_recorded_ones_and_are_counted() -> None:
 @pytest.mark.parametrize("noise", ["", "00", "FF 00", "01 03"])
 def test_a_device_specific_frame_that_looks_like_a_shorter_one_followed_by_a_zero(noise: str, piece: int) -> None:
     factory_reset = bytes.fromhex("01 78 00 00 00 01 60 00")  # 01 78 00 00 00 with the checksum 01 60, and a 00
-    line = RtuSlave({1: a_rover()})
+    line = RtuServer({1: a_rover()})
     heard = bytes.fromhex(noise) + factory_reset + bytes.fromhex("01 03 01 00 00 01 85 F6")
     replies = [r for i in range(0, len(heard), piece) for r in line.feed(heard[i : i + piece], 0)]
     assert replies == [factory_reset, bytes.fromhex("01 03 02 00 57 F9 BA")]

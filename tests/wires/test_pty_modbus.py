@@ -17,8 +17,8 @@ from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import Direction
@@ -42,11 +42,11 @@ def make_unit() -> ModbusUnit:
 
 @asynccontextmanager
 async def rtu_line(
-    link: Path, unit: ModbusUnit, pace: SerialSettings | None = None, slave: RtuSlave | None = None
+    link: Path, unit: ModbusUnit, pace: SerialSettings | None = None, slave: RtuServer | None = None
 ) -> AsyncIterator[list[bytes]]:
     frames: list[bytes] = []
     end = await PtyEnd.open(link, Endpoint.parse("pty:line1"), pace)
-    slave = slave or RtuSlave({1: unit})
+    slave = slave or RtuServer({1: unit})
     task = asyncio.create_task(
         serve_rtu(end, slave, WallClock(), on_frame=lambda direction, t_ns, adu: frames.append(adu))
     )
@@ -62,7 +62,7 @@ async def rtu_line(
 @asynccontextmanager
 async def tcp_server(unit: ModbusUnit) -> AsyncIterator[int]:
     listener = await SocketListener.open(
-        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave({1: unit}), WallClock())
+        Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapServer({1: unit}), WallClock())
     )
     try:
         yield listener.bound.port
@@ -98,7 +98,7 @@ async def take(port: int, count: int) -> bytes:
 def test_a_master_may_disconnect_and_connect_again(tmp_path: Path) -> None:
     async def main() -> None:
         unit = make_unit()
-        slave = RtuSlave({1: unit})
+        slave = RtuServer({1: unit})
         async with rtu_line(tmp_path / "line1", unit, slave=slave) as frames:
             for turn in range(1, 4):
                 port = os.open(tmp_path / "line1", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -130,7 +130,7 @@ def test_direction_and_latency(tmp_path: Path) -> None:
 
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", Endpoint.parse("pty:line1"))
-        slave = RtuSlave({1: make_unit()})
+        slave = RtuServer({1: make_unit()})
         task = asyncio.create_task(
             serve_rtu(end, slave, WallClock(), latency_s=0.02, on_frame=lambda d, t_ns, adu: told.append((d, t_ns)))
         )

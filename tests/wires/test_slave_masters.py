@@ -23,12 +23,12 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
 from fieldtwin.emulators.modbus.functions.file_records import FileRecords
 from fieldtwin.emulators.modbus.functions.identification import Identification
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -92,10 +92,10 @@ async def served(kind: str, unit: ModbusUnit, directory: Path) -> AsyncIterator[
     end: PtyEnd | UdpEnd
     if kind == "ascii":
         end = await PtyEnd.open(directory / "line", Endpoint.parse("pty:line"))
-        where, serving = str(end.link), serve_rtu(end, AsciiSlave(units), clock)
+        where, serving = str(end.link), serve_rtu(end, AsciiServer(units), clock)
     else:
         end = await UdpEnd.open(Endpoint.parse("udp://127.0.0.1:0"))
-        where, serving = str(end.bound.port), serve_udp(end, MbapSlave(units), clock)
+        where, serving = str(end.bound.port), serve_udp(end, MbapServer(units), clock)
     task = asyncio.create_task(serving)
     try:
         yield where

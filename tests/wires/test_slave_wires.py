@@ -20,11 +20,11 @@ from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.emulators.endpoints.tls_server import client_role
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.line import ServedFrame
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
@@ -109,9 +109,9 @@ class UdpClient:
 
 
 @contextlib.asynccontextmanager
-async def udp_server(unit: ModbusUnit, **options: float) -> AsyncIterator[tuple[UdpEnd, MbapSlave, UdpClient]]:
+async def udp_server(unit: ModbusUnit, **options: float) -> AsyncIterator[tuple[UdpEnd, MbapServer, UdpClient]]:
     end = await UdpEnd.open(ANY_UDP)
-    slave = MbapSlave({1: unit})
+    slave = MbapServer({1: unit})
     task = asyncio.create_task(serve_udp(end, slave, WallClock(), **options))
     client = UdpClient()
     try:
@@ -129,16 +129,16 @@ def test_one_device_on_every_wire_at_once(tmp_path: Path, pki: Pki) -> None:
         units = {1: unit}
         rtu = await PtyEnd.open(tmp_path / "rtu", Endpoint.parse("pty:rtu"))
         text = await PtyEnd.open(tmp_path / "ascii", Endpoint.parse("pty:ascii"))
-        tcp = await SocketListener.open(ANY_TCP, lambda c: serve_mbap(c, MbapSlave(units), clock))
-        tls = await SocketListener.open(tls_endpoint(pki), lambda c: serve_mbap(c, MbapSlave(units), clock))
-        line = RtuSlave(units)
+        tcp = await SocketListener.open(ANY_TCP, lambda c: serve_mbap(c, MbapServer(units), clock))
+        tls = await SocketListener.open(tls_endpoint(pki), lambda c: serve_mbap(c, MbapServer(units), clock))
+        line = RtuServer(units)
         tunnel = await SocketListener.open(
             Endpoint.parse("rtu+tcp://127.0.0.1:0"), lambda c: serve_rtu(c, line, clock), 1
         )
         async with udp_server(unit) as (udp, _, client):
             serving = [
-                asyncio.create_task(serve_rtu(rtu, RtuSlave(units), clock)),
-                asyncio.create_task(serve_rtu(text, AsciiSlave(units), clock)),
+                asyncio.create_task(serve_rtu(rtu, RtuServer(units), clock)),
+                asyncio.create_task(serve_rtu(text, AsciiServer(units), clock)),
             ]
             answers = await asyncio.gather(
                 ask_pty(tmp_path / "rtu", RTU_READ, len(RTU_REPLY)),
@@ -246,7 +246,7 @@ def test_tls_the_role_of_the_client_decides(pki: Pki) -> None:
             def allow(unit_id: int, pdu: bytes) -> bool:
                 return client.role == "Operator" or (client.role == "Viewer" and pdu[0] == 3)
 
-            await serve_mbap(client, MbapSlave({1: unit}, allow=allow), WallClock())
+            await serve_mbap(client, MbapServer({1: unit}, allow=allow), WallClock())
 
         listener = await SocketListener.open(tls_endpoint(pki), serve)
         refused = bytes.fromhex("0002 0000 0003 01 86 01")
@@ -269,7 +269,7 @@ def test_tls_a_client_without_a_certificate_is_refused(pki: Pki, tmp_path: Path)
 
     async def serve(client: SocketEnd) -> None:
         served.append(client.peer)
-        await serve_mbap(client, MbapSlave({1: make_unit()}), WallClock())
+        await serve_mbap(client, MbapServer({1: make_unit()}), WallClock())
 
     async def main() -> None:
         strangers = make_pki(tmp_path)
@@ -365,7 +365,7 @@ def test_mb_065_priority_hosts_give_way_only_to_each_other() -> None:
 def test_mb_010_a_line_that_echoes(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))
-        task = asyncio.create_task(serve_rtu(end, RtuSlave({1: make_unit()}), WallClock(), echo=True))
+        task = asyncio.create_task(serve_rtu(end, RtuServer({1: make_unit()}), WallClock(), echo=True))
         assert await ask_pty(tmp_path / "line", RTU_READ, 15) == RTU_READ + RTU_REPLY
         assert await ask_pty(tmp_path / "line", b"\x05\x03", 2) == b"\x05\x03", "what nobody answers echoes too"
         await end.aclose()
@@ -384,7 +384,7 @@ def test_latency_is_asked_for_exchange_by_exchange() -> None:
             return 0.05 if exchange.heard == WRITE else 0.0
 
         listener = await SocketListener.open(
-            ANY_TCP, lambda c: serve_mbap(c, MbapSlave({1: unit}), WallClock(), latency)
+            ANY_TCP, lambda c: serve_mbap(c, MbapServer({1: unit}), WallClock(), latency)
         )
         loop = asyncio.get_running_loop()
         assert await ask_tcp(listener.bound, READ, len(REPLY)) == REPLY

@@ -12,7 +12,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -226,7 +226,7 @@ def test_modbus_pipelined_in_order_and_visible_to_the_tap() -> None:
 
     async def main() -> None:
         listener = await SocketListener.open(
-            ANY_PORT, lambda c: serve_mbap(c, MbapSlave({1: unit}), WallClock(), latency_s=0.002, on_frame=on_frame)
+            ANY_PORT, lambda c: serve_mbap(c, MbapServer({1: unit}), WallClock(), latency_s=0.002, on_frame=on_frame)
         )
         reader, writer = await connect(listener)
         requests = [i.to_bytes(2, "big") + READ[2:] for i in range(1, 9)]
@@ -254,7 +254,7 @@ def units() -> dict[int, ModbusUnit]:
 
 def test_a_stream_that_makes_no_sense_is_answered_so_far_and_hung_up_on() -> None:
     async def main() -> None:
-        listener = await SocketListener.open(ANY_PORT, lambda c: serve_mbap(c, MbapSlave(units()), WallClock()))
+        listener = await SocketListener.open(ANY_PORT, lambda c: serve_mbap(c, MbapServer(units()), WallClock()))
         reader, writer = await connect(listener)
         writer.write(READ + bytes.fromhex("0002 0000 ffff 01"))
         assert await reader.read(100) == REPLY
@@ -270,7 +270,7 @@ def test_a_client_that_does_not_read_its_answers_is_not_read_from_and_gets_all_o
 
     async def main() -> None:
         served: list[SocketEnd] = []
-        slave = MbapSlave(units(), max_in_flight=1_000_000)
+        slave = MbapServer(units(), max_in_flight=1_000_000)
 
         async def serve(client: SocketEnd) -> None:
             served.append(client)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame, UnitLineCounters
+from fieldtwin.emulators.modbus.line import LineServer, ServedFrame, UnitLineCounters
 from fieldtwin.emulators.modbus.rtu.receiver import FRAME_GAP_NS, RtuReceiver, with_crc
 from fieldtwin.emulators.modbus.rtu.shapes import Declared
 from fieldtwin.emulators.modbus.rtu.strict import StrictReceiver
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
-__all__ = ["RtuSlave", "ServedFrame", "UnitLineCounters"]
+__all__ = ["RtuServer", "ServedFrame", "UnitLineCounters"]
 
 
-class RtuSlave(LineSlave):
+class RtuServer(LineServer):
     """The units of one RTU line.
 
     `units` maps a unit ID (1 to 247) to its unit. A pause of `gap_ns` ends an unfinished frame.

@@ -21,11 +21,11 @@ from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import OnClient
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.functions.identification import Identification
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
@@ -63,12 +63,12 @@ def _modbus(options: ModbusOptions, loop: VirtualLoop) -> Coroutine[Any, Any, Ch
         async with Nursery() as nursery:
             if endpoint.is_serial:
                 end, _ = await net.serial(Path(endpoint.path), endpoint, endpoint.serial)
-                slave = AsciiSlave(units) if endpoint.scheme == "ascii" else RtuSlave(units)
-                nursery.start(serve_rtu(end, slave, clock, echo=options.echo), "device on paper")
+                server = AsciiServer(units) if endpoint.scheme == "ascii" else RtuServer(units)
+                nursery.start(serve_rtu(end, server, clock, echo=options.echo), "device of the dry run")
                 return await check_modbus(use)
             if endpoint.scheme == "udp":
                 datagrams = await net.datagrams(endpoint)
-                nursery.start(serve_udp(datagrams, MbapSlave(units), clock), "device on paper")
+                nursery.start(serve_udp(datagrams, MbapServer(units), clock), "device of the dry run")
                 return await check_modbus(use)
             listener = await net.listen(endpoint, _streams(endpoint, units, clock), 8)
             try:
@@ -82,9 +82,9 @@ def _modbus(options: ModbusOptions, loop: VirtualLoop) -> Coroutine[Any, Any, Ch
 def _streams(endpoint: Endpoint, units: dict[int, ModbusUnit], clock: VirtualClock) -> OnClient:
     async def serve(end: ByteConnection) -> None:
         if endpoint.scheme == "rtu+tcp":
-            await serve_rtu(end, RtuSlave(units), clock)
+            await serve_rtu(end, RtuServer(units), clock)
         else:
-            await serve_mbap(end, MbapSlave(units), clock)
+            await serve_mbap(end, MbapServer(units), clock)
 
     served: Callable[[ByteConnection], Awaitable[None]] = serve
     return served
@@ -105,7 +105,7 @@ def canopen_dry_run(options: CanopenOptions) -> Checked:
         try:
             async with Nursery() as nursery:
                 node = CanopenNode(sheet, options.node)
-                nursery.start(serve_node(await bus.join("node on paper"), node, clock), "node on paper")
+                nursery.start(serve_node(await bus.join("node of the dry run"), node, clock), "node of the dry run")
                 return await check_canopen(use)
         finally:
             await bus.aclose()
@@ -118,7 +118,7 @@ def _sheet(options: CanopenOptions) -> str:
     """Return the data sheet of a node with the mandatory objects, and those that may be written, as numbers."""
     text = "[DeviceInfo]\nVendorName=paper\n"
     text += _var("1000", 7, "ro", "0x0") + _var("1001", 5, "ro", "0") + _var("1017", 6, "rw", "0")
-    text += _var("1008", 9, "const", "a node on paper")
+    text += _var("1008", 9, "const", "a node of the dry run")
     text += "[1003]\nParameterName=1003\nObjectType=0x8\nSubNumber=2\n"
     text += _var("1003sub0", 5, "rw", "0") + _var("1003sub1", 7, "ro", "0")
     text += "[1010]\nParameterName=1010\nObjectType=0x8\nSubNumber=2\n"

@@ -9,12 +9,12 @@ from typing import TypeVar
 
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
 from fieldtwin.emulators.modbus.functions.identification import Identification
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
@@ -55,9 +55,9 @@ def on_modbus(
             if serve is not None:
                 await serve(end)
             elif endpoint.scheme == "rtu+tcp":
-                await serve_rtu(end, RtuSlave(units), clock)
+                await serve_rtu(end, RtuServer(units), clock)
             else:
-                await serve_mbap(end, MbapSlave(units), clock)
+                await serve_mbap(end, MbapServer(units), clock)
 
         async with Nursery() as nursery:
             if endpoint.is_serial:
@@ -65,12 +65,12 @@ def on_modbus(
                 if serve is not None:
                     nursery.start(serve(end), "device")
                     return await use(net, url, clock)
-                slave = AsciiSlave(units) if endpoint.scheme == "ascii" else RtuSlave(units)
+                slave = AsciiServer(units) if endpoint.scheme == "ascii" else RtuServer(units)
                 nursery.start(serve_rtu(end, slave, clock), "device")
                 return await use(net, url, clock)
             if endpoint.scheme == "udp":
                 datagrams = await net.datagrams(endpoint)
-                nursery.start(serve_udp(datagrams, MbapSlave(units), clock), "device")
+                nursery.start(serve_udp(datagrams, MbapServer(units), clock), "device")
                 return await use(net, str(datagrams.bound), clock)
             listener = await net.listen(endpoint, stream, 8)
             try:

@@ -15,7 +15,7 @@ from devices_in_memory import make_unit
 from fieldtwin.cli.test.check_command import command
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -37,7 +37,7 @@ def device() -> Iterator[str]:
     stop = asyncio.Event()
 
     async def serve(end: ByteConnection) -> None:
-        await serve_mbap(end, MbapSlave({1: unit}), WallClock())
+        await serve_mbap(end, MbapServer({1: unit}), WallClock())
 
     async def main() -> None:
         listener = await SocketListener.open(Endpoint.parse("tcp://127.0.0.1:0"), serve)

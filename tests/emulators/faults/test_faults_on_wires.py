@@ -19,7 +19,7 @@ from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.link import EmulatedLink
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import ByteConnection
@@ -254,7 +254,7 @@ def test_datagrams() -> None:
             {"name": "duplicate", "every": 2},
         )
         device = FaultyDatagrams(await OsPorts().datagrams(Endpoint.parse("udp://127.0.0.1:0")), faults)
-        slave = MbapSlave({1: ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))})
+        slave = MbapServer({1: ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))})
         serving = asyncio.create_task(serve_udp(device, slave, WallClock()))
         heard: asyncio.Queue[bytes] = asyncio.Queue()
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiSlave
+from fieldtwin.emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -34,13 +34,13 @@ def make_units(*unit_ids: int) -> dict[int, ModbusUnit]:
 
 def test_a_frame_of_the_standard_s_kind() -> None:
     assert READ == b":010300000002FA\r\n"
-    slave = AsciiSlave(make_units())
+    slave = AsciiServer(make_units())
     (exchange,) = slave.receive(READ, 0)
     assert (exchange.heard, exchange.reply) == (READ, READ_REPLY)
 
 
 def test_the_delimiter_can_be_changed() -> None:
-    slave = AsciiSlave(make_units())
+    slave = AsciiServer(make_units())
     change = framed("01 08 0003 3B00")
     assert slave.feed(change, 0) == [change], "answered as it was asked"
     assert slave.feed(READ[:-1] + b";", 1) == [READ_REPLY[:-1] + b";"]
@@ -49,7 +49,7 @@ def test_the_delimiter_can_be_changed() -> None:
 
 
 def test_every_unit_of_a_line_counts_damaged_frames() -> None:
-    slave = AsciiSlave(make_units(1, 2))
+    slave = AsciiServer(make_units(1, 2))
     slave.feed(READ[:-4] + b"00\r\n" + READ, 0)
     assert [u.counters.bus_errors for u in slave.units.values()] == [1, 1]
     assert [u.counters.bus_messages for u in slave.units.values()] == [1, 2], "a reply is its neighbour's message"
@@ -67,7 +67,7 @@ CHUNKS = st.lists(
 
 @given(CHUNKS)
 def test_garbage_never_raises_and_a_frame_after_it_is_answered(chunks: list[tuple[bytes, int]]) -> None:
-    slave = AsciiSlave(make_units())
+    slave = AsciiServer(make_units())
     now_ns = 0
     for data, wait_ns in chunks:
         slave.feed(data, now_ns)
@@ -103,7 +103,7 @@ RTU_READ = bytes.fromhex("01 03 0000 0002 C40B")
 
 class StrictLine:
     def __init__(self) -> None:
-        self.slave = RtuSlave(make_units(), strict=LINE)
+        self.slave = RtuServer(make_units(), strict=LINE)
         self.now_ns = 0
         self.replies: list[bytes] = []
 

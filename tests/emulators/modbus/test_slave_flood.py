@@ -14,11 +14,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.line import LineServer
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -52,10 +52,10 @@ def make_units() -> dict[int, ModbusUnit]:
     return {1: ModbusUnit(MapBank([CellSpan("holding", 0, 4)]))}
 
 
-def make_line(kind: str) -> tuple[LineSlave, bytes]:
+def make_line(kind: str) -> tuple[LineServer, bytes]:
     if kind == "ascii":
-        return AsciiSlave(make_units()), b":010300000001FB\r\n"
-    return RtuSlave(make_units(), strict=LINE if kind == "strict" else None), RTU_READ
+        return AsciiServer(make_units()), b":010300000001FB\r\n"
+    return RtuServer(make_units(), strict=LINE if kind == "strict" else None), RTU_READ
 
 
 def garbage(kind: str) -> Iterator[bytes]:
@@ -109,7 +109,7 @@ def test_a_request_in_the_middle_of_a_flood_is_found() -> None:
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "protocol 1"])
 def test_a_stream(flood: str) -> None:
     """Zeros are ADUs of length 0, each dropped separately; the others are invalid at once."""
-    slave = MbapSlave(make_units())
+    slave = MbapServer(make_units())
     heard = bytes.fromhex("0001 0001 0006 01 03 0000 0001") * (CHUNK // 12)
     with bounded_memory():
         for chunk in garbage(flood):

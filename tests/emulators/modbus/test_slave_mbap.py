@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -22,13 +22,13 @@ READ = "03 0000 0002"
 VALUES = "03 04 00AA 00BB"
 
 
-def make_slave(*unit_ids: int, max_in_flight: int = 16) -> MbapSlave:
+def make_slave(*unit_ids: int, max_in_flight: int = 16) -> MbapServer:
     units = {}
     for unit_id in unit_ids or (1,):
         bank = MapBank([CellSpan("holding", 0, 125)])
         bank.poke("holding", 0, 0xAA, 0xBB)
         units[unit_id] = ModbusUnit(bank)
-    return MbapSlave(units, max_in_flight)
+    return MbapServer(units, max_in_flight)
 
 
 OURS = adu(0x1234, 1, READ)
@@ -107,7 +107,7 @@ def test_mb_057_several_units_behind_one_address() -> None:
 
 def test_two_connections_one_unit() -> None:
     one = make_slave()
-    two = MbapSlave(one.units)
+    two = MbapServer(one.units)
     one.feed(OURS[:9], 0)
     assert two.feed(OURS, 0) == [ANSWER]
     assert one.feed(OURS[9:], 0) == [ANSWER]

@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.rtu.receiver import RtuReceiver
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_MS
@@ -32,19 +32,19 @@ READ = crc("01 03 0000 0002")
 READ_REPLY = crc("01 03 04 00AA 00BB")
 
 
-def make_slave(*unit_ids: int) -> RtuSlave:
+def make_slave(*unit_ids: int) -> RtuServer:
     units = {}
     for unit_id in unit_ids or (1,):
         bank = MapBank([CellSpan("holding", 0, 300), CellSpan("coil", 0, 64)])
         bank.poke("holding", 0, 0xAA, 0xBB)
         units[unit_id] = ModbusUnit(bank)
-    return RtuSlave(units)
+    return RtuServer(units)
 
 
 class Line:
     """Feed a server as a line would: time passes with every byte."""
 
-    def __init__(self, slave: RtuSlave) -> None:
+    def __init__(self, slave: RtuServer) -> None:
         self.slave = slave
         self.now_ns = 1
         self.replies: list[bytes] = []

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
 from fieldtwin.emulators.modbus.functions.fifo import FifoQueues
 from fieldtwin.emulators.modbus.functions.identification import Identification
-from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.line import LineServer
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -58,13 +58,13 @@ class Rig:
         self.vector = vector
         self.wire = vector.get("wire", "rtu")
         self.units = {n: make_unit(vector.get("even_only", False)) for n in vector.get("units", [1])}
-        self.slave: LineSlave | MbapSlave
+        self.slave: LineServer | MbapServer
         if self.wire in ("mbap", "udp"):
-            self.slave = MbapSlave(self.units, vector.get("max_in_flight", 16))
+            self.slave = MbapServer(self.units, vector.get("max_in_flight", 16))
         elif self.wire == "ascii":
-            self.slave = AsciiSlave(self.units)
+            self.slave = AsciiServer(self.units)
         else:
-            self.slave = RtuSlave(self.units, strict=LINE if self.wire == "rtu-strict" else None)
+            self.slave = RtuServer(self.units, strict=LINE if self.wire == "rtu-strict" else None)
 
     def bytes_of(self, text: str) -> bytes:
         return text.encode() if self.wire == "ascii" else bytes.fromhex(text)
@@ -72,7 +72,7 @@ class Rig:
     def feed(self, data: bytes, now_ns: int, piece: int) -> list[bytes]:
         """Feed `data`, whose last byte arrives at `now_ns`, in pieces of `piece` bytes."""
         if self.wire == "udp":
-            assert isinstance(self.slave, MbapSlave)
+            assert isinstance(self.slave, MbapServer)
             return [exchange.reply for exchange in self.slave.receive_datagram(data, now_ns) if exchange.reply]
         if not data:
             return self.slave.feed(b"", now_ns)
@@ -120,7 +120,7 @@ class Rig:
         said += self.slave.feed(b"", now_ns + 2 * LONG_PAUSE_NS)
         if self.vector.get("closed"):
             assert said == []
-            assert isinstance(self.slave, MbapSlave)
+            assert isinstance(self.slave, MbapServer)
             assert self.slave.desync is not None
         else:
             assert [len(reply) for reply in said] == [length], "the wire is wedged"

@@ -13,7 +13,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
@@ -66,7 +66,7 @@ def test_the_driver_reads_the_recorded_values_of_the_device(name: str) -> None:
         units = {unit: ReplayUnit(replay, unit)}
         clock = WallClock()
         listener = await SocketListener.open(
-            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapSlave(units), clock)
+            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, MbapServer(units), clock)
         )
         tags = TagTable(clock)
         trigger = profile.form.trigger

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply
 from fieldtwin.gateway.protocols.modbus.frames.ascii import AsciiFramer
@@ -58,8 +58,8 @@ class Rig:
         self.framer: Framer = framers[kind]()
         self.unit = make_unit()
         units = {UNIT: self.unit}
-        self.line = {"rtu": RtuSlave, "ascii": AsciiSlave}.get(kind, RtuSlave)(units)
-        self.stream = MbapSlave(units)
+        self.line = {"rtu": RtuServer, "ascii": AsciiServer}.get(kind, RtuServer)(units)
+        self.stream = MbapServer(units)
         self.now_ns = 0
 
     def heard(self, data: bytes) -> list[bytes]:

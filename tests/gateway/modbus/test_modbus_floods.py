@@ -13,10 +13,10 @@ from collections.abc import Callable
 
 import pytest
 
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.protocols.modbus.server.line import LOST_AFTER, LineRequest, RtuRequests
@@ -56,7 +56,7 @@ def flood(feed: Callable[[bytes, int], object], kept: Callable[[], int], kind: s
 
 @pytest.mark.parametrize("kind", ["zeros", "ones"])
 def test_an_rtu_slave(kind: str) -> None:
-    slave = RtuSlave(units())
+    slave = RtuServer(units())
     now_ns = flood(slave.feed, lambda: slave.pending, kind)
     assert slave.counters.noise_bytes >= CHUNKS * CHUNK - 600
     slave.feed(b"", now_ns + NS_PER_S)
@@ -65,14 +65,14 @@ def test_an_rtu_slave(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["zeros", "random"])
 def test_an_ascii_slave(kind: str) -> None:
-    slave = AsciiSlave(units())
+    slave = AsciiServer(units())
     now_ns = flood(slave.feed, lambda: slave.pending, kind)
     assert len(slave.feed(b":010300000001FB\r\n", now_ns + 2 * NS_PER_S)) == 1
 
 
 @pytest.mark.parametrize("kind", sorted(GARBAGE))
 def test_a_tcp_slave(kind: str) -> None:
-    slave = MbapSlave(units())
+    slave = MbapServer(units())
     chunks = 4 if kind == "zeros" else CHUNKS  # ADUs of length 0, one in six bytes, each dropped separately
     flood(slave.feed, lambda: slave.pending, kind, chunks)
     assert slave.requests == 0

@@ -13,7 +13,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
-from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -79,7 +79,7 @@ async def reverse(
     units = {3: a_unit(300)}
     near, far = tmp_path / "near", LINE.with_path(str(tmp_path / "near"))
     end = await PtyEnd.open(near, far, None)
-    listener = await SocketListener.open(ANY_PORT, lambda c: serve_mbap(c, MbapSlave(units), CLOCK, latency_s))
+    listener = await SocketListener.open(ANY_PORT, lambda c: serve_mbap(c, MbapServer(units), CLOCK, latency_s))
     audit = AuditLog(tmp_path / "audit.jsonl", CLOCK)
     bus = ModbusBus(BusConfig("lan", listener.bound, 0.5, 0), [], OsConnector(), CLOCK, TagTable(CLOCK), lambda d: None)
     bridge = Bridge(BridgeConfig("b", far, routes={7: Route("lan", 3)}), {"lan": bus}, OsConnector(), CLOCK, audit)

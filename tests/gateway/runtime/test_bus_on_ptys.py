@@ -13,7 +13,7 @@ from support import eventually, run
 from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.emulators.modbus.rtu.line import RtuSlave
+from fieldtwin.emulators.modbus.rtu.line import RtuServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.serial.line import SerialConnection
@@ -37,7 +37,7 @@ def plant(path: Path) -> Endpoint:
 async def plugged(path: Path, cells: MapBank) -> AsyncIterator[None]:
     """A unit on an adapter, while that is plugged in."""
     end = await PtyEnd.open(path / "line", plant(path), None)
-    task = asyncio.create_task(serve_rtu(end, RtuSlave({1: ModbusUnit(cells)}), CLOCK))
+    task = asyncio.create_task(serve_rtu(end, RtuServer({1: ModbusUnit(cells)}), CLOCK))
     try:
         yield
     finally:

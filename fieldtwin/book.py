@@ -17,7 +17,7 @@ _ROW = re.compile(r"([A-Z]{2}-\d{3})[a-h]?")
 
 
 def base_url() -> str:
-    """Return the URL of the book without a slash at the end, or "" if there is none."""
+    """Return the URL of the book without a slash at the end, or "" if the installation does not have one."""
     return (os.environ.get(VARIABLE) or PUBLISHED_AT).rstrip("/")
 
 

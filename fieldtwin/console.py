@@ -1,4 +1,7 @@
-"""The two consoles: data on stdout, talk on stderr. rich honours NO_COLOR and leaves colour out where there is no terminal."""
+"""The two consoles: results on stdout, diagnostics on stderr.
+
+rich honours NO_COLOR, and prints without colour if the output is not a terminal.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from fieldtwin.gateway.core.escaping import escape_controls
 
 class _Console(Console):
     def on_broken_pipe(self) -> NoReturn:
-        """rich ends the program with exit code 1. Who reads with `head` has what it wanted: see `LazyGroup.invoke`."""
+        """rich ends the program with exit code 1. That is not an error for `| head`: see `LazyGroup.invoke`."""
         self.quiet = True
         raise BrokenPipeError
 
@@ -31,6 +34,6 @@ stdout = _Console(highlight=False, emoji=False)
 
 
 def show_warnings(warnings: Iterable[str]) -> None:
-    """What the author of a file should know, one line each on stderr."""
+    """Print warnings for the author of a file, one line each, on stderr."""
     for warning in warnings:
         stderr.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)

@@ -1,7 +1,7 @@
 """The pytest plugin: emulated devices, field simulators, programs and scenarios as fixtures; `*.scenario.yaml` files as tests.
 
-Loaded in every test run of whoever has fieldtwin installed, so it imports pytest and nothing else until a test asks for
-something: neither pymodbus nor canopen, and none of fieldtwin but `fieldtwin.testing`. What is emulated runs in another process
+pytest loads this module in every test run if fieldtwin is installed. So it imports only pytest until a test requests a
+fixture, and then only `fieldtwin.testing`, neither pymodbus nor canopen. Emulated devices run in a separate process
 (docs/how-to/pytest.md).
 """
 
@@ -139,7 +139,7 @@ def _runner(config: pytest.Config) -> WorkerProcess:
 
 
 def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What the test's markers say; those nearer to the test before those of its class and module."""
+    """Return the arguments of the test's markers; those of the test precede those of its class and module."""
     said: dict[str, Any] = {}
     for marker in request.node.iter_markers(MARKER):
         for key, value in marker.kwargs.items():
@@ -187,7 +187,7 @@ def _places(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 @pytest.fixture
 def device(request: pytest.FixtureRequest, emulate: Callable[..., DeviceHandle]) -> DeviceHandle:
-    """The device that ``@pytest.mark.fieldtwin(device=...)`` names, on a wire of its own."""
+    """The device that ``@pytest.mark.fieldtwin(device=...)`` names, on a separate bus."""
     said = {key: value for key, value in _said(request).items() if key not in ("system", "prototype", "listen", "plc")}
     if "device" not in said:
         pytest.fail('which device? @pytest.mark.fieldtwin(device="ctd-reference")', pytrace=False)
@@ -213,7 +213,7 @@ def prototype(request: pytest.FixtureRequest) -> Iterator[PrototypeHandle]:
 
 @pytest.fixture
 def wire(request: pytest.FixtureRequest) -> RecordedTraffic:
-    """What is exchanged on the wire of `device`, or on those of `prototype`."""
+    """Record the traffic on the bus of `device`, or on all buses of `prototype`."""
     if "system" in _said(request) or "prototype" in request.fixturenames:
         whole: PrototypeHandle = request.getfixturevalue("prototype")
         return whole.wire

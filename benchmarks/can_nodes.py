@@ -67,7 +67,7 @@ async def ours(nodes: int, seconds: float) -> None:
     from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint
-    from fieldtwin.gateway.core.files.profile import load_profile
+    from fieldtwin.gateway.core.files.profile_file import load_profile
     from fieldtwin.gateway.wallclock import WallClock
 
     clock, here = WallClock(), Endpoint.parse("can:fieldtwin/127.0.0.1:1")

@@ -13,7 +13,7 @@ from fieldtwin.__about__ import __version__
 if TYPE_CHECKING:
     from fieldtwin.commissioning.scan.node_scan import scan_can_bus as scan_can_bus
     from fieldtwin.gateway.core.errors import FieldtwinError as FieldtwinError
-    from fieldtwin.gateway.core.files.profile import load_profile as load_profile
+    from fieldtwin.gateway.core.files.profile_file import load_profile as load_profile
     from fieldtwin.run.live.options import RunOptions as RunOptions
     from fieldtwin.run.live.session import RunSession as RunSession
     from fieldtwin.twin.prototype.file import load_prototype as load_prototype
@@ -23,7 +23,7 @@ _PUBLIC = {
     "FieldtwinError": "fieldtwin.gateway.core.errors",
     "RunOptions": "fieldtwin.run.live.options",
     "RunSession": "fieldtwin.run.live.session",
-    "load_profile": "fieldtwin.gateway.core.files.profile",
+    "load_profile": "fieldtwin.gateway.core.files.profile_file",
     "load_prototype": "fieldtwin.twin.prototype.file",
     "load_system": "fieldtwin.twin.site.system",
     "scan_can_bus": "fieldtwin.commissioning.scan.node_scan",

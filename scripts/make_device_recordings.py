@@ -20,7 +20,8 @@ if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not 
     sys.path.insert(0, str(ROOT))
 
 from fieldtwin.emulators.codec import encode  # noqa: E402
-from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile, load_profile  # noqa: E402
+from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile  # noqa: E402
+from fieldtwin.gateway.core.files.profile_file import load_profile  # noqa: E402
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.emulators.faults.registry import FAULTS
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.site.schemas import SCHEMAS
 
 KINDS = {

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.new_site.limits import NEVER_POLLED, Limits, Output, commanded, limits_of, supervised

@@ -22,7 +22,7 @@ from fieldtwin.emulators.faults.schema import FaultSpec, load_faults
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.scenarios.judging.waiving import ids_of

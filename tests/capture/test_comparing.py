@@ -13,7 +13,8 @@ from packets import read, values
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
 from fieldtwin.capture.recordings.comparing_can import compare_logs
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MS = 1_000_000

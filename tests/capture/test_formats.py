@@ -21,7 +21,7 @@ from fieldtwin.capture.recordings.rotating_file import exchanges_of
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import LeftOut, line_of, read_log
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import (
     RecordedExchange,
     RecordingHeader,

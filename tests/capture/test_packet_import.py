@@ -16,7 +16,7 @@ from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.capture.recordings.from_packets import PacketImport, PacketSummary
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingReader
 
 

@@ -16,7 +16,7 @@ from fieldtwin.capture.decoding.modbus_connection import KnownUnit, ModbusConnec
 from fieldtwin.capture.decoding.modbus_frames import splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.capture.decoding.tags import TagMap
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.results.trace import TraceEvent

@@ -24,7 +24,8 @@ from fieldtwin.emulators.modbus.mbap import MbapServer
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 METER = """

@@ -20,7 +20,7 @@ from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan, MapBank
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]

@@ -23,7 +23,8 @@ from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.files.profile import RegisterRange, load_profile
+from fieldtwin.gateway.core.files.profile import RegisterRange
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import parse_dictionary
 

@@ -29,7 +29,7 @@ from fieldtwin.commissioning.infer.fields import Interpretation, Level, infer_ru
 from fieldtwin.commissioning.infer.infer import Series, infer, series_of, without_repetitions
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 
 START_S = 1_790_000_000.0
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}

@@ -15,7 +15,7 @@ from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 
 ROOT = Path(__file__).parents[2]
 SDM = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canopen
 from fieldtwin.commissioning.identify.matching import CanClues, Sureness, judge_canopen
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 

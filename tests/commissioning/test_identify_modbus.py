@@ -18,7 +18,8 @@ from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitParts
 from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.unit import ReplayUnit
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 
 URL = "tcp://192.0.2.1:502"
 SHIPPED = [load_profile(path) for path in sorted(Path("profiles/devices").glob("*.yaml"))]

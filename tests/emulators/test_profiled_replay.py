@@ -13,7 +13,7 @@ from fieldtwin.emulators.models.modbus.recorded_device import RecordedDevice, lo
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.gateway.core.connection import RS232Connection
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 ROOT = Path(__file__).resolve().parents[2]

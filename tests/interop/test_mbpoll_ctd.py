@@ -24,7 +24,7 @@ from fieldtwin.emulators.models.modbus.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = [

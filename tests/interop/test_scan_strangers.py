@@ -19,7 +19,7 @@ from targets import socat_pair
 from fieldtwin.commissioning.identify.matching import Sureness
 from fieldtwin.commissioning.identify.modbus import identify_modbus
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 
 HERE = Path(__file__).parent
 SERVERS = HERE.parents[1] / "scripts" / "league_programs" / "servers.py"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from report_rig import MS, adu, answer, ask, can, chunk, note, observatory, run_trace
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.reports.markup import Markup, el, text
 from fieldtwin.reports.run.coverage import Collector, devices_covered

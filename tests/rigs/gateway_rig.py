@@ -22,7 +22,8 @@ from fieldtwin.gateway.core.connection import (
 )
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
-from fieldtwin.gateway.core.files.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver

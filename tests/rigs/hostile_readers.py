@@ -31,7 +31,7 @@ from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.files.candump import LeftOut, read_log
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.plc.st.program import load_file

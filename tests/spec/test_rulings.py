@@ -19,7 +19,7 @@ from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS
 from fieldtwin.gateway.core.values import COMMAND, Quality, Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig

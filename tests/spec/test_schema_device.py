@@ -16,7 +16,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.device import Device, End, Sensor, Transmitter, wire
 from fieldtwin.gateway.core.errors import Bug, UnknownCommand
-from fieldtwin.gateway.core.files.profile import load_profile, resolve
+from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 

@@ -17,7 +17,7 @@ from fieldtwin.emulators.models.canopen.emulated_node import emulated_node
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "drive-cia402.yaml")

@@ -20,7 +20,8 @@ from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.serial.line import SerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.requests.user import FixedShape, UserFunction

@@ -15,7 +15,8 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import SUFFIX
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.twin.prototype.simulations import check_plays, check_simulations

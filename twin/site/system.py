@@ -16,7 +16,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1

@@ -15,7 +15,8 @@ from fieldtwin.commissioning.dump.diff import Differences, Leave, diff_dictionar
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.reports.site.about import headed
 from fieldtwin.twin.site.data_files import find, search_path

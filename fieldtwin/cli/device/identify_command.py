@@ -21,7 +21,8 @@ from fieldtwin.commissioning.identify.modbus import NAMES, ModbusIdentity, ident
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.wallclock import run as run_precise
 from fieldtwin.twin.site.data_files import search_path
 

@@ -140,7 +140,7 @@ def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | N
     """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
     from fieldtwin.emulators.device_faults import check_device
     from fieldtwin.emulators.faults.schema import load_faults
-    from fieldtwin.gateway.core.files.profile import load_profile
+    from fieldtwin.gateway.core.files.profile_file import load_profile
     from fieldtwin.run.emulate.device import ModbusExtras
 
     values, faults = device.values, device.faults_file

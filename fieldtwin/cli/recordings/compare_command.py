@@ -26,7 +26,8 @@ from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import SCHEMES
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.protocols.canopen.sdo.transfers import SdoUpload
 from fieldtwin.gateway.wallclock import run as run_precise

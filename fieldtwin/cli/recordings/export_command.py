@@ -10,7 +10,7 @@ import click
 
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.console import stdout
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.twin.site.data_files import find
 
 

@@ -17,7 +17,8 @@ from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.twin.site.data_files import find

@@ -17,7 +17,8 @@ from fieldtwin.commissioning.dump.file import Dump
 from fieldtwin.commissioning.infer.fields import Interpretation, Level
 from fieldtwin.commissioning.infer.infer import BIT_TABLES, Inference, Series
 from fieldtwin.commissioning.infer.joint import toggled_bits
-from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, gap_text, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, gap_text
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 MOST_BITS = 4000

@@ -40,7 +40,8 @@ from fieldtwin.gateway.core.connection import RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.candump import SUFFIX
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import looks_like_another_file, shown
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.can_bus import only_bus, open_bus

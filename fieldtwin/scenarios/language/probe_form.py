@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import Key, Position, YamlFile
 
 MIN_EVERY_S = 0.01

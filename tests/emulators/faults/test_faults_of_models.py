@@ -22,7 +22,7 @@ from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 
 DEVICES = Path(__file__).parents[3] / "profiles" / "devices"
 TANK = """

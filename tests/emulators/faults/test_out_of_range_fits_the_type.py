@@ -18,7 +18,7 @@ from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import cells_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.results.model import Verdict
 from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario

@@ -15,7 +15,8 @@ from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 

@@ -15,7 +15,8 @@ from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile, resolve
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 ROOT = Path(__file__).resolve().parents[3]

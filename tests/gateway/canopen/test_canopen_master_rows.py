@@ -17,7 +17,7 @@ from modbus_virtual import VirtualLoop, run_virtually
 
 from fieldtwin.gateway.core import errors
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.values import Reason, TagValue
 from fieldtwin.gateway.devices.canopen_config import CanopenNodeConfig
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, load_profile, resolve, resolve_address
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, resolve_address
+from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 HEAD = 'device: test/device\nsource: "a test"\n'

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed
-from fieldtwin.gateway.core.files.profile import Tag, resolve
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, encode

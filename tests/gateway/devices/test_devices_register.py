@@ -21,7 +21,7 @@ from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import FileInvalid, UnknownCommand, VerifyFailed
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import SignalRow
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT
 from fieldtwin.gateway.devices.codec import decode, decode_little, encode, reorder

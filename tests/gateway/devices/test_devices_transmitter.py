@@ -21,7 +21,7 @@ from fieldtwin.emulators.models.modbus.packet_link import LinkImpairments, Packe
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, FileInvalid, NotAllowed
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver, next_sequence

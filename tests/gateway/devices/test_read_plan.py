@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, Table, gap_text, resolve, resolve_gap
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, Table, gap_text, resolve_gap
+from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.devices.read_plan import GroupPlan, Learnt, Read, plan_reads, split
 

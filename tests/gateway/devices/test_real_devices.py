@@ -19,7 +19,8 @@ from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig

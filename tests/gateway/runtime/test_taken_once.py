@@ -14,7 +14,7 @@ from support import eventually, run
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.modbus.mailbox_modem import ModemPair
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver

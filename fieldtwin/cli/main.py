@@ -26,6 +26,7 @@ COMMANDS = {
         "fieldtwin.cli.run.simulate_command",
         "Simulate a system in virtual time, with seeds and random faults.",
     ),
+    "studio": ("fieldtwin.cli.run.studio_command", "See and operate running systems in the browser."),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
@@ -119,7 +120,7 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("new", "run", "simulate", "reload", "emulate", "with", "plc"),
+        *("new", "run", "simulate", "studio", "reload", "emulate", "with", "plc"),
         *("topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (

@@ -8,6 +8,7 @@ the other processes show its consequences, and the run fails. The thread's proce
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -34,6 +35,7 @@ from fieldtwin.run.processes.children import Child
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
+from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, write_record
 from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.thread_return import ThreadReturn
 from fieldtwin.run.processes.topside import TopsideController, script
@@ -214,7 +216,7 @@ class RunSession(AsyncResource):
         config = run_dir / "plc.json"
         config.write_bytes(plc.to_json())
         await self._start_child("plc", "fieldtwin.plc", config)
-        self._resolved = write_resolved(self.instance.path("system.pickle"), self.system)
+        self._resolved = write_resolved(self.instance.path(SYSTEM_FILE), self.system)
         gateway = ControllerConfig(
             system=str(self.system.path.resolve()),
             run_dir=str(run_dir),
@@ -230,8 +232,23 @@ class RunSession(AsyncResource):
         if self.options.thread:
             await self._start_thread(run_dir)
         self.started_ns = self.clock.monotonic_ns()
+        write_record(run_dir, self._record())
         await self._put_faults_in()
         self._start_watching()
+
+    def _record(self) -> RunRecord:
+        o = self.options
+        return RunRecord(
+            system=self.system.name,
+            path=str(self.system.path.resolve()),
+            prototype=o.prototype,
+            allow_writes=o.prototype or o.allow_writes,
+            started_utc_ns=self.clock.utc_ns(),
+            started_ns=self.started_ns,
+            pid=os.getpid(),
+            capture=str(o.capture.resolve()) if o.capture else "",
+            field_elsewhere=bool(o.field_host),
+        )
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:

@@ -1,0 +1,96 @@
+"""`fieldtwin studio`: see and operate running systems in the browser."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.completions import systems
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
+from fieldtwin.cli.options import Secret
+from fieldtwin.console import stderr
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.installation import install_hint
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Where the page is served, and how it is protected."""
+
+    listen: str = option(
+        "--listen", default="127.0.0.1:0", metavar="HOST:PORT", help="Where to serve; port 0: a free one."
+    )
+    names: tuple[str, ...] = option(
+        "--host-name", multiple=True, metavar="NAME", help="Another name of this computer that browsers may use."
+    )
+    certificate: Path | None = option(
+        "--certificate",
+        type=click.Path(dir_okay=False, path_type=Path),
+        default=None,
+        help="Serve HTTPS with this file (PEM).",
+    )
+    key: Path | None = option(
+        "--key", type=click.Path(dir_okay=False, path_type=Path), default=None, help="The key of the certificate (PEM)."
+    )
+    insecure: bool = option(
+        "--insecure", is_flag=True, help="Allow HTTP beyond this computer: others can read the token."
+    )
+    no_token: bool = option(
+        "--no-token", is_flag=True, help="On loopback only: every program of this computer may operate."
+    )
+    operate_token: str = option(
+        "--token", type=Secret(), default="", metavar="@FILE", help="Token of the role operate; default: a new one."
+    )
+    view_token: str = option(
+        "--view-token",
+        type=Secret(),
+        default="",
+        metavar="@FILE",
+        help="Token of the role view, which changes nothing.",
+    )
+
+
+@click.command("studio", cls=GroupedCommand)
+@click.argument("system", required=False, default="", shell_complete=systems)
+@click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
+@group("Server", server=ServerOptions)
+def command(system: str, no_browser: bool, server: ServerOptions) -> int:
+    """Serve a page that shows and operates the running systems of this computer: values, frames, PLC, trends and faults.
+
+    With SYSTEM its prototype is started first, and stopped at the end. Without it the page lists the running instances, the shipped
+    systems and those in the working directory.
+
+    The page is for this computer only, unless --listen names another address. Its address contains a token; everyone who has the
+    token can operate the systems.
+    """
+    try:
+        from fieldtwin.studio.server import Serving, StudioOptions, open_browser, serve
+    except ModuleNotFoundError as e:
+        raise UsageError(f"Studio needs {e.name}", hint=install_hint("studio")) from e
+    host, _, port = server.listen.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65_535:
+        raise UsageError("--listen", expected="HOST:PORT, such as 127.0.0.1:8080", got=server.listen)
+    options = StudioOptions(
+        host=host.strip("[]"),
+        port=int(port),
+        names=server.names,
+        certificate=server.certificate,
+        key=server.key,
+        insecure=server.insecure,
+        no_token=server.no_token,
+        operate_token=server.operate_token,
+        view_token=server.view_token,
+        system=system,
+    )
+    options.check()
+
+    def on_ready(serving: Serving) -> None:
+        stderr.print(f"Studio  →  {serving.url}", soft_wrap=True, markup=False, highlight=False)
+        if not no_browser and not open_browser(serving.url):
+            stderr.print("no browser was found: open this address yourself", soft_wrap=True)
+
+    asyncio.run(serve(options, on_ready))
+    return 0

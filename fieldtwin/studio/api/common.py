@@ -1,0 +1,50 @@
+"""What all handlers share: the gallery of a server, and the instance that a request is about."""
+
+from __future__ import annotations
+
+from starlette.requests import HTTPConnection
+
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.studio.api.errors import NotFound
+from fieldtwin.studio.live.attachment import Attachment
+from fieldtwin.studio.live.gallery import Gallery
+
+INSTANCE = "/instances/{instance}"
+
+
+def gallery_of(request: HTTPConnection) -> Gallery:
+    """Return the gallery of the server."""
+    gallery = request.app.state.gallery
+    assert isinstance(gallery, Gallery)
+    return gallery
+
+
+async def attached(request: HTTPConnection) -> Attachment:
+    """Return the instance that a request names. Raises `NoInstance`, and `FileInvalid` for a run of another version."""
+    return await gallery_of(request).attached(request.path_params["instance"])
+
+
+async def prototype(request: HTTPConnection) -> Attachment:
+    """Return the instance if its devices are simulated by this run. Raises `NotAllowed` for a plant."""
+    attachment = await attached(request)
+    if not attachment.record.prototype:
+        raise NotAllowed("a plant has no simulated devices", expected="an instance that runs with --prototype")
+    if attachment.record.field_elsewhere:
+        raise NotAllowed("the simulated devices of this run are on another host", hint="operate them there")
+    return attachment
+
+
+def tag_of(request: HTTPConnection, attachment: Attachment) -> tuple[str, str]:
+    """Return device and name of the tag that a request names. Raises `NotFound`."""
+    full = request.path_params["tag"]
+    device, _, name = full.rpartition(".")
+    config = attachment.system.devices.get(device)
+    if config is None or name not in config.profile.tags:
+        raise NotFound(f"the system has no tag {full!r}", expected="DEVICE.TAG")
+    return device, name
+
+
+def by_studio(request: HTTPConnection) -> str:
+    """Return the user for audit logs."""
+    client = request.client
+    return f"studio {client.host}" if client is not None else "studio"

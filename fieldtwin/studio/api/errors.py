@@ -1,0 +1,55 @@
+"""Errors of fieldtwin as HTTP answers."""
+
+from __future__ import annotations
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from fieldtwin.gateway.core.control import RemoteError
+from fieldtwin.gateway.core.errors import (
+    Bug,
+    DeviceRefused,
+    FieldtwinError,
+    NotAllowed,
+    Unreachable,
+    UsageError,
+    WireError,
+)
+from fieldtwin.studio.live.gallery import NoInstance
+
+STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
+    (NoInstance, 404),
+    (NotAllowed, 403),
+    (UsageError, 400),
+    (Unreachable, 503),
+    (WireError, 504),
+    (DeviceRefused, 502),
+)
+"""The first class that fits gives the status; any other error is 422, a bug 500."""
+
+
+class NotFound(UsageError):
+    """The interface has nothing under this name."""
+
+
+def status_of(error: FieldtwinError) -> int:
+    """Return the HTTP status of an error."""
+    if isinstance(error, NotFound):
+        return 404
+    if isinstance(error, RemoteError):
+        return 400 if error.remote_exit_code == UsageError.exit_code else 502
+    if isinstance(error, Bug):
+        return 500
+    return next((status for kind, status in STATUS if isinstance(error, kind)), 422)
+
+
+def described(error: FieldtwinError) -> dict[str, object]:
+    """Return an error as data for JSON."""
+    kind = error.kind if isinstance(error, RemoteError) else type(error).__name__
+    return {"error": {"kind": kind, "message": str(error)}}
+
+
+async def on_error(request: Request, error: Exception) -> Response:
+    """Answer a request that raised an error of fieldtwin."""
+    assert isinstance(error, FieldtwinError)
+    return JSONResponse(described(error), status_of(error))

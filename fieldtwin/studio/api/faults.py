@@ -1,0 +1,73 @@
+"""Faults of a prototype: the kinds with their forms, the active ones with their counts, injecting and clearing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+
+from fieldtwin.studio.api.common import INSTANCE, prototype
+from fieldtwin.studio.api.operation import Operation, body_of
+
+
+class InjectFault(msgspec.Struct, forbid_unknown_fields=True):
+    """A fault as in a fault file: ``{"name": "silence", "device": "ctd"}``. Its times count from now."""
+
+    fault: dict[str, Any]
+
+
+async def list_fault_kinds(request: Request) -> list[dict[str, Any]]:
+    """Return every kind of fault with its parameters as JSON schema, and what it can be aimed at."""
+    from fieldtwin.emulators.faults.registry import FAULTS  # here: a plant has no emulators installed
+    from fieldtwin.emulators.faults.schema import aims_of
+
+    return [
+        {
+            "name": name,
+            "kind": kind.kind.value if hasattr(kind.kind, "value") else str(kind.kind),
+            "summary": kind.summary,
+            "aims": aims_of(kind),
+            "parameters": kind.form.model_json_schema().get("properties", {}),
+        }
+        for name, kind in FAULTS.items()
+    ]
+
+
+async def list_faults(request: Request) -> dict[str, Any]:
+    """Return the active faults, every fault so far with the number of times it took effect, and the values that are set."""
+    attachment = await prototype(request)
+    field = msgspec.to_builtins(attachment.field) if attachment.field is not None else {}
+    return {"active": field.get("faults", []), "history": field.get("struck", []), "set": field.get("set", {})}
+
+
+async def inject_fault(request: Request) -> dict[str, Any]:
+    """Inject a fault and return its id."""
+    attachment = await prototype(request)
+    form = await body_of(request, InjectFault)
+    found = await attachment.field_channel.call("fault", fault=form.fault, start_ns=attachment.now_ns())
+    return {"id": found["id"], "active": found["faults"]}
+
+
+async def clear_fault(request: Request) -> dict[str, Any]:
+    """Clear one fault."""
+    attachment = await prototype(request)
+    found = await attachment.field_channel.call("clear", id=request.path_params["fault"])
+    return {"active": found["faults"]}
+
+
+async def clear_faults(request: Request) -> dict[str, Any]:
+    """Clear all faults."""
+    attachment = await prototype(request)
+    for fault in list(attachment.field.faults if attachment.field is not None else []):
+        await attachment.field_channel.call("clear", id=fault.id)
+    return {"active": []}
+
+
+OPERATIONS = (
+    Operation("GET", "/faults", list_fault_kinds, "List all kinds of faults with their parameters"),
+    Operation("GET", f"{INSTANCE}/faults", list_faults, "List the faults of an instance"),
+    Operation("POST", f"{INSTANCE}/faults", inject_fault, "Inject a fault", body=InjectFault, changes=True),
+    Operation("DELETE", f"{INSTANCE}/faults", clear_faults, "Clear all faults", changes=True),
+    Operation("DELETE", INSTANCE + "/faults/{fault:path}", clear_fault, "Clear one fault", changes=True),
+)

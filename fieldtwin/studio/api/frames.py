@@ -1,0 +1,154 @@
+"""Frames of the buses: pages of any position, filters, and exports."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+from starlette.responses import Response
+
+from fieldtwin.capture.formats.pcap import write_pcap
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.studio.api.common import INSTANCE, attached
+from fieldtwin.studio.api.errors import NotFound
+from fieldtwin.studio.api.operation import Operation, Parameter, whole, yes
+from fieldtwin.studio.live.attachment import Attachment
+from fieldtwin.studio.live.frame_log import FrameFilter, FrameLog, FrameRow
+
+MOST_ROWS = 500
+MOST_EXPORTED = 200_000
+FILTERS = (
+    Parameter("bus", "string", "only frames of this bus"),
+    Parameter("device", "string", "only frames of this device"),
+    Parameter("service", "string", "only frames of this function or service"),
+    Parameter("problems", "boolean", "only frames of failed exchanges"),
+)
+
+
+def _frames(attachment: Attachment) -> FrameLog:
+    if attachment.frames is None:
+        raise NotFound(
+            attachment.troubles.get("frames", "this run does not record the frames of its buses"),
+            hint="start it from Studio, with `fieldtwin run --studio`, or with --capture FILE",
+        )
+    return attachment.frames
+
+
+def _wanted(request: Request) -> FrameFilter:
+    given = request.query_params
+    return FrameFilter(
+        given.get("bus", ""), given.get("device", ""), given.get("service", ""), yes(request, "problems")
+    )
+
+
+async def list_frames(request: Request) -> dict[str, Any]:
+    """Return frames from a position on, among those that the filter accepts, and how many there are."""
+    frames, wanted = _frames(await attached(request)), _wanted(request)
+    total, count = frames.count(wanted), whole(request, "count", 100, 1, MOST_ROWS)
+    if (at := request.query_params.get("at_ns")) is not None:
+        start = max(0, frames.position_at(int(at) if at.isdigit() else 0, wanted) - count // 2)
+    else:
+        start = whole(request, "start", max(0, total - count))
+    rows = [shown(frames, number, row) for number, row in frames.page(start, count, wanted)]
+    return {"total": total, "start": start, "rows": rows, "behind_bytes": frames.behind_bytes, "full": frames.is_full}
+
+
+async def get_frame(request: Request) -> dict[str, Any]:
+    """Return one frame, with the frames that it belongs to."""
+    frames, text = _frames(await attached(request)), request.path_params["number"]
+    number = int(text) if text.isdigit() else -1
+    try:
+        row = frames.row(number)
+    except IndexError as e:
+        raise NotFound(f"no frame {text[:20]!r}", expected=f"0 to {len(frames) - 1}") from e
+    linked = [n for n in (row.request, frames.reply_to(number)) if n is not None]
+    return shown(frames, number, row) | {"linked": [shown(frames, n, frames.row(n)) for n in linked]}
+
+
+async def list_services(request: Request) -> list[str]:
+    """Return the functions and services that have occurred, for a filter."""
+    return _frames(await attached(request)).services()
+
+
+async def export_frames(request: Request) -> Response:
+    """Return a selection of frames as a file: pcap (one bus) or candump (CAN buses)."""
+    attachment = await attached(request)
+    frames, wanted = _frames(attachment), _wanted(request)
+    first, last = whole(request, "first", 0), whole(request, "last", len(frames) - 1)
+    if last - first >= MOST_EXPORTED:
+        raise UsageError("too many frames for one file", expected=f"at most {MOST_EXPORTED}", got=str(last - first + 1))
+    kind = request.query_params.get("format", "pcap")
+    offset_ns = attachment.record.started_utc_ns - attachment.record.started_ns
+    captured = frames.captured(first, last, wanted)
+    if kind == "candump":
+        lines = [
+            f"({(c.t_ns + offset_ns) / 1e9:.6f}) {_interface(str(c.endpoint))} {c.item}\n"
+            for c in captured
+            if isinstance(c.item, CanFrame)
+        ]
+        if not lines:
+            raise UsageError("there are no CAN frames in the selection", hint="format=pcap takes other buses")
+        return _file("".join(lines).encode("ascii"), "frames.log", "text/plain")
+    if kind != "pcap":
+        raise UsageError("the format", expected="pcap or candump", got=repr(kind[:20]))
+    endpoints = {str(c.endpoint): c.endpoint for c in captured}
+    if len(endpoints) != 1:
+        raise UsageError(
+            "a pcap file has the frames of one bus",
+            expected="the parameter bus",
+            got=", ".join(endpoints) or "no frame",
+        )
+    endpoint = next(iter(endpoints.values()))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frames.pcap"
+        await asyncio.to_thread(write_pcap, path, captured, endpoint, offset_ns)
+        return _file(path.read_bytes(), "frames.pcap", "application/vnd.tcpdump.pcap")
+
+
+def shown(frames: FrameLog, number: int, row: FrameRow) -> dict[str, Any]:
+    """Return a frame as data for JSON."""
+    told = msgspec.structs.asdict(row)
+    return {"number": number, **told, "verdict": frames.verdict(number), "reply": frames.reply_to(number)}
+
+
+def _interface(endpoint: str) -> str:
+    return endpoint.rpartition("/")[2] or "can0"
+
+
+def _file(content: bytes, name: str, kind: str) -> Response:
+    return Response(content, media_type=kind, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+OPERATIONS = (
+    Operation(
+        "GET",
+        f"{INSTANCE}/frames",
+        list_frames,
+        "Read a page of frames",
+        (
+            Parameter("start", "integer", "position of the first frame; by default the latest frames are returned"),
+            Parameter("count", "integer", f"how many, at most {MOST_ROWS}"),
+            Parameter("at_ns", "integer", "frames around this instant, in place of start"),
+            *FILTERS,
+        ),
+    ),
+    Operation("GET", f"{INSTANCE}/frames/services", list_services, "List the functions and services seen so far"),
+    Operation(
+        "GET",
+        f"{INSTANCE}/frames/export",
+        export_frames,
+        "Export frames",
+        (
+            Parameter("format", "string", "pcap or candump"),
+            Parameter("first", "integer", "number of the first frame"),
+            Parameter("last", "integer", "number of the last frame"),
+            *FILTERS,
+        ),
+    ),
+    Operation("GET", INSTANCE + "/frames/{number}", get_frame, "Read one frame and the frames linked with it"),
+)

@@ -1,0 +1,85 @@
+"""The PLC: variables and their origin, forces, pause and steps. The PLC records each intervention in its audit log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+
+from fieldtwin.studio.api.common import INSTANCE, attached, by_studio
+from fieldtwin.studio.api.operation import Operation, body_of
+
+
+class Force(msgspec.Struct, forbid_unknown_fields=True):
+    """A tag and the value that programs and outputs see until the force is removed."""
+
+    tag: str
+    value: float | bool | int
+
+
+class Steps(msgspec.Struct, forbid_unknown_fields=True):
+    """The number of scans that a paused PLC executes."""
+
+    count: int = 1
+
+
+async def get_plc(request: Request) -> Any:
+    """Return the status of the PLC with all inputs, outputs and variables."""
+    attachment = await attached(request)
+    return await attachment.plc_channel.call("get")
+
+
+async def get_why(request: Request) -> Any:
+    """Return which program last changed a tag, when, and what it had read."""
+    attachment = await attached(request)
+    return await attachment.plc_channel.call("why", tag=request.path_params["tag"])
+
+
+async def force_tag(request: Request) -> Any:
+    """Force a tag."""
+    attachment = await attached(request)
+    form = await body_of(request, Force)
+    return await attachment.plc_channel.call("force", tag=form.tag, value=form.value, by=by_studio(request))
+
+
+async def unforce_tag(request: Request) -> Any:
+    """Remove the force on a tag."""
+    attachment = await attached(request)
+    return await attachment.plc_channel.call("unforce", tag=request.path_params["tag"], by=by_studio(request))
+
+
+async def unforce_all(request: Request) -> Any:
+    """Remove all forces."""
+    attachment = await attached(request)
+    return await attachment.plc_channel.call("unforce", all=True, by=by_studio(request))
+
+
+async def pause_plc(request: Request) -> Any:
+    """Stop executing programs; outputs keep their values."""
+    return await (await attached(request)).plc_channel.call("pause", by=by_studio(request))
+
+
+async def continue_plc(request: Request) -> Any:
+    """Continue after a pause."""
+    return await (await attached(request)).plc_channel.call("go", by=by_studio(request))
+
+
+async def step_plc(request: Request) -> Any:
+    """Execute some scans while paused."""
+    attachment = await attached(request)
+    form = await body_of(request, Steps)
+    return await attachment.plc_channel.call("step", count=form.count, by=by_studio(request))
+
+
+PLC = f"{INSTANCE}/plc"
+OPERATIONS = (
+    Operation("GET", PLC, get_plc, "Read the PLC's status and variables"),
+    Operation("GET", PLC + "/why/{tag}", get_why, "Explain the value of a tag"),
+    Operation("POST", f"{PLC}/forces", force_tag, "Force a tag", body=Force, changes=True),
+    Operation("DELETE", f"{PLC}/forces", unforce_all, "Remove all forces", changes=True),
+    Operation("DELETE", PLC + "/forces/{tag}", unforce_tag, "Remove a force", changes=True),
+    Operation("POST", f"{PLC}/pause", pause_plc, "Pause the PLC", changes=True),
+    Operation("POST", f"{PLC}/continue", continue_plc, "Continue after a pause", changes=True),
+    Operation("POST", f"{PLC}/step", step_plc, "Execute scans while paused", body=Steps, changes=True),
+)

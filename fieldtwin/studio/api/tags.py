@@ -1,0 +1,81 @@
+"""Tags: present values, history, and values that are set in simulated devices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.studio.api.common import INSTANCE, attached, prototype, tag_of
+from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
+from fieldtwin.studio.live.tag_history import MOST_POINTS
+
+
+class SetValue(msgspec.Struct, forbid_unknown_fields=True):
+    """The value that a simulated device shall hold, in engineering units."""
+
+    value: float | bool
+
+
+async def list_tags(request: Request) -> dict[str, Any]:
+    """Return every tag with value, quality, reason and age in seconds."""
+    attachment = await attached(request)
+    status = attachment.status()
+    if status["gateway"] is None:
+        raise Unreachable(attachment.troubles.get("gateway", "the gateway has not answered yet"))
+    tags: dict[str, Any] = status["gateway"]["tags"]
+    return tags
+
+
+async def get_history(request: Request) -> dict[str, Any]:
+    """Return the changes of a tag: [time in ns, value, quality, reason]."""
+    attachment = await attached(request)
+    device, name = tag_of(request, attachment)
+    now_ns = attachment.now_ns()
+    from_ns, to_ns = whole(request, "from_ns", 0), whole(request, "to_ns", now_ns)
+    points = whole(request, "points", MOST_POINTS, 4, MOST_POINTS)
+    found, thinned = attachment.history.between(f"{device}.{name}", from_ns, to_ns, points)
+    return {"points": [list(point) for point in found], "thinned": thinned, "now_ns": now_ns}
+
+
+async def set_value(request: Request) -> dict[str, Any]:
+    """Let a simulated device hold a value until it is released. This is a fault of kind `set`."""
+    attachment = await prototype(request)
+    device, name = tag_of(request, attachment)
+    form = await body_of(request, SetValue)
+    number = float(form.value)
+    if number != number or number in (float("inf"), float("-inf")):
+        raise UsageError("the value", expected="a finite number")
+    await attachment.field_channel.call("set", device=device, tag=name, value=number)
+    return {"tag": f"{device}.{name}", "value": number}
+
+
+async def release_value(request: Request) -> dict[str, Any]:
+    """Give a simulated device its own value back."""
+    attachment = await prototype(request)
+    device, name = tag_of(request, attachment)
+    await attachment.field_channel.call("set", device=device, tag=name, value=None)
+    return {"tag": f"{device}.{name}", "value": None}
+
+
+TAG = INSTANCE + "/tags/{tag}"
+OPERATIONS = (
+    Operation("GET", f"{INSTANCE}/tags", list_tags, "Read all tags"),
+    Operation(
+        "GET",
+        f"{TAG}/history",
+        get_history,
+        "Read the history of a tag",
+        (
+            Parameter("from_ns", "integer", "begin, on the run's monotonic clock"),
+            Parameter("to_ns", "integer", "end"),
+            Parameter(
+                "points", "integer", "at most this many points; more are thinned out, extremes and bad values stay"
+            ),
+        ),
+    ),
+    Operation("PUT", f"{TAG}/set", set_value, "Set a value in a simulated device", body=SetValue, changes=True),
+    Operation("DELETE", f"{TAG}/set", release_value, "Release a value that was set", changes=True),
+)

@@ -1,0 +1,196 @@
+"""Observe one running instance through its control channels and its capture.
+
+The statuses of gateway, PLC and field simulator are read twice to five times a second, changes of tags ten times a second. A process
+that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.plc.status import WholePlcStatus
+from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord
+from fieldtwin.studio.live.channel import Channel
+from fieldtwin.studio.live.frame_log import FrameLog
+from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
+from fieldtwin.studio.live.observed import describe_system
+from fieldtwin.studio.live.subscription import Publisher
+from fieldtwin.studio.live.tag_history import Point, TagHistory
+from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.site.resolved import read_resolved
+from fieldtwin.twin.site.system import System
+
+TAGS_EVERY_S = 0.1
+GATEWAY_EVERY_S = 0.5
+PLC_EVERY_S = 0.25
+FIELD_EVERY_S = 0.5
+FRAMES_EVERY_S = 0.05
+AGAIN_AFTER_S = 1.0
+"""Pause in seconds before a process that did not answer is asked again."""
+SECRET = "(secret)"
+NONE_OF_THEM = 1 << 62
+"""The number after which the refused writes are wanted: the status has them already."""
+
+
+class Attachment:
+    """``async with Attachment(found, clock) as attachment``: one instance, observed until the block ends.
+
+    `gateway`, `plc` and `field` are the latest statuses, None while a process does not answer; `troubles` gives the reasons.
+    """
+
+    def __init__(self, found: FoundInstance, clock: Clock) -> None:
+        if found.record is None:
+            raise FileInvalid(found.trouble or "the run directory has no record of a run", path=str(found.dir))
+        self.name = found.name
+        self.dir = found.dir
+        self.record: RunRecord = found.record
+        [system] = read_resolved(str(found.dir / SYSTEM_FILE))
+        assert isinstance(system, System)
+        self.system = system
+        self.description = describe_system(system)
+        self.gateway: GatewayStatus | None = None
+        self.plc: WholePlcStatus | None = None
+        self.field: FieldStatus | None = None
+        self.troubles: dict[str, str] = {}
+        self.updates = Publisher()
+        self.gateway_channel = Channel(found.dir / GATEWAY_SOCKET, "gateway")
+        self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
+        self.field_channel = Channel(found.dir / FIELD_SOCKET, "field simulator")
+        self.history_from_ns = clock.monotonic_ns()
+        """Since when changes of tags are recorded: the start of the observation."""
+        self.changes_lost = 0
+        """Changes of tags that the gateway had dropped before they were read."""
+        self.frames: FrameLog | None = None
+        self._clock = clock
+        self._secrets = {
+            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values() if t.secret
+        }
+        self.history = TagHistory(
+            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()
+        )
+        self._seen_change: int | None = None
+        """The number of the latest change that was read, None before the first answer."""
+        self._nursery = Nursery()
+
+    async def __aenter__(self) -> Attachment:
+        if self.record.capture:
+            try:
+                self.frames = FrameLog(Path(self.record.capture), self.system)
+            except FileInvalid as e:
+                self.troubles["frames"] = str(e)
+        self._nursery.start(self._repeat("tags", self._read_tags, TAGS_EVERY_S), "tags")
+        self._nursery.start(self._repeat("gateway", self._read_gateway, GATEWAY_EVERY_S), "gateway")
+        self._nursery.start(self._repeat("plc", self._read_plc, PLC_EVERY_S), "plc")
+        if self.record.prototype and not self.record.field_elsewhere:
+            self._nursery.start(self._repeat("field", self._read_field, FIELD_EVERY_S), "field")
+        if self.frames is not None:
+            self._nursery.start(self._follow_frames(self.frames), "frames")
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        self.updates.end()
+        await self._nursery.__aexit__(None, None, None)
+        for channel in (self.gateway_channel, self.plc_channel, self.field_channel):
+            await channel.aclose()
+        if self.frames is not None:
+            self.frames.close()
+
+    @property
+    def running(self) -> bool:
+        """Return whether the gateway answers."""
+        return self.gateway is not None
+
+    def now_ns(self) -> int:
+        """Return the present time on the run's monotonic clock."""
+        return self._clock.monotonic_ns()
+
+    def status(self) -> dict[str, Any]:
+        """Return the statuses, as data for JSON."""
+        gateway = msgspec.to_builtins(self.gateway) if self.gateway is not None else None
+        if gateway is not None:
+            for name in self._secrets & gateway["tags"].keys():
+                gateway["tags"][name] |= {"value": SECRET}
+        frames = self.frames
+        return {
+            "now_ns": self.now_ns(),
+            "gateway": gateway,
+            "plc": msgspec.to_builtins(self.plc) if self.plc is not None else None,
+            "field": msgspec.to_builtins(self.field) if self.field is not None else None,
+            "troubles": dict(self.troubles),
+            "frames": None
+            if frames is None
+            else {"total": len(frames), "behind_bytes": frames.behind_bytes, "full": frames.is_full},
+        }
+
+    def point(self, name: str, t_ns: int, value: Any, quality: str, reason: str) -> Point:
+        """Return a change of a tag, without the value of a secret."""
+        return Point(t_ns, SECRET if name in self._secrets else value, quality, reason)
+
+    async def _repeat(self, what: str, read: Callable[[], Awaitable[None]], every_s: float) -> None:
+        while True:
+            try:
+                await read()
+            except FieldtwinError as e:
+                self._lost(what, str(e))
+                await asyncio.sleep(AGAIN_AFTER_S)
+                continue
+            self.troubles.pop(what, None)
+            await asyncio.sleep(every_s)
+
+    def _lost(self, what: str, reason: str) -> None:
+        if what == "gateway":
+            self.gateway = None
+        elif what == "plc":
+            self.plc = None
+        elif what == "field":
+            self.field = None
+        if self.troubles.get(what) != reason:
+            self.troubles[what] = reason
+            self.updates.publish({"type": "status", "status": self.status()})
+
+    async def _read_gateway(self) -> None:
+        self.gateway = await self.gateway_channel.ask("get", GatewayStatus)
+        self.updates.publish({"type": "status", "status": self.status()})
+
+    async def _read_plc(self) -> None:
+        self.plc = await self.plc_channel.ask("get", WholePlcStatus)
+
+    async def _read_field(self) -> None:
+        self.field = await self.field_channel.ask("get", FieldStatus)
+
+    async def _read_tags(self) -> None:
+        names = self.history.names() if self._seen_change is None else []
+        since = self._seen_change or 0
+        answer = await self.gateway_channel.call("watch", since=since, names=names, refused=NONE_OF_THEM)
+        if answer["last"] < since:  # another gateway, whose numbers begin again
+            self._seen_change = None
+            return
+        for name, (value, quality, reason, t_ns) in answer["tags"].items():
+            self.history.add(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
+        changes = []
+        for _, t_ns, name, value, quality, reason in answer["changes"]:
+            point = self.point(name, t_ns, value, quality, reason)
+            self.history.add(name, point)
+            changes.append([name, *point])
+        self.changes_lost += answer["dropped"]
+        self._seen_change = answer["changes"][-1][0] if answer["changes"] else answer["last"]
+        if changes:
+            self.updates.publish({"type": "tags", "changes": changes})
+
+    async def _follow_frames(self, frames: FrameLog) -> None:
+        told = -1
+        while True:
+            new = frames.follow()
+            if len(frames) != told and (not new or frames.behind_bytes < 1 << 16):
+                told = len(frames)
+                self.updates.publish({"type": "frames", "total": told, "behind_bytes": frames.behind_bytes})
+            await asyncio.sleep(0 if new else FRAMES_EVERY_S)

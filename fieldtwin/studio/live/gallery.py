@@ -1,0 +1,62 @@
+"""The instances that Studio observes: each is attached when a page first asks for it, and kept until Studio ends."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.studio.live.attachment import Attachment
+from fieldtwin.studio.live.instances import find_instance, find_instances
+
+MOST_ATTACHED = 8
+
+
+class NoInstance(UsageError):
+    """There is no instance of this name."""
+
+
+class Gallery:
+    """``async with Gallery(clock) as gallery``: the attached instances by name."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._attached: dict[str, tuple[Attachment, AsyncExitStack]] = {}
+        self._lock = asyncio.Lock()
+
+    async def __aenter__(self) -> Gallery:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        for name in list(self._attached):
+            await self._detach(name)
+
+    async def attached(self, name: str) -> Attachment:
+        """Return the attachment of an instance.
+
+        A run that was started again under the same name is attached anew. Raises `NoInstance`, and `FileInvalid` for a run of
+        another version.
+        """
+        async with self._lock:
+            found = await find_instance(name)
+            if found is None:
+                others = ", ".join(other.name for other in await find_instances())
+                raise NoInstance(
+                    f"no instance {name!r} on this computer", expected=others or "an instance; there is none"
+                )
+            known = self._attached.get(name)
+            if known is not None and (found.record is None or found.record == known[0].record):
+                return known[0]
+            if known is not None:
+                await self._detach(name)
+            while len(self._attached) >= MOST_ATTACHED:
+                await self._detach(next(iter(self._attached)))
+            stack = AsyncExitStack()
+            attachment = await stack.enter_async_context(Attachment(found, self._clock))
+            self._attached[name] = attachment, stack
+            return attachment
+
+    async def _detach(self, name: str) -> None:
+        _, stack = self._attached.pop(name)
+        await stack.aclose()

@@ -1,0 +1,92 @@
+"""The history of tags: for each tag its latest changes, with quality and reason, and thinned out for a diagram of some width."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+MOST_CHANGES = 2_000_000
+"""Changes that are kept of all tags together: about 300 MB."""
+MOST_OF_A_TAG = 100_000
+LEAST_OF_A_TAG = 1_000
+MOST_POINTS = 5_000
+"""Points in one answer."""
+
+GOOD = "good"
+
+
+class Point(NamedTuple):
+    """A value from `t_ns` on, until the next point. `t_ns` counts on the run's monotonic clock."""
+
+    t_ns: int
+    value: Any
+    quality: str
+    reason: str
+
+
+class TagHistory:
+    """The changes of the tags of one run, the oldest ones dropped first."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        names = list(names)
+        room = min(MOST_OF_A_TAG, max(LEAST_OF_A_TAG, MOST_CHANGES // max(1, len(names))))
+        self._points: dict[str, deque[Point]] = {name: deque(maxlen=room) for name in names}
+
+    def add(self, name: str, point: Point) -> None:
+        """Add a change. Tags that are not in the system are ignored."""
+        points = self._points.get(name)
+        if points is not None:
+            points.append(point)
+
+    def names(self) -> list[str]:
+        """Return the names of all tags."""
+        return list(self._points)
+
+    def at(self, name: str, t_ns: int) -> Point | None:
+        """Return the point that was valid at an instant, None before the first one."""
+        return next((point for point in reversed(self._points[name]) if point.t_ns <= t_ns), None)
+
+    def between(self, name: str, from_ns: int, to_ns: int, points: int = MOST_POINTS) -> tuple[list[Point], bool]:
+        """Return the points of a tag in an interval, at most `points`, and whether they were thinned out.
+
+        The first one is the point that was valid at the beginning. Thinning keeps of each part of the interval the first, the
+        smallest, the largest and the last value, and every change of quality.
+        """
+        found: list[Point] = []
+        for point in reversed(self._points[name]):
+            if point.t_ns > to_ns:
+                continue
+            found.append(point)
+            if point.t_ns <= from_ns:
+                break
+        found.reverse()
+        if len(found) <= points:
+            return found, False
+        return _thinned(found, from_ns, to_ns, max(1, points // 4)), True
+
+
+def _thinned(points: list[Point], from_ns: int, to_ns: int, parts: int) -> list[Point]:
+    """Return at most about four points for each of `parts` equal parts of the interval, and all changes of quality."""
+    width_ns = max(1, (to_ns - from_ns) // parts)
+    kept: list[Point] = []
+    bucket: list[Point] = []
+    number = -1
+    for point in points:
+        here = max(0, point.t_ns - from_ns) // width_ns
+        changed = bucket and (point.quality, point.reason) != (bucket[-1].quality, bucket[-1].reason)
+        if here != number or changed:
+            kept += _extremes(bucket)
+            bucket, number = [], here
+        bucket.append(point)
+    return kept + _extremes(bucket)
+
+
+def _extremes(bucket: list[Point]) -> list[Point]:
+    if len(bucket) <= 4:
+        return bucket
+    numbers = [p for p in bucket if isinstance(p.value, int | float)]
+    chosen = {bucket[0], bucket[-1]}
+    if numbers:
+        chosen |= {min(numbers, key=lambda p: p.value), max(numbers, key=lambda p: p.value)}
+    return sorted(chosen, key=lambda p: p.t_ns)

@@ -1,0 +1,168 @@
+"""Run Studio's web server until it is asked to stop."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import ssl
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from pathlib import Path
+
+import uvicorn
+
+from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
+from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, UsageError, os_reason
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.studio.access import Access, allowed_hosts, new_token
+from fieldtwin.studio.app import application
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+CLOSES_WITHIN_S = 2
+MOST_CONNECTIONS = 200
+
+
+@dataclass(frozen=True)
+class StudioOptions:
+    """Where the server listens and who may use it.
+
+    `port` 0 chooses a free port. `names` are further names of this computer that browsers may use. An empty token is made, unless
+    `no_token` is set, which is for loopback only.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    names: tuple[str, ...] = ()
+    certificate: Path | None = None
+    key: Path | None = None
+    insecure: bool = False
+    no_token: bool = False
+    operate_token: str = field(default="", repr=False)
+    view_token: str = field(default="", repr=False)
+    system: str = ""
+    """A system whose prototype is started with the server; empty for none."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for a combination that would let others operate a plant."""
+        if self.is_loopback:
+            return
+        if self.no_token:
+            raise UsageError("--no-token is for loopback only", got=f"--listen {self.host}")
+        if self.certificate is None and not self.insecure:
+            raise UsageError(
+                "without TLS everyone on the network can read the token",
+                expected="--certificate and --key, or --insecure",
+                got=f"--listen {self.host}",
+            )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Return whether only programs on this computer can connect."""
+        if self.host in LOOPBACK:
+            return True
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+
+@dataclass(frozen=True)
+class Serving:
+    """A server that accepts connections. `url` contains the token for the role operate."""
+
+    url: str
+    address: str
+    access: Access
+
+
+async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> None:
+    """Serve until SIGINT or SIGTERM. `on_ready` is called once, when the server accepts connections.
+
+    Raises `UsageError`, `EndpointBusy`, `Unreachable` or `FileInvalid`.
+    """
+    options.check()
+    listener = _listener(options)
+    port = listener.getsockname()[1]
+    names = {options.host, *options.names} | (set(LOOPBACK) if options.is_loopback else set())
+    operate = "" if options.no_token else options.operate_token or new_token()
+    access = Access(allowed_hosts(names, port), operate, options.view_token)
+    app = application(access, WallClock(), Path.cwd())
+    config = uvicorn.Config(
+        app,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        lifespan="on",
+        ws="websockets-sansio",
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=CLOSES_WITHIN_S,
+        ssl_certfile=str(options.certificate) if options.certificate else None,
+        ssl_keyfile=str(options.key) if options.key else None,
+    )
+    server = _Server(config)
+    try:
+        config.load()
+    except (ssl.SSLError, OSError) as e:
+        raise FileInvalid(f"the certificate or its key cannot be used: {e}", path=str(options.certificate)) from e
+    on_stop_signal(server.stop)
+    running = asyncio.ensure_future(server.serve(sockets=[listener]))
+    try:
+        while not server.started and not running.done():
+            await asyncio.sleep(0.01)
+        if running.done():
+            running.result()
+            raise Unreachable("the server did not start", where=options.host)
+        scheme = "https" if options.certificate else "http"
+        shown = f"[{options.host}]" if ":" in options.host else options.host
+        address = f"{scheme}://{shown}:{port}/"
+        instance = await app.state.launcher.start(options.system) if options.system else ""
+        url = (f"{address}?token={operate}" if operate else address) + (f"#/{instance}" if instance else "")
+        on_ready(Serving(url, address, access))
+        await running
+    finally:
+        server.stop()
+        await asyncio.gather(running, return_exceptions=True)
+        listener.close()
+
+
+def open_browser(url: str) -> bool:
+    """Open the user's browser; return False if there is none."""
+    try:
+        return webbrowser.open(url)
+    except webbrowser.Error:
+        return False
+
+
+class _Server(uvicorn.Server):
+    """A server whose signals are handled by the caller."""
+
+    def install_signal_handlers(self) -> None:
+        return None
+
+    def capture_signals(self):  # type: ignore[no-untyped-def]
+        from contextlib import nullcontext
+
+        return nullcontext()
+
+    def stop(self) -> None:
+        self.should_exit = True
+
+
+def _listener(options: StudioOptions) -> socket.socket:
+    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((options.host, options.port))
+        listener.listen(128)
+    except OSError as e:
+        listener.close()
+        where = f"{options.host}:{options.port}"
+        if e.errno in (98, 48):
+            raise EndpointBusy(
+                "another program listens there", where=where, hint="--listen HOST:0 selects a free port"
+            ) from e
+        raise Unreachable(f"cannot listen: {os_reason(e)}", where=where) from e
+    return listener

@@ -1,0 +1,74 @@
+// Parts that several views share.
+
+import { html, useEffect, useRef, useState } from "../vendor/preact.js";
+import { reason } from "./format.js";
+
+export const Quality = ({ quality, why }) =>
+  html`<span class="chip ${quality}" title=${reason(why)}>${quality}${why && why !== "none" ? `: ${reason(why)}` : ""}</span>`;
+
+export const Failure = ({ text }) => (text ? html`<p class="error" role="alert">${text}</p>` : null);
+
+/** Run an action and keep its error for display: [run, error, busy]. */
+export function useAction() {
+  const [error, setError] = useState("");
+  const [busy, setBusy] = useState(false);
+  const run = async (action) => {
+    setBusy(true);
+    setError("");
+    try {
+      return await action();
+    } catch (e) {
+      setError(e.message);
+      return undefined;
+    } finally {
+      setBusy(false);
+    }
+  };
+  return [run, error, busy];
+}
+
+/** Fetch something when `keys` change: [result, error, fetch again]. */
+export function useFetched(fetcher, keys) {
+  const [state, setState] = useState({ result: null, error: "" });
+  const [round, setRound] = useState(0);
+  useEffect(() => {
+    let current = true;
+    fetcher().then(
+      (result) => current && setState({ result, error: "" }),
+      (e) => current && setState({ result: null, error: e.message }),
+    );
+    return () => (current = false);
+  }, [...keys, round]);
+  return [state.result, state.error, () => setRound((n) => n + 1)];
+}
+
+/** A modal dialog; Escape and Cancel close it. */
+export function Dialog({ title, onClose, children }) {
+  const ref = useRef(null);
+  useEffect(() => {
+    ref.current.showModal();
+  }, []);
+  return html`<dialog ref=${ref} onClose=${onClose} aria-label=${title}>
+    <h2>${title}</h2>
+    ${children}
+  </dialog>`;
+}
+
+/** The values of the last minute as a small line; times without a good value are shaded. */
+export function Sparkline({ points, now, width = 110, height = 22 }) {
+  if (!points?.length) return html`<svg class="spark" width=${width} height=${height} aria-hidden="true"></svg>`;
+  const span = 60e9;
+  const x = (t) => Math.max(0, width * (1 - (now - t) / span));
+  const numbers = points.filter((p) => p[1] !== null).map((p) => p[1]);
+  const low = Math.min(...numbers);
+  const high = Math.max(...numbers);
+  const y = (v) => (high === low ? height / 2 : height - 2 - ((v - low) / (high - low)) * (height - 4));
+  let path = "";
+  const gaps = [];
+  points.forEach(([t, v], n) => {
+    const end = x(n + 1 < points.length ? points[n + 1][0] : now);
+    if (v === null) gaps.push(html`<rect class="gap" x=${x(t)} y="0" width=${Math.max(1, end - x(t))} height=${height} />`);
+    else path += `${path && points[n - 1]?.[1] !== null ? "L" : "M"}${x(t).toFixed(1)},${y(v).toFixed(1)}L${end.toFixed(1)},${y(v).toFixed(1)}`;
+  });
+  return html`<svg class="spark" width=${width} height=${height} aria-hidden="true">${gaps}<path d=${path} /></svg>`;
+}

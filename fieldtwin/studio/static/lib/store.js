@@ -1,0 +1,132 @@
+// The state of one instance in this page: its description, the latest statuses, and the latest value of each tag.
+
+import { useEffect, useState } from "../vendor/preact.js";
+import { follow, get, of } from "./api.js";
+
+const RECENT_MS = 60_000;
+const MOST_RECENT = 600;
+
+export class Store {
+  constructor(name) {
+    this.name = name;
+    this.about = null; // what GET /instances/NAME says
+    this.status = null;
+    this.error = "";
+    this.connected = false;
+    this.dropped = 0;
+    this.frames = { total: 0, behind_bytes: 0 };
+    this.recent = new Map(); // tag -> [[time in ns, number or null], ...] of the last minute, for sparklines
+    this.changed = new Map(); // tag -> time in ns of the last change
+    this.rates = {}; // bus -> requests in a second
+    this.listeners = new Set();
+    this.waiting = 0;
+    this.path = of(name);
+  }
+
+  async open() {
+    try {
+      this.about = await get(this.path);
+    } catch (error) {
+      this.error = error.message;
+      this.tell();
+      return;
+    }
+    this.leave = follow(
+      this.name,
+      (update) => this.take(update),
+      (connected) => {
+        this.connected = connected;
+        this.tell();
+      },
+    );
+    this.tell();
+  }
+
+  close() {
+    this.leave?.();
+    cancelAnimationFrame(this.waiting);
+  }
+
+  take(update) {
+    if (update.type === "hello" || update.type === "status") this.takeStatus(update.status);
+    else if (update.type === "tags") this.takeTags(update.changes);
+    else if (update.type === "frames") this.frames = update;
+    else if (update.type === "dropped") this.dropped = update.count;
+    this.tell();
+  }
+
+  takeStatus(status) {
+    const before = this.status;
+    if (before?.gateway && status.gateway) {
+      const seconds = (status.now_ns - before.now_ns) / 1e9;
+      for (const [name, bus] of Object.entries(status.gateway.buses)) {
+        const count = traffic(bus) - traffic(before.gateway.buses[name]);
+        if (seconds > 0.2) this.rates[name] = Math.max(0, count / seconds);
+      }
+    }
+    this.status = status;
+    this.at = performance.now();
+    if (status.frames) this.frames = status.frames;
+  }
+
+  takeTags(changes) {
+    for (const [name, t, value, quality, reason] of changes) {
+      const seen = this.status?.gateway?.tags?.[name];
+      if (seen) {
+        Object.assign(seen, { value, quality, reason, age_s: (this.status.now_ns - t) / 1e9 });
+        delete seen.text;
+      }
+      this.changed.set(name, t);
+      const points = this.recent.get(name) ?? [];
+      points.push([t, quality === "good" && typeof value !== "string" ? Number(value) : null]);
+      const oldest = t - RECENT_MS * 1e6;
+      while (points.length > MOST_RECENT || (points.length > 1 && points[1][0] < oldest)) points.shift();
+      this.recent.set(name, points);
+    }
+  }
+
+  /** The present time on the run's clock. */
+  now() {
+    return this.status ? this.status.now_ns + (performance.now() - this.at) * 1e6 : 0;
+  }
+
+  get tags() {
+    return this.status?.gateway?.tags ?? {};
+  }
+
+  get mayOperate() {
+    return this.about?.role === "operate";
+  }
+
+  get isPrototype() {
+    return this.about?.mode === "prototype";
+  }
+
+  tagOf(full) {
+    const at = full.lastIndexOf(".");
+    return this.about?.system.devices[full.slice(0, at)]?.tags[full.slice(at + 1)];
+  }
+
+  /** Views are drawn once a frame at most, however many updates arrive. */
+  tell() {
+    if (this.waiting) return;
+    this.waiting = requestAnimationFrame(() => {
+      this.waiting = 0;
+      for (const listener of this.listeners) listener();
+    });
+  }
+}
+
+const traffic = (bus) =>
+  bus ? (bus.counters.requests ?? bus.counters.sdo_requests ?? 0) + (bus.counters.pdos ?? 0) + (bus.counters.heartbeats ?? 0) : 0;
+
+/** Draw the component again when the store changes. */
+export function useStore(store) {
+  const [, again] = useState(0);
+  useEffect(() => {
+    const listener = () => again((n) => n + 1);
+    store.listeners.add(listener);
+    return () => store.listeners.delete(listener);
+  }, [store]);
+  return store;
+}

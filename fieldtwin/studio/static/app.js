@@ -1,0 +1,144 @@
+// The frame of the page: which instance and which view the address names, navigation, and warnings that are visible on every view.
+
+import { html, render, useEffect, useState } from "./vendor/preact.js";
+import { address } from "./lib/address.js";
+import { remove } from "./lib/api.js";
+import { Failure, useAction } from "./lib/parts.js";
+import { Store, useStore } from "./lib/store.js";
+import { number } from "./lib/format.js";
+import { Home } from "./views/home.js";
+import { Overview } from "./views/overview.js";
+import { Devices } from "./views/devices.js";
+import { Bus } from "./views/bus.js";
+import { Plc } from "./views/plc.js";
+import { Trends } from "./views/trends.js";
+import { Faults } from "./views/faults.js";
+
+const VIEWS = {
+  overview: { title: "Overview", view: Overview },
+  devices: { title: "Devices", view: Devices },
+  bus: { title: "Bus", view: Bus, fill: true },
+  plc: { title: "PLC", view: Plc },
+  trends: { title: "Trends", view: Trends },
+  faults: { title: "Faults", view: Faults, prototype: true },
+};
+
+function readAddress() {
+  const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
+  const [instance = "", view = "overview"] = path.split("/").map(decodeURIComponent);
+  return { instance, view: view in VIEWS ? view : "overview", query: new URLSearchParams(query ?? "") };
+}
+
+function App() {
+  const [place, setPlace] = useState(readAddress());
+  useEffect(() => {
+    const changed = () => setPlace(readAddress());
+    addEventListener("hashchange", changed);
+    return () => removeEventListener("hashchange", changed);
+  }, []);
+  useEffect(() => {
+    document.title = place.instance ? `${place.instance}: ${VIEWS[place.view].title} · Studio` : "fieldtwin Studio";
+  }, [place]);
+  if (!place.instance) return html`<${Home} />`;
+  return html`<${Instance} key=${place.instance} place=${place} />`;
+}
+
+function Instance({ place }) {
+  const [store] = useState(() => new Store(place.instance));
+  useEffect(() => {
+    store.open();
+    return () => store.close();
+  }, [store]);
+  useStore(store);
+  const { view: View, fill } = VIEWS[place.view];
+  return html`<div class="frame">
+    <${Top} store=${store} />
+    <${Banners} store=${store} />
+    <nav class="nav" aria-label="Views">
+      ${Object.entries(VIEWS).map(
+        ([name, { title, prototype }]) =>
+          (!prototype || store.isPrototype) &&
+          html`<a href=${address(place.instance, name)} aria-current=${name === place.view ? "page" : null}>
+            ${title} <${Count} store=${store} view=${name} />
+          </a>`,
+      )}
+    </nav>
+    <main class=${fill ? "fill" : ""} id="view">
+      ${store.error && html`<${Failure} text=${store.error} /><p><a href="#/">All instances</a></p>`}
+      ${store.about && html`<${View} store=${store} query=${place.query} key=${place.view} />`}
+      ${!store.about && !store.error && html`<p class="empty">Reading the instance …</p>`}
+    </main>
+  </div>`;
+}
+
+function Count({ store, view }) {
+  const forces = Object.keys(store.status?.plc?.forces ?? {}).length;
+  const faults = (store.status?.field?.faults?.length ?? 0) + Object.keys(store.status?.field?.set ?? {}).length;
+  const count = view === "plc" ? forces : view === "faults" ? faults : 0;
+  return count ? html`<span class="count" title=${view === "plc" ? "active forces" : "active faults"}>${count}</span>` : null;
+}
+
+function Top({ store }) {
+  const mode = store.about?.mode;
+  const writes = mode === "plant" && (store.about.allow_writes ? "writes allowed" : "read-only");
+  const program = Object.entries(store.status?.plc?.variables ?? {}).filter(([name]) => name.endsWith(".state"));
+  return html`<header class="top">
+    <a class="brand" href="#/">fieldtwin Studio</a>
+    <strong>${store.name}</strong>
+    ${mode && html`<span class="chip ${mode === "plant" ? "warn" : "accent"}">${mode}${writes ? `, ${writes}` : ""}</span>`}
+    ${program.map(([name, value]) => html`<span class="chip">${name.replace(/\.state$/, "")}: ${stateName(store, value)}</span>`)}
+    <span class="grow"></span>
+    ${store.about?.role === "view" && html`<span class="chip">view only</span>`}
+    ${store.dropped > 0 && html`<span class="chip warn" title="This page was too slow to take them">${store.dropped} updates lost</span>`}
+    <span class="chip ${store.connected ? "good" : "bad"}" role="status">${store.connected ? "live" : "not connected"}</span>
+    <${Theme} />
+  </header>`;
+}
+
+const STATES = { 0: "STANDBY", 1: "ACTIVE", 2: "OFF" };
+const stateName = (store, value) => (typeof value === "number" ? (STATES[value] ?? number(value)) : number(value));
+
+function Theme() {
+  const [theme, setTheme] = useState(document.documentElement.dataset.theme ?? "");
+  const dark = theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  const change = () => {
+    const next = dark ? "light" : "dark";
+    document.documentElement.dataset.theme = next;
+    setTheme(next);
+  };
+  return html`<button class="quiet" onClick=${change}>${dark ? "Light" : "Dark"}</button>`;
+}
+
+function Banners({ store }) {
+  const [run, error] = useAction();
+  const { gateway, plc, field } = store.status ?? {};
+  const forces = Object.entries(plc?.forces ?? {});
+  const set = Object.entries(field?.set ?? {});
+  const troubles = Object.entries(store.status?.troubles ?? {}).filter(([what]) => what !== "tags" || !store.status.troubles.gateway);
+  return html`<div class="banners">
+    ${!store.connected && store.about && html`<div class="banner bad" role="alert">The connection to Studio's server is lost: values below are old.</div>`}
+    ${troubles.map(([, text]) => html`<div class="banner bad" role="alert"><span class="grow">${text}</span></div>`)}
+    ${plc?.error && html`<div class="banner bad" role="alert"><span class="grow">PLC: ${plc.error} ${plc.error_at}</span></div>`}
+    ${plc?.state === "paused" && html`<div class="banner" role="alert">The PLC is paused: it executes no program, and its outputs keep their values.</div>`}
+    ${forces.length > 0 &&
+    html`<div class="banner" role="alert">
+      <span class="grow">Forced: ${forces.map(([tag, f]) => `${tag} = ${number(f.value)}${f.by ? ` by ${f.by}` : ""}`).join(", ")}</span>
+      ${store.mayOperate && html`<button onClick=${() => run(() => remove(`${store.path}/plc/forces`))}>Remove all forces</button>`}
+    </div>`}
+    ${(field?.faults?.length > 0 || set.length > 0) &&
+    html`<div class="banner" role="status">
+      <span class="grow"
+        >Faults:
+        ${[
+          ...(field.faults ?? []).map((f) => `${f.name} on ${f.device || f.bus}`),
+          ...set.map(([tag, v]) => `${tag} set to ${number(v)}`),
+        ].join(", ")}</span
+      >
+      <a href=${address(store.name, "faults")}>Show</a>
+    </div>`}
+    ${gateway && !gateway.plc.alive && html`<div class="banner bad" role="alert">The gateway receives nothing from the PLC.</div>`}
+    <${Failure} text=${error} />
+  </div>`;
+}
+
+render(html`<${App} />`, document.getElementById("app"));

@@ -1,0 +1,191 @@
+// The frames of the buses. Only the rows in view are fetched and drawn, so a million frames scroll like a hundred.
+
+import { html, useCallback, useEffect, useRef, useState } from "../vendor/preact.js";
+import { get, url } from "../lib/api.js";
+import { clock, hex, milliseconds, number } from "../lib/format.js";
+import { Failure, useFetched } from "../lib/parts.js";
+import { useStore } from "../lib/store.js";
+
+const ROW = 24;
+const PAGE = 100;
+const TALLEST = 8_000_000; // browsers do not draw taller elements; beyond, the bar moves by several frames at a time
+const MOST_PAGES = 30;
+
+export function Bus({ store, query }) {
+  useStore(store);
+  const [filter, setFilter] = useState({ bus: query.get("bus") ?? "", device: query.get("device") ?? "", service: "", problems: query.get("problems") ?? "" });
+  const [selected, setSelected] = useState(null);
+  const [live, setLive] = useState(!query.get("at"));
+  const [services] = useFetched(() => (store.about.frames ? get(`${store.path}/frames/services`) : Promise.resolve([])), [store.frames.total > 0]);
+  if (!store.about.frames)
+    return html`<div class="empty">
+      <p>This run does not record the frames of its buses.</p>
+      <p>Start it here, with <code>fieldtwin run SYSTEM --studio</code>, or with <code>--capture FILE</code>.</p>
+    </div>`;
+  const change = (key) => (e) => setFilter({ ...filter, [key]: e.target.type === "checkbox" ? (e.target.checked ? "true" : "") : e.target.value });
+  const choice = (key, title, values) =>
+    html`<label>${title}
+      <select value=${filter[key]} onChange=${change(key)}>
+        <option value="">all</option>
+        ${values.map((v) => html`<option value=${v}>${v}</option>`)}
+      </select>
+    </label>`;
+  const { system } = store.about;
+  const selection = new URLSearchParams(Object.entries(filter).filter(([, v]) => v));
+  return html`<h1 class="visually-hidden">Frames of the buses</h1>
+    <div class="bar">
+      <button onClick=${() => setLive(!live)} aria-pressed=${live}>${live ? "Pause" : "Follow"}</button>
+      ${choice("bus", "Bus", Object.keys(system.buses))} ${choice("device", "Device", Object.keys(system.devices))}
+      ${choice("service", "Function", services ?? [])}
+      <label><input type="checkbox" checked=${!!filter.problems} onChange=${change("problems")} /> only problems</label>
+      <span class="grow"></span>
+      ${store.frames.behind_bytes > 100_000 && html`<span class="chip warn">reading earlier frames …</span>`}
+      <span class="soft">${store.frames.total.toLocaleString("en")} frames</span>
+      ${["pcap", "candump"].map((kind) => html`<a href=${url(`${store.path}/frames/export?format=${kind}&${selection}`)} download>${kind}</a>`)}
+    </div>
+    <${Frames} store=${store} filter=${filter} live=${live} setLive=${setLive} selected=${selected} setSelected=${setSelected} at=${query.get("at")} />
+    ${selected !== null && html`<${Detail} store=${store} number=${selected} onClose=${() => setSelected(null)} onSelect=${setSelected} />`}`;
+}
+
+function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
+  const view = useRef(null);
+  const pages = useRef(new Map());
+  const [state, setState] = useState({ total: 0, top: 0, tall: 400 });
+  const [error, setError] = useState("");
+  const [, again] = useState(0);
+  const key = JSON.stringify(filter);
+  const search = new URLSearchParams(Object.entries(filter).filter(([, v]) => v)).toString();
+
+  const fetchPage = useCallback(
+    async (page) => {
+      if (pages.current.get(page) === "coming") return;
+      const known = pages.current.get(page);
+      pages.current.set(page, known ?? "coming");
+      try {
+        const answer = await get(`${store.path}/frames?start=${page * PAGE}&count=${PAGE}&${search}`);
+        pages.current.set(page, answer.rows);
+        while (pages.current.size > MOST_PAGES) pages.current.delete(pages.current.keys().next().value);
+        setState((s) => ({ ...s, total: answer.total }));
+        setError("");
+      } catch (e) {
+        pages.current.delete(page);
+        setError(e.message);
+      }
+      again((n) => n + 1);
+    },
+    [store, search],
+  );
+
+  useEffect(() => {
+    pages.current = new Map();
+    setState((s) => ({ ...s, total: 0 }));
+    get(`${store.path}/frames?count=1&${search}`).then((a) => setState((s) => ({ ...s, total: a.total })), (e) => setError(e.message));
+  }, [key]);
+  // With a filter only the server knows the number of frames; it is asked while the view follows.
+  useEffect(() => {
+    if (!live) return;
+    if (!search) setState((s) => ({ ...s, total: store.frames.total }));
+    else get(`${store.path}/frames?count=1&${search}`).then((a) => setState((s) => ({ ...s, total: a.total })), () => {});
+  }, [live, store.frames.total]);
+
+  const whole = Math.min(TALLEST, state.total * ROW);
+  const factor = state.total * ROW > TALLEST ? (state.total * ROW - state.tall) / (TALLEST - state.tall) : 1;
+  const first = Math.max(0, Math.min(state.total - 1, Math.floor((state.top * factor) / ROW)));
+  const count = Math.ceil(state.tall / ROW) + 1;
+  const last = Math.min(state.total, first + count);
+  useEffect(() => {
+    for (let page = Math.floor(first / PAGE); page * PAGE < last; page++) {
+      const rows = pages.current.get(page);
+      const complete = Array.isArray(rows) && (rows.length === PAGE || page * PAGE + rows.length >= last);
+      const settled = Array.isArray(rows) && rows.every((r) => r.verdict !== "" || r.number < state.total - 500);
+      if (!complete || (live && !settled)) fetchPage(page);
+    }
+  });
+  useEffect(() => {
+    if (live && view.current) view.current.scrollTop = whole;
+  }, [live, whole]);
+  useEffect(() => {
+    const measure = () => view.current && setState((s) => ({ ...s, tall: view.current.clientHeight }));
+    const observer = new ResizeObserver(measure);
+    observer.observe(view.current);
+    return () => observer.disconnect();
+  }, []);
+  useEffect(() => {
+    if (at)
+      get(`${store.path}/frames?at_ns=${at}&count=${PAGE}&${search}`).then((a) => {
+        setState((s) => ({ ...s, total: a.total }));
+        requestAnimationFrame(() => (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
+      });
+  }, [at]);
+  const scrolled = (e) => {
+    const { scrollTop, clientHeight, scrollHeight } = e.target;
+    if (live && scrollTop + clientHeight < scrollHeight - 4 * ROW) setLive(false);
+    setState((s) => ({ ...s, top: scrollTop, tall: clientHeight }));
+  };
+  const move = (e) => {
+    const step = { ArrowDown: 1, ArrowUp: -1, PageDown: count - 2, PageUp: 2 - count }[e.key];
+    if (!step) return;
+    e.preventDefault();
+    setLive(false);
+    view.current.scrollTop += (step * ROW) / factor;
+  };
+  const started = store.about.started_ns;
+  const rows = [];
+  for (let position = first; position < last; position++) {
+    const page = pages.current.get(Math.floor(position / PAGE));
+    const row = Array.isArray(page) ? page[position % PAGE] : undefined;
+    rows.push([position, row]);
+  }
+  const linked = rows.find(([, r]) => r?.number === selected)?.[1];
+  return html`<${Failure} text=${error} />
+    <div class="frames" role="region" aria-label="Frames" onKeyDown=${move}>
+      <div class="row head">
+        <span>Time</span><span>Bus</span><span></span><span>Device</span><span>Function</span><span>Meaning</span><span>Bytes</span><span>Latency</span><span>Verdict</span>
+      </div>
+      <div class="view" ref=${view} onScroll=${scrolled} tabindex="0" aria-label="Scroll with the arrow keys">
+        <div style=${{ height: `${whole}px` }}></div>
+        ${rows.map(([position, r]) => {
+          const top = factor === 1 ? position * ROW : state.top + (position - first) * ROW;
+          if (!r) return html`<div class="row soft" key=${position} style=${{ position: "absolute", left: 0, top: `${top}px` }}>…</div>`;
+          const bad = r.verdict !== "good" && r.verdict !== "";
+          const tied = linked && (r.number === linked.request || r.number === linked.reply);
+          return html`<button
+            class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""}"
+            key=${position}
+            style=${{ top: `${top}px` }}
+            aria-selected=${r.number === selected}
+            onClick=${() => setSelected(r.number)}
+          >
+            <span class="mono">${clock(r.t_ns - started)}</span><span>${r.bus}</span>
+            <span title=${r.sent ? "sent by the gateway" : "received by the gateway"}>${r.sent ? "→" : "←"}</span>
+            <span>${r.device || (r.unit === null ? "" : r.unit)}</span><span>${r.service}</span><span title=${r.text}>${r.text}</span>
+            <span class="mono soft">${hex(r.bytes)}</span><span class="mono">${milliseconds(r.latency_ns)}</span>
+            <span>${r.verdict || (r.sent ? "pending" : "")}</span>
+          </button>`;
+        })}
+      </div>
+    </div>`;
+}
+
+function Detail({ store, number: n, onClose, onSelect }) {
+  const [frame, error] = useFetched(() => get(`${store.path}/frames/${n}`), [n]);
+  const started = store.about.started_ns;
+  return html`<section class="card detail" aria-label="Details of a frame">
+    <header><h2>Frame ${n}</h2><button class="quiet" onClick=${onClose}>Close</button></header>
+    <${Failure} text=${error} />
+    ${frame &&
+    html`<dl class="facts">
+      <dt>Time</dt><dd>${clock(frame.t_ns - started)} after the start, ${frame.sent ? "sent" : "received"} by the gateway on ${frame.bus}</dd>
+      <dt>Meaning</dt><dd>${frame.device && `${frame.device}: `}${frame.text}</dd>
+      ${frame.can_id !== null && html`<dt>COB-ID</dt><dd class="mono">${frame.can_id.toString(16).toUpperCase()}h</dd>`}
+      <dt>Bytes</dt><dd class="mono">${hex(frame.bytes)}</dd>
+      ${Object.entries(frame.tags).length > 0 &&
+      html`<dt>Values</dt><dd>${Object.entries(frame.tags).map(([tag, v]) => `${tag} = ${number(v)}`).join(", ")}</dd>`}
+      ${frame.linked.map(
+        (other) => html`<dt>${other.number < n ? "Request" : "Reply"}</dt>
+          <dd><button class="quiet" onClick=${() => onSelect(other.number)}>frame ${other.number}</button> ${other.text} ${milliseconds(other.latency_ns)}</dd>`,
+      )}
+      <dt>Verdict</dt><dd>${frame.verdict || "pending"}</dd>
+    </dl>`}
+  </section>`;
+}

@@ -1,0 +1,95 @@
+// All registers and objects by name, with value, quality, age and a sparkline. In a prototype a value of the simulated device can be set.
+
+import { html, useState } from "../vendor/preact.js";
+import { put, remove } from "../lib/api.js";
+import { age, number, value } from "../lib/format.js";
+import { Dialog, Failure, Quality, Sparkline, useAction } from "../lib/parts.js";
+import { useStore } from "../lib/store.js";
+import { address } from "../lib/address.js";
+
+const MOST_ROWS = 500;
+
+export function Devices({ store, query }) {
+  useStore(store);
+  const [search, setSearch] = useState("");
+  const [device, setDevice] = useState(query.get("device") ?? "");
+  const [onlyBad, setOnlyBad] = useState(false);
+  const [setting, setSetting] = useState(null);
+  const [run, error] = useAction();
+  const { devices } = store.about.system;
+  const rows = Object.entries(devices)
+    .filter(([name]) => !device || name === device)
+    .flatMap(([name, d]) => Object.entries(d.tags).map(([tag, about]) => ({ full: `${name}.${tag}`, name, about })))
+    .filter(({ full, about }) => !search || `${full} ${about.at} ${about.unit}`.toLowerCase().includes(search.toLowerCase()))
+    .filter(({ full }) => !onlyBad || store.tags[full]?.quality !== "good");
+  const set = store.status?.field?.set ?? {};
+  const now = store.now();
+  return html`<h1 class="visually-hidden">Devices</h1>
+    <div class="bar">
+      <input type="search" placeholder="Search name, address, unit" aria-label="Search" value=${search} onInput=${(e) => setSearch(e.target.value)} />
+      <label>Device
+        <select value=${device} onChange=${(e) => setDevice(e.target.value)}>
+          <option value="">all</option>
+          ${Object.keys(devices).map((name) => html`<option value=${name}>${name}</option>`)}
+        </select>
+      </label>
+      <label><input type="checkbox" checked=${onlyBad} onChange=${(e) => setOnlyBad(e.target.checked)} /> only bad values</label>
+      <span class="grow"></span>
+      <span class="soft">${rows.length} values</span>
+    </div>
+    <${Failure} text=${error} />
+    <div class="scroll">
+      <table class="list">
+        <thead>
+          <tr><th>Tag</th><th>Address</th><th class="number">Value</th><th>Unit</th><th>Quality</th><th class="number">Age</th><th>Last minute</th><th><span class="visually-hidden">Actions</span></th></tr>
+        </thead>
+        <tbody>
+          ${rows.slice(0, MOST_ROWS).map(({ full, about }) => {
+            const seen = store.tags[full];
+            return html`<tr key=${full} data-tag=${full}>
+              <td><a href=${address(store.name, "trends", { tags: full })}>${full}</a></td>
+              <td class="mono soft">${about.at}</td>
+              <td class="number">${value(seen, about)}</td>
+              <td>${about.unit}</td>
+              <td>${seen && html`<${Quality} quality=${seen.quality} why=${seen.reason} />`} ${full in set && html`<span class="chip warn">set</span>`}</td>
+              <td class="number">${age(seen?.age_s)}</td>
+              <td><${Sparkline} points=${store.recent.get(full)} now=${now} /></td>
+              <td>
+                ${store.isPrototype && store.mayOperate && !about.secret &&
+                (full in set
+                  ? html`<button class="quiet" onClick=${() => run(() => remove(`${store.path}/tags/${full}/set`))}>Release</button>`
+                  : html`<button class="quiet" onClick=${() => setSetting({ full, about })}>Set …</button>`)}
+              </td>
+            </tr>`;
+          })}
+        </tbody>
+      </table>
+      ${rows.length > MOST_ROWS && html`<p class="empty">The first ${MOST_ROWS} are shown. Search for the others.</p>`}
+      ${!rows.length && html`<p class="empty">No value fits.</p>`}
+    </div>
+    ${setting && html`<${SetDialog} store=${store} ...${setting} onClose=${() => setSetting(null)} />`}`;
+}
+
+function SetDialog({ store, full, about, onClose }) {
+  const now = store.tags[full]?.value;
+  const [text, setText] = useState(typeof now === "number" ? number(now) : "");
+  const [run, error, busy] = useAction();
+  const wanted = Number(text.replace(",", "."));
+  const valid = text.trim() !== "" && Number.isFinite(wanted);
+  const send = async (e) => {
+    e.preventDefault();
+    if (await run(() => put(`${store.path}/tags/${full}/set`, { value: wanted }))) onClose();
+  };
+  return html`<${Dialog} title="Set ${full} in the simulated device" onClose=${onClose}>
+    <form onSubmit=${send}>
+      <p class="soft">The device holds this value until you release it. The gateway reads it over the bus, like any other value.</p>
+      <${Failure} text=${error} />
+      <label>Value <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${about.unit}</label>
+      <p class="soft">now ${number(now)} ${about.unit}${about.range ? `, range ${about.range.join(" to ")}` : ""}</p>
+      <footer>
+        <button type="button" onClick=${onClose}>Cancel</button>
+        <button class="primary" disabled=${!valid || busy}>Set</button>
+      </footer>
+    </form>
+  <//>`;
+}

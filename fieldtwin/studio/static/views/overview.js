@@ -1,0 +1,123 @@
+// The drawing of the system with its present state: the controller on the left, a line for each bus with its devices below it.
+
+import { html } from "../vendor/preact.js";
+import { address } from "../lib/address.js";
+import { age, number } from "../lib/format.js";
+
+const LEFT = 250; // width of the controller, in units of the drawing
+const BOX = 218;
+const TALL = 78;
+const STEP = BOX + 16;
+const WIDTH = 1240;
+const COLUMNS = Math.floor((WIDTH - LEFT - 40) / STEP);
+
+export function Overview({ store }) {
+  const { system } = store.about;
+  const gateway = store.status?.gateway;
+  const buses = Object.entries(system.buses).map(([name, bus]) => ({
+    name,
+    ...bus,
+    devices: Object.entries(system.devices).filter(([, d]) => d.bus === name),
+  }));
+  let y = 14;
+  for (const bus of buses) {
+    bus.y = y;
+    y += 64 + Math.max(1, Math.ceil(bus.devices.length / COLUMNS)) * (TALL + 22) + 8;
+  }
+  const height = Math.max(y, 240);
+  return html`<h1 class="visually-hidden">Overview of ${store.name}</h1>
+    <svg class="plan" viewBox="0 0 ${WIDTH} ${height}" role="group" aria-label="Buses and devices of ${system.name}">
+      <${Controller} store=${store} height=${height - 14} />
+      ${buses.map((bus) => html`<${BusLine} store=${store} bus=${bus} seen=${gateway?.buses[bus.name]} />`)}
+    </svg>
+    ${!gateway && html`<p class="soft">The gateway does not answer, so no state is shown.</p>`}`;
+}
+
+function Controller({ store, height }) {
+  const { plc, gateway } = store.status ?? {};
+  const late = plc?.lateness_us?.p99;
+  const programs = Object.keys(store.about.system.programs);
+  const lines = programs.length
+    ? [
+        ["PLC", "name"],
+        [plc ? `${plc.state}, scan ${number(plc.cycle_ms)} ms` : "no answer", plc?.state === "running" ? "good-text" : "bad-text"],
+        [plc ? `${plc.scans} scans, late p99 ${late === undefined ? "–" : (late / 1000).toFixed(2)} ms` : "", "soft"],
+        ...programs.map((name) => [`${name}: ${shownState(plc, name)}`, ""]),
+      ]
+    : [["no PLC program", "soft"]];
+  const served = [...Object.entries(gateway?.serve ?? {}), ...Object.entries(gateway?.bridge ?? {})];
+  return html`<g>
+    <a href=${address(store.name, "plc")} aria-label="PLC">
+      <rect class="box" x="1" y="14" width=${LEFT - 2} height=${height - 14} rx="10" />
+      <text class="name" x="16" y="40">gateway</text>
+      <text class=${gateway ? "soft" : "bad-text"} x="16" y="60">
+        ${gateway ? `${gateway.published} values published` : "no answer"}
+      </text>
+      <text class="soft" x="16" y="80">${gateway ? (gateway.writes.allowed ? `${gateway.writes.done} writes` : "read-only") : ""}</text>
+      ${lines.map(([text, cls], n) => html`<text class=${cls} x="16" y=${116 + n * 20}>${text}</text>`)}
+      ${served.map(
+        ([name, front], n) =>
+          html`<text class=${front.error ? "bad-text" : "soft"} x="16" y=${126 + (lines.length + n) * 20}>${name} ← ${front.listening ?? front.error}</text>`,
+      )}
+    </a>
+  </g>`;
+}
+
+function shownState(plc, program) {
+  const state = plc?.variables?.[`${program}.state`];
+  return state === undefined ? (plc?.waiting?.[program] ? "waits for its inputs" : "runs") : number(state);
+}
+
+function BusLine({ store, bus, seen }) {
+  const rate = store.rates[bus.name];
+  const errors = seen ? (seen.counters.timeouts ?? 0) + (seen.counters.crc_errors ?? 0) + (seen.counters.aborts ?? 0) : 0;
+  const rows = Math.max(1, Math.ceil(bus.devices.length / COLUMNS));
+  const line = `line${store.isPrototype ? " emulated" : ""}${seen?.error ? " bad" : ""}`;
+  const lineY = bus.y + 46;
+  const last = Math.min(bus.devices.length, COLUMNS);
+  return html`<g>
+    <a href=${address(store.name, "bus", { bus: bus.name })} aria-label="Bus ${bus.name}">
+      <text class="name" x=${LEFT + 40} y=${bus.y + 14}>${bus.name}</text>
+      <text class="soft" x=${LEFT + 40 + 9 * bus.name.length + 14} y=${bus.y + 14}>${bus.kind} ${bus.endpoint}</text>
+      <text x=${LEFT + 40} y=${bus.y + 34} class=${seen?.error ? "bad-text" : ""}>
+        ${seen?.error ? seen.error : rate === undefined ? "" : `${rate.toFixed(rate < 10 ? 1 : 0)} messages/s`}
+        <tspan class=${errors ? "warn-text" : "soft"}>${seen && !seen.error ? `   ${errors} timeouts and errors` : ""}</tspan>
+      </text>
+    </a>
+    <path class=${line} d="M${LEFT},${lineY} H${LEFT + 40 + Math.max(0.5, last - 0.5) * STEP}" />
+    ${Array.from({ length: rows - 1 }, (_, r) => {
+      const at = lineY + (r + 1) * (TALL + 22);
+      return html`<path class=${line} d="M${LEFT + 18},${lineY} V${at} H${LEFT + 40 + BOX / 2}" />`;
+    })}
+    ${bus.devices.map(([name, device], n) => {
+      const x = LEFT + 40 + (n % COLUMNS) * STEP;
+      const y = lineY + Math.floor(n / COLUMNS) * (TALL + 22);
+      return html`<${Device} store=${store} name=${name} device=${device} x=${x} y=${y} line=${line} />`;
+    })}
+  </g>`;
+}
+
+function Device({ store, name, device, x, y, line }) {
+  const seen = store.status?.gateway?.devices[name];
+  const tags = Object.keys(device.tags).map((tag) => store.tags[`${name}.${tag}`]).filter(Boolean);
+  const good = tags.filter((t) => t.quality === "good").length;
+  const oldest = Math.max(0, ...tags.filter((t) => t.age_s !== null && t.quality === "good").map((t) => t.age_s));
+  const fault = store.status?.field?.faults?.find((f) => f.device === name);
+  const lamp = !seen ? "" : !seen.online ? "bad" : good < tags.length ? "warn" : "good";
+  const state = !seen ? "unknown" : seen.online ? "answers" : seen.error || "does not answer";
+  return html`<g>
+    <path class=${line} d="M${x + BOX / 2},${y} v14" />
+    <a href=${address(store.name, "devices", { device: name })} aria-label="${name}: ${state}">
+      <rect class="box" x=${x} y=${y + 14} width=${BOX} height=${TALL - 10} rx="8" />
+      <circle class="lamp ${lamp}" cx=${x + 16} cy=${y + 32} r="5" />
+      <text class="name" x=${x + 28} y=${y + 37}>${name}</text>
+      <text class="soft" x=${x + BOX - 12} y=${y + 37} text-anchor="end">${device.protocol === "canopen" ? "node" : "unit"} ${device.address}</text>
+      <text class=${lamp === "bad" ? "bad-text" : "soft"} x=${x + 12} y=${y + 56}>${cut(lamp === "bad" ? state : device.device, 30)}</text>
+      <text class=${fault ? "warn-text" : "soft"} x=${x + 12} y=${y + 74}>
+        ${fault ? `fault: ${fault.name}` : tags.length ? `${good} of ${tags.length} good, oldest ${age(oldest)}` : ""}
+      </text>
+    </a>
+  </g>`;
+}
+
+const cut = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);

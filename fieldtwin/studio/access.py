@@ -1,8 +1,9 @@
 """Who may use Studio: a token for each role, checks against other web sites, and the headers that restrict what a page may do.
 
-A web page of another site can send requests to this server from the user's browser. It cannot read the answers, but a request
-could change a plant. Three checks prevent that: the ``Host`` header has to name this server (DNS rebinding), the ``Origin`` header of
-requests and WebSockets has to be this server's, and the cookie is sent by pages of this site only (RFC 6265bis, SameSite).
+A web page of another site can send requests to this server from the user's browser. It cannot read the answers, but a
+request could change a plant. Three checks prevent that: the ``Host`` header has to name this server (DNS rebinding), the
+``Origin`` header of requests and WebSockets has to be this server's, and the cookie is sent by pages of this site only (RFC
+6265bis, SameSite).
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Access:
 class AccessMiddleware:
     """Refuse what `Access` does not allow, and put the role of the client into ``scope["role"]``.
 
-    ``/?token=TOKEN`` stores the token in a cookie and redirects to the page without it, so that it does not stay in the address bar.
+    ``/?token=TOKEN`` stores the token in a cookie and redirects to the page without it, so that the address bar does not show it.
     """
 
     def __init__(self, app: ASGIApp, access: Access, now_s: Callable[[], float]) -> None:
@@ -163,7 +164,8 @@ def _token_of(scope: Scope, headers: Headers) -> str:
         cookies = SimpleCookie(headers.get("cookie", ""))
     except CookieError:
         return ""
-    return str(cookies[COOKIE].value)[:LONGEST_TOKEN] if COOKIE in cookies else ""
+    token: str = cookies[COOKIE].value if COOKIE in cookies else ""
+    return token[:LONGEST_TOKEN]
 
 
 def _with_headers(send: Send) -> Send:

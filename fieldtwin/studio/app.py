@@ -15,7 +15,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from fieldtwin.gateway.core.clock import Clock
-from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError
 from fieldtwin.studio.access import Access, AccessMiddleware
 from fieldtwin.studio.api import faults, frames, instances, plc, tags
 from fieldtwin.studio.api.common import INSTANCE
@@ -48,7 +48,7 @@ def application(access: Access, clock: Clock, folder: Path) -> Starlette:
     return Starlette(
         routes=_routes(),
         middleware=[Middleware(AccessMiddleware, access=access, now_s=lambda: clock.monotonic_ns() / 1e9)],
-        exception_handlers={FieldtwinError: on_error, 404: _not_found, 500: _bug},
+        exception_handlers={FieldtwinError: on_error, 404: _not_found},
         lifespan=lifespan,
     )
 
@@ -71,7 +71,12 @@ def _routes() -> list[BaseRoute]:
 
 def _dispatch(operations: dict[str, Operation]) -> Any:
     async def handle(request: Request) -> Response:
-        return await operations["GET" if request.method == "HEAD" else request.method](request)
+        try:
+            return await operations["GET" if request.method == "HEAD" else request.method](request)
+        except FieldtwinError:
+            raise
+        except Exception as e:  # a bug in one operation must not end the others, and the user sees no traceback
+            raise Bug(f"{request.method} {request.url.path}: {type(e).__name__}: {e}") from e
 
     return handle
 
@@ -86,7 +91,3 @@ async def _openapi(request: Request) -> Response:
 
 async def _not_found(request: Request, error: Exception) -> Response:
     return JSONResponse({"error": {"kind": "NotFound", "message": f"nothing at {request.url.path}"}}, 404)
-
-
-async def _bug(request: Request, error: Exception) -> Response:
-    return JSONResponse({"error": {"kind": "Bug", "message": f"internal error: {type(error).__name__}"}}, 500)

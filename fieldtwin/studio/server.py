@@ -43,6 +43,8 @@ class StudioOptions:
     view_token: str = field(default="", repr=False)
     system: str = ""
     """A system whose prototype is started with the server; empty for none."""
+    instance: str = ""
+    """A running instance that the page shows first, if no system is started."""
 
     def check(self) -> None:
         """Raise `UsageError` for a combination that would let others operate a plant."""
@@ -91,7 +93,8 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
     app = application(access, WallClock(), Path.cwd())
     config = uvicorn.Config(
         app,
-        log_level="error",
+        log_config=None,
+        log_level="critical",
         access_log=False,
         server_header=False,
         lifespan="on",
@@ -117,7 +120,9 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
         scheme = "https" if options.certificate else "http"
         shown = f"[{options.host}]" if ":" in options.host else options.host
         address = f"{scheme}://{shown}:{port}/"
-        instance = await app.state.launcher.start(options.system) if options.system else ""
+        instance = await app.state.launcher.start(options.system) if options.system else options.instance
+        if instance:
+            await app.state.gallery.attached(instance)  # its history begins now, not when a page first asks
         url = (f"{address}?token={operate}" if operate else address) + (f"#/{instance}" if instance else "")
         on_ready(Serving(url, address, access))
         await running

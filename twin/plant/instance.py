@@ -25,6 +25,8 @@ else:
     LOCKS = True
 
 TEMPORARY = Path("/tmp")
+BULK = Path("/var/tmp")
+"""For captures: files of many megabytes, which do not fit where the run directories are (often memory)."""
 
 SOCKET_PATH_MAX = 100
 """Longest path of a run directory plus file name. A Unix socket's path is at most 107 bytes (sockaddr_un)."""
@@ -112,3 +114,24 @@ class Instance:
     def path(self, name: str) -> Path:
         """Return the path of a file of this instance."""
         return self.dir / name
+
+
+def capture_path(instance: str) -> Path:
+    """Return where a run records the frames of its buses for Studio: a folder for this user only.
+
+    Raises `Unreachable` if another user owns the folder.
+    """
+    base = BULK if BULK.is_dir() else Path(tempfile.gettempdir())
+    folder = base / f"fieldtwin-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as e:
+        raise Unreachable(f"cannot make a folder for captures: {e.strerror}", where=str(folder)) from e
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise Unreachable(
+            "other users have access to the folder of the captures",
+            where=str(folder),
+            hint="remove it, or make it yours",
+        )
+    return folder / f"{instance}.capture.jsonl"

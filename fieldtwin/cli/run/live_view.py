@@ -59,6 +59,11 @@ def print_mapping(session: RunSession) -> None:
     _print_thread(session)
 
 
+def print_studio(url: str) -> None:
+    """Print once the address of the page."""
+    stderr.print(f"  studio  →  {url}", soft_wrap=True, markup=False, highlight=False)
+
+
 def print_metrics(url: str) -> None:
     """Print once the address of the metrics."""
     if url:

@@ -7,7 +7,8 @@ import json
 import os
 import signal
 import sys
-from dataclasses import dataclass
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -25,6 +26,9 @@ from fieldtwin.run.template import system_file
 from fieldtwin.service.attached import RunService, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
+from fieldtwin.service.studio_child import StudioChild
+from fieldtwin.twin.plant.instance import capture_path
+from fieldtwin.twin.site.system import load_system
 
 NEITHER = """run needs --plant or --prototype; there is no default.
   --prototype   emulate the field devices as defined in NAME.prototype.yaml; no real device is touched
@@ -139,6 +143,14 @@ class ThreadOptions:
         help="Write the traffic of all buses to this file (JSON lines).",
     ),
     click.option(
+        "--studio",
+        is_flag=False,
+        flag_value="127.0.0.1:0",
+        default="",
+        metavar="[HOST:PORT]",
+        help="Serve the page of this run (see fieldtwin studio); default: a free port on loopback. Records the frames of the buses.",
+    ),
+    click.option(
         "--metrics",
         default="",
         metavar="HOST:PORT",
@@ -164,6 +176,7 @@ def command(
     thread: ThreadOptions,
     sources: TemplateSearchOptions,
     capture: Path | None,
+    studio: str,
     metrics: str,
     log: Format | None,
     as_json: bool,
@@ -183,7 +196,7 @@ def command(
         raise UsageError(SIMULATE.format("--faults random"))
     others = {
         **replay.given(), "--field": field.field_host, "--listen": listen, "--can": field.can, "--capture": capture,
-        "--thread-store": thread.thread_store, "--metrics": metrics, "--log": log,
+        "--thread-store": thread.thread_store, "--metrics": metrics, "--log": log, "--studio": studio,
     }  # fmt: skip
     systems = systems_of(system, sources, others, OF_A_GROUP, plant=place.plant, virtual=False)
     if systems is not None:
@@ -232,14 +245,18 @@ def command(
         thread_every_s=thread.thread_every_s,
         fault_file=Path(field.faults) if field.faults else None,
     )
-    return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
+    return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), studio, as_json))
 
 
-async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bool) -> int:
-    from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_summary
+async def _run(options: RunOptions, service_options: ServiceOptions, studio: str, as_json: bool) -> int:
+    from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_studio, print_summary
     from fieldtwin.console import show_warnings
 
     check(service_options)
+    if studio and options.capture is None:
+        options = replace(
+            options, capture=capture_path(options.instance or load_system(options.system, options.profiles).name)
+        )
     notifier = Notifier.from_environment()
     session = RunSession(options)
     interrupted = started = False
@@ -269,7 +286,12 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
                     # SIGHUP from a terminal means that the terminal closed; for a service, that the configuration changed
                     watched = not notifier.wanted and any(map(os.isatty, range(3)))
                     loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
-                async with LiveView(session, quiet=as_json or service_options.log is not None):
+                async with AsyncExitStack() as stack:
+                    if studio:
+                        child = StudioChild(session.instance.name, session.instance.dir, studio)
+                        print_studio((await stack.enter_async_context(child)).url)
+                    view = LiveView(session, quiet=as_json or service_options.log is not None)
+                    await stack.enter_async_context(view)
                     await session.wait()
     except (asyncio.CancelledError, FieldtwinError):
         if interrupted and not started:

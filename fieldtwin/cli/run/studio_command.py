@@ -56,12 +56,13 @@ class ServerOptions:
 @click.command("studio", cls=GroupedCommand)
 @click.argument("system", required=False, default="", shell_complete=systems)
 @click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
+@click.option("--instance", default="", metavar="NAME", help="Show this running instance first.")
 @group("Server", server=ServerOptions)
-def command(system: str, no_browser: bool, server: ServerOptions) -> int:
+def command(system: str, no_browser: bool, instance: str, server: ServerOptions) -> int:
     """Serve a page that shows and operates the running systems of this computer: values, frames, PLC, trends and faults.
 
-    With SYSTEM its prototype is started first, and stopped at the end. Without it the page lists the running instances, the shipped
-    systems and those in the working directory.
+    With SYSTEM its prototype is started first, and stopped at the end. Without it the page lists the running instances, the
+    shipped systems and those in the working directory.
 
     The page is for this computer only, unless --listen names another address. Its address contains a token; everyone who has the
     token can operate the systems.
@@ -84,6 +85,7 @@ def command(system: str, no_browser: bool, server: ServerOptions) -> int:
         operate_token=server.operate_token,
         view_token=server.view_token,
         system=system,
+        instance=instance,
     )
     options.check()
 

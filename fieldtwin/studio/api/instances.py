@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, attached
+from fieldtwin.studio.api.common import INSTANCE, attached, gallery_of
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.live.instances import FoundInstance, find_instances
@@ -39,7 +39,9 @@ async def start_prototype(request: Request) -> dict[str, Any]:
     known = {system.path for system in known_systems(_folder(request))}
     if form.system not in known:  # a page must not start arbitrary files
         raise NotFound(f"no system {form.system[:80]!r}", expected=", ".join(sorted(known)))
-    return {"instance": await _launcher(request).start(form.system, form.instance)}
+    instance = await _launcher(request).start(form.system, form.instance)
+    await gallery_of(request).attached(instance)  # its history begins now, not when a page first asks
+    return {"instance": instance}
 
 
 async def stop_instance(request: Request) -> dict[str, Any]:

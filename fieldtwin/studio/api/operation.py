@@ -1,4 +1,4 @@
-"""An operation of the interface: its path, who may call it, and its description for OpenAPI. Handlers are registered in tables of these."""
+"""An operation of the interface: its path, who may call it, and its description for OpenAPI."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import msgspec
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 
 from fieldtwin.gateway.core.errors import NotAllowed, UsageError
 from fieldtwin.studio.access import OPERATE
@@ -16,6 +16,7 @@ from fieldtwin.studio.access import OPERATE
 PREFIX = "/api/v1"
 MOST_BODY_BYTES = 1 << 20
 
+_encoder = msgspec.json.Encoder()
 Handler = Callable[[Request], Awaitable[Any]]
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -49,7 +50,9 @@ class Operation:
         if self.changes and request.scope["role"] != OPERATE:
             raise NotAllowed("this needs the role operate", got=f"the role {request.scope['role']}")
         result = await self.handler(request)
-        return result if isinstance(result, Response) else JSONResponse(msgspec.to_builtins(result))
+        return (
+            result if isinstance(result, Response) else Response(_encoder.encode(result), media_type="application/json")
+        )
 
 
 async def body_of(request: Request, form: type[S]) -> S:

@@ -1,7 +1,8 @@
-"""Updates over a WebSocket: the present state first, then each change. A client that reads too slowly loses updates and is told how many.
+"""Updates over a WebSocket: the present state first, then each change.
 
-Messages are JSON objects with a ``type``: ``hello``, ``status``, ``tags`` (changes: name, time in ns, value, quality, reason), ``frames``
-(the number of frames so far), ``dropped`` (how many updates this client has lost), ``end``.
+A client that reads too slowly loses updates and is told how many. Messages are JSON objects with a ``type``: ``hello``,
+``status``, ``tags`` (changes: name, time in ns, value, quality, reason), ``frames`` (the number of frames so far), ``dropped``
+(how many updates this client has lost), ``end``.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ async def stream(socket: WebSocket) -> None:
         pass  # the client is gone, or takes nothing
     finally:
         attachment.updates.unsubscribe(subscription)
-        with contextlib.suppress(RuntimeError):
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close()
 
 

@@ -1,7 +1,7 @@
 """Observe one running instance through its control channels and its capture.
 
-The statuses of gateway, PLC and field simulator are read twice to five times a second, changes of tags ten times a second. A process
-that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
+The statuses of gateway, PLC and field simulator are read two to four times a second, changes of tags ten times a second. A
+process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 The run writes the capture (`fieldtwin.gateway.connections.tap.TapFile`); this module follows the file. Decoded frames go to a
 temporary file, and memory holds some 30 bytes for each: a million frames take about 40 MB.
 
-A frame here is a piece of traffic as the medium delivered it. On a serial line a long reply can arrive in several pieces; the last one
-carries the decoded values and the latency.
+A frame here is a piece of traffic as the medium delivered it. On a serial line a long reply can arrive in several pieces;
+the last one carries the decoded values and the latency.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class FrameLog:
             self._capture = capture.open("rb")
         except OSError as e:
             raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(capture)) from e
-        self._rows = tempfile.TemporaryFile(prefix="fieldtwin-frames-")
+        self._rows = tempfile.TemporaryFile(prefix="fieldtwin-frames-")  # noqa: SIM115: closed by `close`
         self._rest = b""
         self._read_to = 0
         self._written = 0

@@ -1,14 +1,11 @@
-"""Start prototypes from Studio, and stop them. Each is a separate `fieldtwin run`, as on the command line, which ends with Studio."""
+"""Start prototypes from Studio, and stop them. Each is a separate `fieldtwin run`, which ends with Studio."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import re
 import signal
-import stat
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +13,7 @@ from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
 from fieldtwin.run.processes.run_record import read_record
 from fieldtwin.studio.live.instances import GATEWAY_SOCKET, accepts, find_instance
 from fieldtwin.twin.plant.child import command
-from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.plant.instance import capture_path, runtime_root
 from fieldtwin.twin.site.data_files import search_path
 
 STARTS_WITHIN_S = 30.0
@@ -26,8 +23,6 @@ MOST_OUTPUT_BYTES = 16_384
 """The end of a run's messages, which is kept to explain why it did not start."""
 MOST_RUNS = 4
 MOST_SYSTEMS = 200
-BULK = Path("/var/tmp")
-"""For captures: files of many megabytes, which do not fit where the run directories are (often memory)."""
 
 
 @dataclass(frozen=True)
@@ -57,27 +52,6 @@ def known_systems(folder: Path) -> list[KnownSystem]:
 
 def _system_of(prototype: Path) -> Path:
     return prototype.with_name(prototype.name.removesuffix(".prototype.yaml") + ".yaml")
-
-
-def capture_path(instance: str) -> Path:
-    """Return where Studio lets a run record its frames: a folder for this user only.
-
-    Raises `Unreachable` if another user owns the folder.
-    """
-    base = BULK if BULK.is_dir() else Path(tempfile.gettempdir())
-    folder = base / f"fieldtwin-{os.getuid()}"
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-    except OSError as e:
-        raise Unreachable(f"cannot make a folder for captures: {e.strerror}", where=str(folder)) from e
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise Unreachable(
-            "other users have access to the folder of the captures",
-            where=str(folder),
-            hint="remove it, or make it yours",
-        )
-    return folder / f"{instance}.capture.jsonl"
 
 
 class Launcher:

@@ -28,7 +28,11 @@ def describe_system(system: System) -> dict[str, Any]:
             for name, device in system.devices.items()
         },
         "programs": {
-            name: {"source": form.source, "inputs": {v: i.tag for v, i in form.inputs.items()}, "outputs": dict(form.outputs)}
+            name: {
+                "source": form.source,
+                "inputs": {v: i.tag for v, i in form.inputs.items()},
+                "outputs": dict(form.outputs),
+            }
             for name, form in system.plc.programs.items()
         },
         "cycle_ms": system.plc.cycle_ms,

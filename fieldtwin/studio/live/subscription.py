@@ -1,4 +1,4 @@
-"""Updates for several clients, each with a bounded queue: a slow client loses updates, which are counted, and delays nobody else."""
+"""Updates for several clients, each with a bounded queue: a slow client loses updates, which are counted, and delays no other."""
 
 from __future__ import annotations
 

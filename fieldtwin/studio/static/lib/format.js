@@ -17,6 +17,7 @@ export function value(seen, tag) {
 
 export function age(seconds) {
   if (seconds === null || seconds === undefined) return "–";
+  seconds = Math.max(0, seconds);
   if (seconds < 10) return `${seconds.toFixed(1)} s`;
   if (seconds < 120) return `${Math.round(seconds)} s`;
   if (seconds < 7200) return `${Math.round(seconds / 60)} min`;

@@ -73,7 +73,7 @@ export class Store {
     for (const [name, t, value, quality, reason] of changes) {
       const seen = this.status?.gateway?.tags?.[name];
       if (seen) {
-        Object.assign(seen, { value, quality, reason, age_s: (this.status.now_ns - t) / 1e9 });
+        Object.assign(seen, { value, quality, reason, age_s: Math.max(0, (this.now() - t) / 1e9) });
         delete seen.text;
       }
       this.changed.set(name, t);

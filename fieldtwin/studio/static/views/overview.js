@@ -2,11 +2,12 @@
 
 import { html } from "../vendor/preact.js";
 import { address } from "../lib/address.js";
-import { age, number } from "../lib/format.js";
+import { age, number, reason, value } from "../lib/format.js";
 
 const LEFT = 250; // width of the controller, in units of the drawing
-const BOX = 218;
-const TALL = 78;
+const BOX = 236;
+const TALL = 116;
+const MOST_VALUES = 3;
 const STEP = BOX + 16;
 const WIDTH = 1240;
 const COLUMNS = Math.floor((WIDTH - LEFT - 40) / STEP);
@@ -22,7 +23,7 @@ export function Overview({ store }) {
   let y = 14;
   for (const bus of buses) {
     bus.y = y;
-    y += 64 + Math.max(1, Math.ceil(bus.devices.length / COLUMNS)) * (TALL + 22) + 8;
+    y += 60 + Math.max(1, Math.ceil(bus.devices.length / COLUMNS)) * (TALL + 22);
   }
   const height = Math.max(y, 240);
   return html`<h1 class="visually-hidden">Overview of ${store.name}</h1>
@@ -102,6 +103,10 @@ function Device({ store, name, device, x, y, line }) {
   const tags = Object.keys(device.tags).map((tag) => store.tags[`${name}.${tag}`]).filter(Boolean);
   const good = tags.filter((t) => t.quality === "good").length;
   const oldest = Math.max(0, ...tags.filter((t) => t.age_s !== null && t.quality === "good").map((t) => t.age_s));
+  const shown = Object.entries(device.tags)
+    .map(([tag, about]) => [tag, about, store.tags[`${name}.${tag}`]])
+    .filter(([, about, now]) => now && !about.secret)
+    .slice(0, MOST_VALUES);
   const fault = store.status?.field?.faults?.find((f) => f.device === name);
   const lamp = !seen ? "" : !seen.online ? "bad" : good < tags.length ? "warn" : "good";
   const state = !seen ? "unknown" : seen.online ? "answers" : seen.error || "does not answer";
@@ -112,10 +117,16 @@ function Device({ store, name, device, x, y, line }) {
       <circle class="lamp ${lamp}" cx=${x + 16} cy=${y + 32} r="5" />
       <text class="name" x=${x + 28} y=${y + 37}>${name}</text>
       <text class="soft" x=${x + BOX - 12} y=${y + 37} text-anchor="end">${device.protocol === "canopen" ? "node" : "unit"} ${device.address}</text>
-      <text class=${lamp === "bad" ? "bad-text" : "soft"} x=${x + 12} y=${y + 56}>${cut(lamp === "bad" ? state : device.device, 30)}</text>
-      <text class=${fault ? "warn-text" : "soft"} x=${x + 12} y=${y + 74}>
-        ${fault ? `fault: ${fault.name}` : tags.length ? `${good} of ${tags.length} good, oldest ${age(oldest)}` : ""}
+      <text class=${fault ? "warn-text" : lamp === "bad" ? "bad-text" : "soft"} x=${x + 12} y=${y + 56}>
+        ${cut(fault ? `fault: ${fault.name}` : lamp === "bad" ? state : tags.length ? `${good} of ${tags.length} good, oldest ${age(oldest)}` : "", 34)}
       </text>
+      ${shown.map(([tag, about, now], n) => {
+        const bad = now.quality !== "good";
+        return html`<text class=${bad ? "bad-text" : "soft"} x=${x + 12} y=${y + 76 + n * 17}>${cut(tag, 16)}</text>
+          <text class=${bad ? "bad-text" : ""} x=${x + BOX - 12} y=${y + 76 + n * 17} text-anchor="end">
+            ${cut(bad ? reason(now.reason) || now.quality : `${value(now, about)} ${about.unit}`, 20)}
+          </text>`;
+      })}
     </a>
   </g>`;
 }

@@ -88,10 +88,10 @@ function Chart({ store, unit, tags, data }) {
   const plot = useRef(null);
   const started = store.about.started_ns;
   useEffect(() => {
-    const style = getComputedStyle(document.documentElement);
-    const ink = style.getPropertyValue("--soft");
-    const grid = style.getPropertyValue("--edge");
-    const axis = { stroke: () => getComputedStyle(document.body).color, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid }, font: "12px sans-serif" };
+    // A canvas takes no variables of the style sheet, so colours are read from elements that use them.
+    const ink = () => getComputedStyle(place.current).color;
+    const edge = () => getComputedStyle(place.current.parentElement).borderTopColor;
+    const axis = { stroke: ink, grid: { stroke: edge, width: 1 }, ticks: { stroke: edge, width: 1 }, font: "12px sans-serif" };
     plot.current = new uPlot(
       {
         width: place.current.clientWidth,
@@ -114,7 +114,6 @@ function Chart({ store, unit, tags, data }) {
       joined(tags, data, started),
       place.current,
     );
-    void ink;
     const observer = new ResizeObserver(() => plot.current?.setSize({ width: place.current.clientWidth, height: 220 }));
     observer.observe(place.current);
     return () => {

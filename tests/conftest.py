@@ -50,7 +50,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-LINES = {"system": "systems", "spec": "programs", "docs": "programs", "interop": "programs"}
+LINES = {"system": "systems", "studio": "studio", "spec": "programs", "docs": "programs", "interop": "programs"}
 """Folders whose tests start many processes, and the queue that they share, because parallel ones would only wait for
 each other.
 

@@ -159,7 +159,8 @@ def _token_of(scope: Scope, headers: Headers) -> str:
     if scheme.lower() == "bearer":
         return value.strip()[:LONGEST_TOKEN]
     if _in_query(scope):
-        return parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0][:LONGEST_TOKEN]
+        query: bytes = scope["query_string"]
+        return parse_qs(query.decode("latin-1")).get("token", [""])[0][:LONGEST_TOKEN]
     try:
         cookies = SimpleCookie(headers.get("cookie", ""))
     except CookieError:

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, UsageError, os_reason
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.studio.access import Access, allowed_hosts, new_token
-from fieldtwin.studio.app import application
+from fieldtwin.studio.app import STATIC, application
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 CLOSES_WITHIN_S = 2
@@ -77,6 +77,14 @@ class Serving:
     url: str
     address: str
     access: Access
+
+
+def check_pages() -> None:
+    """Raise `Unreachable` if the libraries of the pages are missing, as in a clone in which they were never fetched."""
+    if not (STATIC / "vendor" / "preact.js").is_file():
+        raise Unreachable(
+            "Studio's pages are not built in this clone", where=str(STATIC), hint="scripts/studio-assets fetches them; it needs npm"
+        )
 
 
 async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> None:

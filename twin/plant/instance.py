@@ -117,21 +117,18 @@ class Instance:
 
 
 def capture_path(instance: str) -> Path:
-    """Return where a run records the frames of its buses for Studio: a folder for this user only.
+    """Return where a run records the frames of its buses for Studio: with FIELDTWIN_RUN in the run directory, otherwise in
+    a folder for large files that only this user may enter.
 
-    Raises `Unreachable` if another user owns the folder.
+    Raises `Unreachable` if another user has access to that folder.
     """
+    if os.environ.get("FIELDTWIN_RUN"):
+        return runtime_root() / instance / "capture.jsonl"
     base = BULK if BULK.is_dir() else Path(tempfile.gettempdir())
     folder = base / f"fieldtwin-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
     except OSError as e:
         raise Unreachable(f"cannot make a folder for captures: {e.strerror}", where=str(folder)) from e
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise Unreachable(
-            "other users have access to the folder of the captures",
-            where=str(folder),
-            hint="remove it, or make it yours",
-        )
+    _refuse_a_strangers(folder)
     return folder / f"{instance}.capture.jsonl"

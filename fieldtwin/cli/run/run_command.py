@@ -148,7 +148,7 @@ class ThreadOptions:
         flag_value="127.0.0.1:0",
         default="",
         metavar="[HOST:PORT]",
-        help="Serve the page of this run (see fieldtwin studio); default: a free port on loopback. Records the frames of the buses.",
+        help="Serve the page of this run (see fieldtwin studio), by default at a free port, and record the frames of its buses.",
     ),
     click.option(
         "--metrics",

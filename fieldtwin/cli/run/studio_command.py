@@ -68,7 +68,7 @@ def command(system: str, no_browser: bool, instance: str, server: ServerOptions)
     token can operate the systems.
     """
     try:
-        from fieldtwin.studio.server import Serving, StudioOptions, open_browser, serve
+        from fieldtwin.studio.server import Serving, StudioOptions, check_pages, open_browser, serve
     except ModuleNotFoundError as e:
         raise UsageError(f"Studio needs {e.name}", hint=install_hint("studio")) from e
     host, _, port = server.listen.rpartition(":")
@@ -88,6 +88,7 @@ def command(system: str, no_browser: bool, instance: str, server: ServerOptions)
         instance=instance,
     )
     options.check()
+    check_pages()
 
     def on_ready(serving: Serving) -> None:
         stderr.print(f"Studio  →  {serving.url}", soft_wrap=True, markup=False, highlight=False)

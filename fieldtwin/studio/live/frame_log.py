@@ -112,7 +112,7 @@ class FrameLog:
             self._capture = capture.open("rb")
         except OSError as e:
             raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(capture)) from e
-        self._rows = tempfile.TemporaryFile(prefix="fieldtwin-frames-")  # noqa: SIM115: closed by `close`
+        self._rows = tempfile.TemporaryFile(prefix="fieldtwin-frames-")  # noqa: SIM115
         self._rest = b""
         self._read_to = 0
         self._written = 0

@@ -1,0 +1,196 @@
+"""The REST and WebSocket interface, used with clients that are not ours: httpx and websockets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import httpx
+import pytest
+import websockets
+from studio_rig import OPERATE, VIEW, Studio, until
+
+from fieldtwin.capture.formats.pcap import MAGIC_NS
+
+NAME = "/instances/observatory"
+
+
+def tag(studio: Studio, name: str) -> dict[str, Any]:
+    with studio.client(VIEW) as client:
+        found: dict[str, Any] = client.get(f"{NAME}/tags").json()[name]
+        return found
+
+
+def latest(client: httpx.Client, **wanted: Any) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = client.get(f"{NAME}/frames", params=wanted | {"count": 50}).json()["rows"]
+    return rows
+
+
+def test_a_started_prototype_is_listed_and_described(observatory: Studio) -> None:
+    with observatory.client(VIEW) as client:
+        [listed] = [i for i in client.get("/instances").json() if i["name"] == "observatory"]
+        assert listed["running"]
+        assert listed["mode"] == "prototype"
+        assert listed["started_here"]
+        assert listed["frames"]
+        about = client.get(NAME).json()
+    assert about["system"]["devices"]["ctd"]["tags"]["pressure"]["unit"] == "dbar"
+    assert about["role"] == "view"
+    assert about["system"]["buses"]["can0"]["kind"] == "CAN bus"
+
+
+def test_a_silent_device_turns_bad_with_its_reason_and_recovers(observatory: Studio) -> None:
+    until(lambda: tag(observatory, "ctd.status")["quality"] == "good", "the sensor is read")
+    with observatory.client() as client:
+        injected = client.post(f"{NAME}/faults", json={"fault": {"name": "silence", "device": "ctd"}}).json()
+        bad = until(lambda: (t := tag(observatory, "ctd.status"))["quality"] == "bad" and t, "the status turns bad")
+        assert bad["reason"] in ("timeout", "stale")
+        problems = until(
+            lambda: client.get(f"{NAME}/frames", params={"device": "ctd", "problems": True}).json()["rows"],
+            "unanswered requests are shown as problems",
+        )
+        assert {row["verdict"] for row in problems} == {"no reply"}
+        counted = until(
+            lambda: [
+                f for f in client.get(f"{NAME}/faults").json()["history"] if f["id"] == injected["id"] and f["struck"]
+            ],
+            "the fault is counted",
+        )
+        assert counted[0]["name"] == "silence"
+        client.delete(f"{NAME}/faults/{injected['id']}").raise_for_status()
+    until(lambda: tag(observatory, "ctd.status")["quality"] == "good", "the sensor is read again")
+
+
+def test_a_value_set_in_the_simulated_device_arrives_over_the_bus_until_it_is_released(observatory: Studio) -> None:
+    with observatory.client() as client:
+        client.put(f"{NAME}/tags/ctd.sample_period_s/set", json={"value": 7}).raise_for_status()
+        until(lambda: tag(observatory, "ctd.sample_period_s")["value"] == 7, "the set value is read")
+        until(
+            lambda: 7 in [row["tags"].get("sample_period_s") for row in latest(client, device="ctd")],
+            "the frame that carried the value is shown",
+        )
+        history = client.get(f"{NAME}/tags/ctd.sample_period_s/history").json()
+        assert history["points"][-1][1:3] == [7, "good"]
+        client.delete(f"{NAME}/tags/ctd.sample_period_s/set").raise_for_status()
+        until(lambda: tag(observatory, "ctd.sample_period_s")["value"] != 7, "the device has its own value again")
+
+
+def test_requests_are_linked_with_their_replies(observatory: Studio) -> None:
+    with observatory.client(VIEW) as client:
+        params = {"device": "ctd", "service": "read holding registers"}
+        rows = until(
+            lambda: [r for r in client.get(f"{NAME}/frames", params=params).json()["rows"] if r["reply"] is not None],
+            "an answered request",
+        )
+        request = rows[-1]
+        detail = client.get(f"{NAME}/frames/{request['number']}").json()
+        [reply] = detail["linked"]
+        assert reply["request"] == request["number"]
+        assert reply["latency_ns"] == reply["t_ns"] - request["t_ns"]
+        assert request["bytes"].startswith("0103")
+
+
+def test_frames_are_exported_as_pcap_and_candump(observatory: Studio) -> None:
+    with observatory.client(VIEW) as client:
+        until(lambda: client.get(f"{NAME}/frames", params={"bus": "can0"}).json()["total"], "CAN frames")
+        packets = client.get(f"{NAME}/frames/export", params={"bus": "lan", "format": "pcap"})
+        assert packets.content[:4] == MAGIC_NS.to_bytes(4, "big")
+        text = client.get(f"{NAME}/frames/export", params={"bus": "can0", "format": "candump"}).text
+        assert text.splitlines()[0].split()[1] == "can0"
+        mixed = client.get(f"{NAME}/frames/export", params={"format": "pcap"})
+        assert mixed.status_code == 400
+        assert "one bus" in mixed.json()["error"]["message"]
+
+
+def test_a_force_is_seen_recorded_and_removed(observatory: Studio) -> None:
+    with observatory.client() as client:
+        client.post(f"{NAME}/plc/forces", json={"tag": "ctd.sample_count", "value": 5}).raise_for_status()
+        forces = client.get(f"{NAME}/plc").json()["forces"]
+        assert forces["ctd.sample_count"]["value"] == 5
+        assert forces["ctd.sample_count"]["by"].startswith("studio")
+        client.delete(f"{NAME}/plc/forces").raise_for_status()
+        assert client.get(f"{NAME}/plc").json()["forces"] == {}
+    audit = (observatory.run_root / "observatory" / "audit.jsonl").read_text()
+    assert '"force"' in audit
+    assert '"unforce"' in audit
+    assert "studio" in audit
+
+
+def test_changes_arrive_over_the_websocket(observatory: Studio) -> None:
+    async def main() -> set[str]:
+        url = f"{observatory.api}{NAME}/stream".replace("http", "ws", 1)
+        async with websockets.connect(url, additional_headers={"Authorization": f"Bearer {VIEW}"}) as socket:
+            hello = json.loads(await socket.recv())
+            assert hello["type"] == "hello"
+            assert hello["status"]["gateway"]["devices"]["ctd"]["bus"] == "line1"
+            seen: set[str] = set()
+            async with asyncio.timeout(30):
+                while not {"status", "tags", "frames"} <= seen:
+                    seen.add(json.loads(await socket.recv())["type"])
+            return seen
+
+    assert asyncio.run(main()) >= {"status", "tags", "frames"}
+
+
+def test_two_browsers_see_the_same(observatory: Studio) -> None:
+    async def main() -> list[Any]:
+        url = f"{observatory.api}{NAME}/stream".replace("http", "ws", 1)
+        headers = {"Authorization": f"Bearer {OPERATE}"}
+        async with (
+            websockets.connect(url, additional_headers=headers) as one,
+            websockets.connect(url, additional_headers=headers) as other,
+        ):
+            seen = []
+            for socket in (one, other):
+                async with asyncio.timeout(30):
+                    changes: list[Any] = []
+                    while len(changes) < 30:
+                        changes += json.loads(await socket.recv()).get("changes", [])
+                    seen.append(changes)
+            return seen
+
+    first, second = asyncio.run(main())
+    common = [change for change in first if change in second]
+    assert common
+    assert [c for c in second if c in common] == common
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status", "text"),
+    [
+        ("GET", "/instances/nobody", None, 404, "no instance"),
+        ("GET", f"{NAME}/tags/ctd.nothing/history", None, 404, "no tag"),
+        ("GET", f"{NAME}/frames/999999999", None, 404, "no frame"),
+        ("GET", f"{NAME}/frames?count=0", None, 400, "count"),
+        ("GET", f"{NAME}/frames?count=x", None, 400, "whole number"),
+        ("PUT", f"{NAME}/tags/ctd.status/set", '{"value": "x"}', 400, "Expected"),
+        ("PUT", f"{NAME}/tags/ctd.status/set", "{", 400, "content"),
+        ("PUT", f"{NAME}/tags/ctd.sample_period_s/set", '{"value": 1e300}', 400, "sample_period_s"),
+        ("POST", f"{NAME}/faults", '{"fault": {"name": "silense"}}', 400, "silence"),
+        ("POST", f"{NAME}/plc/forces", '{"tag": "no.tag", "value": 1}', 400, "no.tag"),
+        ("POST", "/instances", '{"system": "/etc/passwd"}', 404, "no system"),
+        ("DELETE", "/instances/other", None, 400, "has not started"),
+        ("GET", "/nothing", None, 404, "nothing at"),
+    ],
+)
+def test_bad_requests_are_refused_in_words(
+    observatory: Studio, method: str, path: str, body: str | None, status: int, text: str
+) -> None:
+    with observatory.client() as client:
+        answer = client.request(method, path, content=body)
+    assert answer.status_code == status, answer.text
+    assert text in answer.json()["error"]["message"]
+    assert "Traceback" not in observatory.log.read_text()
+
+
+def test_the_description_of_the_interface_names_every_operation(observatory: Studio) -> None:
+    from fieldtwin.studio.app import OPERATIONS
+
+    with observatory.client(VIEW) as client:
+        told = client.get("/openapi.json").json()
+    assert told["openapi"] == "3.1.0"
+    assert sum(len(methods) for methods in told["paths"].values()) == len(OPERATIONS)
+    force = told["paths"]["/api/v1/instances/{instance}/plc/forces"]["post"]
+    assert force["requestBody"]["content"]["application/json"]["schema"]["$ref"] == "#/components/schemas/Force"
+    assert set(told["components"]["schemas"]["Force"]["properties"]) == {"tag", "value"}

@@ -1,6 +1,6 @@
 """Studio: see and operate a prototype or a plant in the browser.
 
-A web server in a process of its own. It talks to gateway, PLC and field simulator through their control channels, as the
+The web server is a separate process. It talks to gateway, PLC and field simulator through their control channels, as the
 command line does, and reads the capture of the buses from its file. So it can neither delay a poll nor a scan.
 
 `live` observes instances and keeps their history; it does not know HTTP. `api` is the REST and WebSocket interface.

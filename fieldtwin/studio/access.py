@@ -1,4 +1,4 @@
-"""Who may use Studio: a token for each role, checks against other web sites, and the headers that restrict what a page may do.
+"""Access to Studio: a token for each role, checks against other web sites, and headers that restrict the pages.
 
 A web page of another site can send requests to this server from the user's browser. It cannot read the answers, but a
 request could change a plant. Three checks prevent that: the ``Host`` header has to name this server (DNS rebinding), the

@@ -83,7 +83,9 @@ def check_pages() -> None:
     """Raise `Unreachable` if the libraries of the pages are missing, as in a clone in which they were never fetched."""
     if not (STATIC / "vendor" / "preact.js").is_file():
         raise Unreachable(
-            "Studio's pages are not built in this clone", where=str(STATIC), hint="scripts/studio-assets fetches them; it needs npm"
+            "Studio's pages are not built in this clone",
+            where=str(STATIC),
+            hint="scripts/studio-assets fetches them; it needs npm",
         )
 
 
@@ -141,7 +143,7 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
 
 
 def open_browser(url: str) -> bool:
-    """Open the user's browser; return False if there is none."""
+    """Open the user's browser. Return whether a browser was found."""
     try:
         return webbrowser.open(url)
     except webbrowser.Error:

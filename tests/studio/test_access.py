@@ -1,4 +1,4 @@
-"""Who may use Studio: tokens and roles, other web sites, DNS rebinding, and what listens where."""
+"""Access to Studio: tokens and roles, other web sites, DNS rebinding, and listening beyond loopback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client that is too slow loses the oldest updates, is told how many, and delays no other client."""
+"""A client that is too slow loses the oldest updates, knows their number, and delays no other client."""
 
 from __future__ import annotations
 

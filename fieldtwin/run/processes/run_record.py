@@ -20,7 +20,7 @@ MOST_BYTES = 1 << 20
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Times of frames and values count on the monotonic clock of the computer."""
+    """The description of a run. Times of frames and values count on the monotonic clock of the computer."""
 
     version: str = __version__
     system: str
@@ -48,7 +48,7 @@ def write_record(run_dir: Path, record: RunRecord) -> None:
 
 
 def read_record(run_dir: Path) -> RunRecord | None:
-    """Return the record of the latest run in a run directory, None if there is none.
+    """Return the record of the latest run in a run directory, or None if no run has written one.
 
     Raises `FileInvalid` if the file belongs to another version of fieldtwin or is damaged.
     """

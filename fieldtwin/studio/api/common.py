@@ -1,4 +1,4 @@
-"""What all handlers share: the gallery of a server, and the instance that a request is about."""
+"""Functions that all handlers use: the gallery of the server, and the instance that a request names."""
 
 from __future__ import annotations
 

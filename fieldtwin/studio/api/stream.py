@@ -1,6 +1,6 @@
 """Updates over a WebSocket: the present state first, then each change.
 
-A client that reads too slowly loses updates and is told how many. Messages are JSON objects with a ``type``: ``hello``,
+A client that reads too slowly loses updates, and a message gives their number. Messages are JSON objects with a ``type``: ``hello``,
 ``status``, ``tags`` (changes: name, time in ns, value, quality, reason), ``frames`` (the number of frames so far), ``dropped``
 (how many updates this client has lost), ``end``.
 """
@@ -71,7 +71,7 @@ async def _serve(socket: WebSocket, subscription: Subscription) -> None:
 
 
 async def _until_left(socket: WebSocket) -> None:
-    """Return when the client has left. What it sends is ignored."""
+    """Return when the client has left. Messages from the client are ignored."""
     with contextlib.suppress(WebSocketDisconnect):
         while True:
             await socket.receive_text()

@@ -14,7 +14,7 @@ MOST_ATTACHED = 8
 
 
 class NoInstance(UsageError):
-    """There is no instance of this name."""
+    """The instance does not exist on this computer."""
 
 
 class Gallery:

@@ -36,7 +36,7 @@ async def find_instances() -> list[FoundInstance]:
 
 
 async def find_instance(name: str) -> FoundInstance | None:
-    """Return the instance of a name, None if there is none."""
+    """Return the instance of this name, or None."""
     if "/" in name or name in ("", ".", ".."):
         return None
     folder = runtime_root() / name

@@ -1,4 +1,4 @@
-"""What Studio knows about one instance: its description, its latest statuses, the history of its tags, and its frames."""
+"""The description of a system for pages and other programs: buses, devices with their tags, programs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Updates over a WebSocket: the present state first, then each change.
 
-A client that reads too slowly loses updates, and a message gives their number. Messages are JSON objects with a ``type``: ``hello``,
-``status``, ``tags`` (changes: name, time in ns, value, quality, reason), ``frames`` (the number of frames so far), ``dropped``
-(how many updates this client has lost), ``end``.
+A client that reads too slowly loses updates, and a message gives their number. Messages are JSON objects with a ``type``:
+``hello``, ``status``, ``tags`` (changes: name, time in ns, value, quality, reason), ``frames`` (the number of frames so far),
+``dropped`` (how many updates this client has lost), ``end``.
 """
 
 from __future__ import annotations

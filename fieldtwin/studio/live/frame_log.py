@@ -25,7 +25,7 @@ from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.capture.formats.pcap import captured_of
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.results.trace import Event
+from fieldtwin.results.trace import TraceEvent
 from fieldtwin.twin.site.system import System
 
 MOST_FRAMES = 4_000_000
@@ -252,7 +252,7 @@ class FrameLog:
         for event in events:
             self._add(event, at)
 
-    def _add(self, event: Event, at: int) -> None:
+    def _add(self, event: TraceEvent, at: int) -> None:
         number, decoded = len(self), self._decoder.decode(event)
         sent = event.data.get("dir") == "sent"
         answered: DecodedExchange | None = None
@@ -276,7 +276,7 @@ class FrameLog:
         self._append(event, at, decoded.text, sent, of, answered, request)
 
     def _append(
-        self, event: Event, at: int, text: str, sent: bool, of: DecodedExchange | None, answered: DecodedExchange | None,
+        self, event: TraceEvent, at: int, text: str, sent: bool, of: DecodedExchange | None, answered: DecodedExchange | None,
         request: int | None,
     ) -> None:  # fmt: skip
         device = of.device if of else text.partition(":")[0] if text.partition(":")[0] in self._system.devices else ""

@@ -27,6 +27,7 @@ from fieldtwin.gateway.protocols.modbus.server.analysis import (
     NO_PATH,
     SERVER_BUSY,
     SERVER_FAILURE,
+    WRITE_FUNCTIONS,
     Access,
     ServedTable,
     examine,
@@ -43,9 +44,6 @@ from fieldtwin.gateway.runtime.tags import TagTable
 BIT_TABLES = ("coil", "discrete")
 DIRECT_UNITS = (0, 255)
 """The unit IDs that a client without unit IDs sends to a device directly on TCP (TG 4.4.1.2, case MB-057)."""
-
-WRITING = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
-"""Function codes of requests that write."""
 
 QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
     "input": "input",
@@ -162,6 +160,7 @@ class TagServer:
             admits=lambda address: within(address, config.networks),
             idle_s=config.idle_s,
             listen=listen,
+            refused=self._note_refusal,
         )
 
     async def run(self) -> None:
@@ -185,14 +184,18 @@ class TagServer:
         """Answer a request PDU. A unit ID that is not served gets exception 0A, because silence would hide a wrong setting."""
         try:
             if unit != self.config.unit and unit not in DIRECT_UNITS:
-                raise refusal(pdu[0], NO_PATH)
+                raise refusal(pdu[0], NO_PATH, f"the unit ID is {self.config.unit}")
             return self._answer(caller, pdu)
         except ModbusExceptionReply as e:
             self.counters.bad += e.code == SERVER_FAILURE
             self.counters.refused += e.code != SERVER_FAILURE
-            if self._record is not None and pdu[0] in WRITING:
-                self._record.refused(caller.on_record, self.config.name, unit, pdu, e.code)
+            self._note_refusal(caller, unit, pdu, e.code, e.hint)
             return exception_pdu(e)
+
+    def _note_refusal(self, caller: Caller, unit: int, pdu: bytes, code: int, why: str = "") -> None:
+        """Record a write that reaches no tag."""
+        if self._record is not None and pdu[0] in WRITE_FUNCTIONS:
+            self._record.refused(caller.on_record, self.config.name, unit, pdu, code, why)
 
     def _answer(self, caller: Caller, pdu: bytes) -> Answer:
         function = pdu[0]

@@ -48,10 +48,18 @@ def a_unit(first: int) -> ModbusUnit:
 class Rig:
     """A bridge, its line, and the recorded traffic of the line."""
 
-    def __init__(self, bridge: Bridge, bus: ModbusBus, units: dict[int, ModbusUnit], audit: Path) -> None:
+    def __init__(self, bridge: Bridge, bus: ModbusBus, units: dict[int, ModbusUnit], audit: Path, end: PtyEnd) -> None:
         self.bridge, self.bus, self.units = bridge, bus, units
+        self._end = end
         self.heard: list[bytes] = []
         self._audit = audit
+
+    async def unplug(self) -> None:
+        """Take the line away, and send requests until the bus has noticed."""
+        await self._end.aclose()
+        async with asyncio.timeout(20), self.client() as client:
+            while self.bus.down is None:
+                await refused(client, 2)
 
     @property
     def audit(self) -> list[dict[str, Any]]:
@@ -97,7 +105,7 @@ async def rig(
     bus = ModbusBus(BusConfig("line", plant, timeout_s, 1), [], OsConnector(), CLOCK, TagTable(CLOCK), lambda d: None)
     config = config or BridgeConfig("b", ANY_PORT, to="line")
     bridge = Bridge(config, {"line": bus}, OsConnector(), CLOCK, audit, blocked)
-    made = Rig(bridge, bus, units, tmp_path / "audit.jsonl")
+    made = Rig(bridge, bus, units, tmp_path / "audit.jsonl", end)
 
     def note(direction: Direction, t_ns: int, adu: bytes) -> None:
         if direction is Direction.SENT:

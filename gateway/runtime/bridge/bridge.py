@@ -37,6 +37,7 @@ from fieldtwin.gateway.protocols.modbus.server.analysis import (
     SERVER_BUSY,
     SERVER_FAILURE,
     ServerRequest,
+    changes_a_unit,
     examine,
     exception_pdu,
 )
@@ -53,6 +54,7 @@ from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeRequest
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.gateway_status import BridgeStatus
 
+_FULL = "too many requests wait for the bus"
 LAST_LINE_UNIT = 247
 """Unit IDs 248 to 255 are reserved on a serial line (SL 2.2)."""
 
@@ -174,6 +176,7 @@ class Bridge:
                 insist=config.insist,
                 idle_s=config.idle_s,
                 listen=listen,
+                refused=self._note_refusal,
             )
 
     async def run(self) -> None:
@@ -204,7 +207,13 @@ class Bridge:
                 return when_all_are_out(pdu, sent) if self.config.answer_broadcast else None
             return self._forward(caller, route, pdu, asked)
         except ModbusExceptionReply as e:
+            self._note_refusal(caller, unit, pdu, e.code, e.hint)
             return exception_pdu(e)
+
+    def _note_refusal(self, caller: Caller, unit: int, pdu: bytes, code: int, why: str = "") -> None:
+        """Record a request that was not forwarded, if it may change a unit."""
+        if changes_a_unit(pdu):
+            self._record.refused(caller.on_record, self._place(unit, self._route(unit)), unit, pdu, code, why)
 
     def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[ServerRequest, Route | None]:
         """Return the parsed request and its route; a route of None is a broadcast. Raises the exception to answer
@@ -214,7 +223,7 @@ class Bridge:
         broadcast = route is None and unit == 0 and self.config.broadcast
         if route is None and not broadcast:
             self.counters.no_path += 1
-            raise refusal(function, NO_PATH)
+            raise refusal(function, NO_PATH, "the bridge has no route for this unit ID")
         try:
             asked = examine(pdu)
         except ModbusExceptionReply:
@@ -225,9 +234,7 @@ class Bridge:
             code = ILLEGAL_FUNCTION
         if code:
             self.counters.refused += 1
-            if asked.changes:
-                self._record.refused(caller.on_record, self._place(unit, route), unit, pdu, code)
-            raise refusal(function, code)
+            raise refusal(function, code, "the allow list of the bridge refuses it")
         return asked, route
 
     def _route(self, unit: int) -> Route | None:
@@ -255,17 +262,16 @@ class Bridge:
         if kept is not None:
             return kept
         if bus.down is not None:
-            return exception_pdu(refusal(asked.function, self._code_of(bus.down, route)))
+            raise refusal(asked.function, self._code_of(bus.down, route), str(bus.down))
         away = self._away.get(route)
         if away is not None and now_ns < away.until_ns:
             self.counters.spared += 1
-            raise refusal(asked.function, NO_RESPONSE)
+            raise refusal(asked.function, NO_RESPONSE, "the unit did not answer, and is not asked for some seconds")
         if self._under_way[route.bus] >= self.config.queue:
             self.counters.full += 1
-            raise refusal(asked.function, SERVER_BUSY)
+            raise refusal(asked.function, SERVER_BUSY, _FULL)
         if asked.changes and (why := self._blocked(route.bus, route.unit)):
-            self._record.refused(caller.on_record, self._place(0, route), route.unit, pdu, NO_PATH, why)
-            raise refusal(asked.function, NO_PATH)
+            raise refusal(asked.function, NO_PATH, why)
         promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
         self._under_way[route.bus] += 1
         promise.add_done_callback(lambda _: self._ended(route.bus))
@@ -346,16 +352,18 @@ class Bridge:
         """Send a broadcast once to every serial line; units do not answer it (case MB-028). Return a future for each line."""
         sent = []
         for name, bus in self._buses.items():
-            if not self._is_line(name) or bus.down is not None:
+            if not self._is_line(name):
                 continue
-            if why := self._blocked(name, 0):
+            why = str(bus.down) if bus.down is not None else self._blocked(name, 0)
+            if not why and self._under_way[name] >= self.config.queue:
+                why = _FULL
+            if why:
                 self._record.refused(caller.on_record, f"{name}/0", 0, pdu, NO_PATH, why)
                 continue
             promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
-            if self._under_way[name] < self.config.queue:
-                self.counters.broadcasts += 1
-                self._under_way[name] += 1
-                promise.add_done_callback(lambda _, name=name: self._ended(name))  # type: ignore[misc]
-                bus.guests.put(self._guest(caller, Route(name, 0), pdu, asked, promise, attempts=1))
-                sent.append(promise)
+            self.counters.broadcasts += 1
+            self._under_way[name] += 1
+            promise.add_done_callback(lambda _, name=name: self._ended(name))  # type: ignore[misc]
+            bus.guests.put(self._guest(caller, Route(name, 0), pdu, asked, promise, attempts=1))
+            sent.append(promise)
         return sent

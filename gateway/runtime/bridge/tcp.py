@@ -56,6 +56,14 @@ Ask = Callable[[Caller, int, bytes], Answer]
 """``(caller, unit, request PDU)``. Never waits, and never raises an error because of what a client sends."""
 
 
+Refused = Callable[[Caller, int, bytes, int, str], None]
+"""``(caller, unit, request PDU, exception code, reason)``: called with a request that `Ask` never receives."""
+
+
+def _ignore(caller: Caller, unit: int, pdu: bytes, code: int, why: str) -> None:
+    """Do nothing."""
+
+
 @dataclass
 class FrontCounters:
     """Counters: accepted requests, requests refused because too many were unanswered, ADUs of other protocols, streams that could
@@ -88,6 +96,7 @@ class TcpFront:
         insist: bool = True,
         idle_s: float = 0.0,
         listen: Listen = TcpListener.open,
+        refused: Refused = _ignore,
     ) -> None:
         self.endpoint = endpoint
         self.counters = FrontCounters()
@@ -101,6 +110,7 @@ class TcpFront:
         self._insist = insist
         self._idle_s = idle_s
         self._listen = listen
+        self._refused = refused
 
     @property
     def bound(self) -> Endpoint | None:
@@ -145,18 +155,27 @@ class TcpFront:
         )
 
     async def _serve(self, connection: Client) -> None:
-        session = _Session(connection, self._ask, self._in_flight, self.counters, self._clock)
+        session = _Session(connection, self._ask, self._refused, self._in_flight, self.counters, self._clock)
         await session.run()
 
 
 class _Session:
     """The session of one client."""
 
-    def __init__(self, connection: Client, ask: Ask, in_flight: int, counters: FrontCounters, clock: Clock) -> None:
+    def __init__(
+        self,
+        connection: Client,
+        ask: Ask,
+        refused: Refused,
+        in_flight: int,
+        counters: FrontCounters,
+        clock: Clock,
+    ) -> None:
         self._connection = connection
         self._clock = clock
         self._caller = Caller(f"{connection.peer}:{connection.peer_port}", connection.peer, connection.role)
         self._ask = ask
+        self._refused = refused
         self._in_flight = in_flight
         self._counters = counters
         self._waiting: deque[tuple[TcpRequest, Answer]] = deque()
@@ -222,6 +241,8 @@ class _Session:
         answer: Answer
         if sum(isinstance(a, asyncio.Future) and not a.done() for _, a in self._waiting) >= self._in_flight:
             self._counters.busy += 1
+            why = f"the client has {self._in_flight} requests without an answer"
+            self._refused(self._caller, request.unit, request.pdu, SERVER_BUSY, why)
             answer = exception_pdu(refusal(request.pdu[0], SERVER_BUSY))
         else:
             answer = self._ask(self._caller, request.unit, request.pdu)

@@ -10,7 +10,7 @@ from bridge_rig import ANY_PORT, WRITERS, read_adu, rig, take
 from support import run
 
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig
+from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy, network
 
 
@@ -103,5 +103,61 @@ def test_the_wrong_device_is_not_written_to(tmp_path: Path) -> None:
                 await raw.write(read_adu(2, 1, 4, 1))
                 assert (await take(raw, 11))[-2:] == (104).to_bytes(2)
             assert r.audit[-1]["result"] == "another device"
+
+    run(main())
+
+
+def adu(unit: int, pdu: str) -> bytes:
+    data = bytes.fromhex(pdu)
+    return bytes.fromhex("0001 0000") + (len(data) + 1).to_bytes(2) + bytes([unit]) + data
+
+
+@pytest.mark.parametrize(
+    ("unit", "pdu", "code", "device", "why"),
+    [
+        (7, "06 0004 0001", 0x0A, "b/7", "the bridge has no route for this unit ID"),
+        (1, "10 0004 0002 02 0001", 3, "line/1", "exception 03h"),
+        (2, "06 0004 0001", 0x0B, "line/99", "the unit did not answer, and is not asked for some seconds"),
+    ],
+)
+def test_a_write_that_the_bridge_answers_itself_is_on_record(
+    tmp_path: Path, unit: int, pdu: str, code: int, device: str, why: str
+) -> None:
+    async def main() -> None:
+        routes = {1: Route("line", 1), 2: Route("line", 99)}
+        async with rig(tmp_path, BridgeConfig("b", ANY_PORT, routes=routes, policy=WRITERS)) as r, r.raw() as raw:
+            if unit == 2:
+                await raw.write(read_adu(1, 2, 4, 1))
+                assert (await take(raw, 9))[-1] == 0x0B
+            await raw.write(adu(unit, pdu))
+            assert (await take(raw, 9))[-1] == code
+            (entry,) = r.audit
+            assert (entry["action"], entry["device"], entry["result"]) == ("refuse", device, why)
+            assert entry["pdu"] == pdu.replace(" ", "").lower()
+
+    run(main())
+
+
+@pytest.mark.parametrize("unit", [1, 0], ids=["unit", "broadcast"])
+def test_a_write_to_a_line_that_is_away_is_on_record(tmp_path: Path, unit: int) -> None:
+    async def main() -> None:
+        config = BridgeConfig("b", ANY_PORT, to="line", policy=WRITERS, broadcast=True, answer_broadcast=True)
+        async with rig(tmp_path, config) as r, r.raw() as raw:
+            await r.unplug()
+            await raw.write(adu(unit, "06 0004 0001"))
+            assert (await take(raw, 9))[-1] == 0x0A
+            (entry,) = r.audit
+            assert (entry["action"], entry["device"]) == ("refuse", f"line/{unit}")
+            assert str(tmp_path / "line") in entry["result"]
+
+    run(main())
+
+
+def test_reads_that_are_refused_are_not_in_the_audit_log(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path, BridgeConfig("b", ANY_PORT, routes={1: Route("line", 1)})) as r, r.raw() as raw:
+            await raw.write(read_adu(1, 7, 4, 1))
+            assert (await take(raw, 9))[-1] == 0x0A
+            assert r.audit == []
 
     run(main())

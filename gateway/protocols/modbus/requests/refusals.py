@@ -38,6 +38,8 @@ _TYPES: dict[int, type[ModbusExceptionReply]] = {
 }
 
 
-def refusal(function: int, code: int) -> ModbusExceptionReply:
-    """Return the error for exception `code` to a request of `function`."""
-    return _TYPES.get(code, ModbusExceptionReply)(function, code)
+def refusal(function: int, code: int, hint: str = "") -> ModbusExceptionReply:
+    """Return the error for exception `code` to a request of `function`. `hint` gives the reason, which is not on the wire."""
+    error = _TYPES.get(code, ModbusExceptionReply)(function, code)
+    error.hint = hint
+    return error

@@ -78,6 +78,14 @@ def examine(pdu: bytes) -> ServerRequest:
     return ServerRequest(pdu[0], changes=True) if reader is None else reader(pdu)
 
 
+def changes_a_unit(pdu: bytes) -> bool:
+    """Return whether a request may change the unit. A request with wrong lengths is judged by its function code."""
+    try:
+        return examine(pdu).changes
+    except ModbusExceptionReply:
+        return pdu[:1] != b"" and pdu[0] in WRITE_FUNCTIONS
+
+
 def word(pdu: bytes, at: int) -> int:
     """Return the unsigned word at byte `at`, high byte first (AP 4.2)."""
     return pdu[at] << 8 | pdu[at + 1]

@@ -11,6 +11,7 @@ from random import Random
 from typing import Any
 
 from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.faults.effect import check_wire_effect
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, InjectionPoint, ValueFault
 from fieldtwin.emulators.faults.frames import Framing
@@ -71,8 +72,8 @@ class DeviceFaults:
         return active
 
 
-def check_device(spec: FaultSpec, profile: DeviceProfile | None) -> None:
-    """Raise `WrongAim` for a fault that a single device cannot have."""
+def check_device(spec: FaultSpec, profile: DeviceProfile | None, framings: Iterable[Framing] = ()) -> None:
+    """Raise `WrongAim` for a fault that a single device cannot have, or that changes nothing on any of its wires."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:
@@ -93,6 +94,15 @@ def check_device(spec: FaultSpec, profile: DeviceProfile | None) -> None:
     if profile is not None:
         check_fault(spec.make(), aim.register_, profile.tags.values())
     _place(aim, profile)
+    table = None if tag is None or kind is not InjectionPoint.BYTES else tag.registers.table
+    without: list[WrongAim] = []
+    for framing in (framings := tuple(framings)):
+        try:
+            check_wire_effect(spec, framing, table)
+        except WrongAim as e:
+            without.append(e)
+    if without and len(without) == len(framings):
+        raise without[0]
 
 
 def _tag(aim: Aim, profile: DeviceProfile | None) -> Tag | None:

@@ -20,7 +20,7 @@ from fieldtwin.emulators.endpoints.faulty.udp import FaultyDatagrams
 from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import CanPort, Listening, Ports
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.frames import Framing, framing_of
 from fieldtwin.emulators.modbus.ascii import AsciiServer
 from fieldtwin.emulators.modbus.line import LineServer
 from fieldtwin.emulators.modbus.mbap import MbapServer
@@ -235,15 +235,6 @@ class EmulatorHost:
 def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineServer:
     """Return the units of a serial line, in the framing of the plant's endpoint."""
     return AsciiServer(units) if plant.scheme == "ascii" else RtuServer(units)
-
-
-def framing_of(plant: Endpoint) -> Framing:
-    """Return the framing of a bus."""
-    if plant.is_can:
-        return Framing.RAW
-    if plant.scheme == "ascii":
-        return Framing.ASCII
-    return Framing.RTU if plant.is_serial or plant.scheme == "rtu+tcp" else Framing.MBAP
 
 
 def _latency(wire: ModbusWire, units: Mapping[int, ModbusUnit]) -> float | Latency:

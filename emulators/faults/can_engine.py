@@ -43,8 +43,10 @@ def aimed(active: Active, frame: CanFrame) -> bool:
         return False
     if aim.index is None:
         return True
-    sdo = frame.can_id & 0x780 in (SDO_REPLY, SDO_REQUEST) and len(frame.data) == 8
-    return sdo and int.from_bytes(frame.data[1:3], "little") == aim.index
+    segments = {SDO_REPLY: (0, 1), SDO_REQUEST: (0, 3)}.get(frame.can_id & 0x780)
+    if segments is None or len(frame.data) != 8 or frame.data[0] >> 5 in segments:
+        return False
+    return int.from_bytes(frame.data[1:3], "little") == aim.index
 
 
 def seen(way: FrameDirection, node: int) -> FaultFrame:

@@ -44,6 +44,11 @@ class CanFault(Fault):
         return ()
 
 
+def only_sends(kind: type[Fault]) -> bool:
+    """Return whether a fault sends frames of its own when it is injected, and changes none."""
+    return issubclass(kind, CanFault) and kind.appears is not CanFault.appears
+
+
 class BusFault(Fault):
     """A fault that destroys attempts to send; only a modelled CAN bus supports it."""
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
+from fieldtwin.emulators.faults.frames import EVERY_FRAMING, FaultFrame, FrameDirection, Framing
 from fieldtwin.gateway.core.files.profile import Tag
 
 
@@ -144,6 +144,10 @@ class WireFault(Fault):
 
     refuses: ClassVar[bool] = False
     """Whether new connections are refused while the fault lasts."""
+    framings: ClassVar[frozenset[Framing]] = EVERY_FRAMING
+    """The framings whose frames the fault can change; on any other one it is refused when its file is loaded."""
+    functions: ClassVar[frozenset[int]] = frozenset()
+    """The function codes whose frames the fault can change; empty: all."""
     divides: ClassVar[bool] = False
     """Whether the fault delivers the frame in several pieces, with all bytes unchanged.
 

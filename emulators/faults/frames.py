@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fieldtwin.emulators.modbus.rtu.shapes import crc16
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 FLUSH_S = 0.05
 """How long bytes that form no frame wait for more, in seconds."""
@@ -43,6 +44,20 @@ class Framing(Enum):
     def streams(self) -> bool:
         """Return whether frames are part of a TCP stream with arbitrary segments, and carry their own length."""
         return self in (Framing.THREAD, Framing.MQTT)
+
+
+EVERY_FRAMING = frozenset(Framing)
+MODBUS = frozenset({Framing.RTU, Framing.ASCII, Framing.MBAP})
+"""The framings whose frames carry a unit ID and a PDU."""
+
+
+def framing_of(plant: Endpoint) -> Framing:
+    """Return the framing of a bus."""
+    if plant.is_can:
+        return Framing.RAW
+    if plant.scheme == "ascii":
+        return Framing.ASCII
+    return Framing.RTU if plant.is_serial or plant.scheme == "rtu+tcp" else Framing.MBAP
 
 
 class FrameDirection(Enum):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from random import Random
 from typing import Any
 
-from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
+from fieldtwin.emulators.faults.can_fault import BusFault, only_sends
+from fieldtwin.emulators.faults.effect import check_can_effect, check_wire_effect
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, InjectionPoint
 from fieldtwin.emulators.faults.frames import Framing
@@ -15,12 +17,15 @@ from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 
-def check_link(spec: FaultSpec) -> None:
-    """Raise `WrongAim` for a fault that needs a system file, devices, register names, values or a CAN bus."""
+def check_link(spec: FaultSpec, framing: Framing = Framing.RTU) -> None:
+    """Raise `WrongAim` for a fault that needs a system file, devices, register names, values or a CAN bus, and for one that
+    changes nothing in frames of `framing`.
+    """
     _check_kind(spec, InjectionPoint.BYTES, "one of a line or socket")
     _check_names(spec, "unit, function, address")
     if spec.aim.address is not None:
         addressed(spec.aim.address)
+    check_wire_effect(spec, framing)
 
 
 def check_can_link(spec: FaultSpec) -> None:
@@ -32,8 +37,9 @@ def check_can_link(spec: FaultSpec) -> None:
             "name", f"fault {spec.kind.name} needs a modelled bus, and a link has none",
             hint="`fieldtwin run` and `fieldtwin with` have one",
         )  # fmt: skip
-    if issubclass(spec.kind, CanFault) and spec.kind.appears is not CanFault.appears and spec.aim.unit is None:
+    if only_sends(spec.kind) and spec.aim.unit is None:
         raise WrongAim("name", f"fault {spec.kind.name} is sent by a node", expected="unit: the node ID")
+    check_can_effect(spec, spec.aim.unit)
 
 
 def _check_kind(spec: FaultSpec, kind: InjectionPoint, expected: str) -> None:
@@ -53,9 +59,11 @@ def wire_faults(
     framing: Framing,
     seed: int,
     start_ns: int,
-    check: Callable[[FaultSpec], None] = check_link,
+    check: Callable[[FaultSpec], None] | None = None,
 ) -> WireFaults:
-    """Return the injected faults of a link. Their times count from `start_ns`. Raises the errors of `check`."""
+    """Return the injected faults of a link. Their times count from `start_ns`. Raises the errors of `check`, by default
+    those of `check_link`."""
+    check = check or partial(check_link, framing=framing)
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):
         spec = parse_fault(dict(one), number=number)

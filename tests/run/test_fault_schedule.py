@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.run.campaigns.shrink import as_scenario, smallest
-from fieldtwin.run.virtual.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
+from fieldtwin.run.virtual.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, RandomFaults, random_schedule
+from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.group import one_system
 from fieldtwin.twin.site.system import load_system
@@ -68,3 +70,11 @@ def test_a_schedule_reads_as_a_scenario_again() -> None:
     sent = [{"pause": "6s"}, {"send": {"period_s": 1}}, {"pause": "39s"}, {"send": {"period_s": -1}}, {"pause": "15s"}]
     assert file.data["steps"] == [{"fault": fault}, *sent]
     assert parse_fault(file.data["steps"][0]["fault"]).until_s == 3.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_random_fault_is_without_effect_at_its_target(seed: int) -> None:
+    found = random_schedule(GROUP, seed, 24 * 3600.0, RandomFaults(mean_s=60.0))
+    assert {"boot-storm", "corrupt-length"} <= {fault["name"] for fault in found}
+    for said in found:
+        target(SYSTEM, parse_fault(dict(said)))

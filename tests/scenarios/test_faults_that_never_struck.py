@@ -47,7 +47,6 @@ def fault(said: str) -> str:
         ("name: silence, device: modem, function: 23", False),
         ("name: silence, device: modem, from: 1h", False),
         ("name: wrong-function, device: ctd, function: 4, code: 4", False),
-        ("name: corrupt-crc, device: modem", False),
         ("name: drift, device: inclinometer, register: slope_long, per_s: 1", True),
     ],
 )

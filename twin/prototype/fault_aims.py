@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from fieldtwin.emulators.faults.effect import check_can_effect, check_wire_effect
 from fieldtwin.emulators.faults.fault import Aim, InjectionPoint
+from fieldtwin.emulators.faults.frames import framing_of
 from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
 from fieldtwin.emulators.faults.values.value_ranges import check_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
@@ -52,9 +54,16 @@ def target(system: System, spec: FaultSpec) -> FaultTarget:
     is_can = system.buses[bus].endpoint.is_can
     if kind is not InjectionPoint.VALUE and is_can != (kind is InjectionPoint.CAN):
         raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", got=f"bus {bus!r}")
+    if aim.device and aim.unit not in (None, system.devices[aim.device].address):
+        address = str(system.devices[aim.device].address)
+        raise WrongAim("unit", f"{aim.device} has a different address", expected=address, got=str(aim.unit))
+    table = tag.registers.table if kind is InjectionPoint.BYTES and tag is not None else None
+    check_wire_effect(spec, framing_of(system.buses[bus].endpoint), table)
     units = (aim.unit,) if aim.unit is not None else (system.devices[aim.device].address,) if aim.device else ()
-    if kind is InjectionPoint.CAN and tag is not None and tag.object is not None:
-        return FaultTarget(bus, units, aim.model_copy(update={"index": tag.object[0]}))
+    index = tag.object[0] if kind is InjectionPoint.CAN and tag is not None and tag.object is not None else None
+    check_can_effect(spec, units[0] if units else None, index)
+    if index is not None:
+        return FaultTarget(bus, units, aim.model_copy(update={"index": index}))
     if kind is not InjectionPoint.BYTES:
         return FaultTarget(bus, units, aim)
     if tag is not None:

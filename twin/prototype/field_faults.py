@@ -16,11 +16,10 @@ from fieldtwin.emulators.endpoints.faulty.can import bus_rule
 from fieldtwin.emulators.faults.can_fault import BusFault
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
-from fieldtwin.emulators.faults.frames import FrameDirection
+from fieldtwin.emulators.faults.frames import FrameDirection, framing_of
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.values.set_value import Form, SetValue
 from fieldtwin.emulators.faults.values.value_ranges import check_value
-from fieldtwin.emulators.host import framing_of
 from fieldtwin.emulators.wires.can_faults import ErrorRule
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import UsageError

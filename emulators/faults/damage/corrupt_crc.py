@@ -11,6 +11,7 @@ from fieldtwin.emulators.faults.frames import FaultFrame, Framing
 class CorruptCrc(WireFault):
     name = "corrupt-crc"
     summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; no effect over TCP, which has none"
+    framings = frozenset({Framing.RTU, Framing.ASCII})
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         data = frame.data

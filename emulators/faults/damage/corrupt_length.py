@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import FaultFrame, Framing
+from fieldtwin.emulators.faults.frames import MODBUS, FaultFrame, Framing
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -22,6 +22,7 @@ class CorruptLength(WireFault):
         "(with a correct check sum)"
     )
     form = Form
+    framings = MODBUS
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         by = self.parameters.by

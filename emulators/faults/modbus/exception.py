@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import FaultFrame
+from fieldtwin.emulators.faults.frames import MODBUS, FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 CODES = {
@@ -34,6 +34,7 @@ class ExceptionReply(WireFault):
     summary = "the reply is exception `code` (APP V1.1b3, 7)"
     form = Form
     codes = CODES
+    framings = MODBUS
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if not frame.pdu:

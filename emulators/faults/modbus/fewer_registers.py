@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import FaultFrame
+from fieldtwin.emulators.faults.frames import MODBUS, FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 _BITS = frozenset((1, 2))
@@ -25,6 +25,8 @@ class FewerRegisters(WireFault):
         "the remaining data, at least one register"
     )
     form = Form
+    framings = MODBUS
+    functions = _BITS | _REGISTERS
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         pdu = frame.pdu

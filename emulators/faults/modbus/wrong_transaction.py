@@ -23,6 +23,7 @@ class WrongTransaction(WireFault):
         "effect on a serial line, which has none"
     )
     form = Form
+    framings = frozenset({Framing.MBAP})
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if frame.framing is not Framing.MBAP or len(frame.data) < 4:

@@ -7,7 +7,7 @@ from random import Random
 from pydantic import Field
 
 from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
-from fieldtwin.emulators.faults.frames import FaultFrame
+from fieldtwin.emulators.faults.frames import MODBUS, FaultFrame
 from fieldtwin.emulators.faults.remake import remade
 
 
@@ -19,6 +19,7 @@ class WrongUnit(WireFault):
     name = "wrong-unit"
     summary = "the frame carries unit ID `unit_id` (with a correct check sum)"
     form = Form
+    framings = MODBUS
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(remade(frame, unit=self.parameters.unit_id))

@@ -130,18 +130,22 @@ def _emulate_one(kind: str, path: Path, device: OneDeviceOptions, replay: Record
         run_device(
             kind, path, endpoints, node if unit is None else unit, recording, replay.speed or 1.0, device.bitrate,
             unknown=NeverRecorded(replay.unknown or "exception"), at_end=EndOfRecording(replay.at_end or "hold"),
-            options=options, extras=_extras(kind, path, device, recording),
+            options=options, extras=_extras(kind, path, endpoints, device, recording),
         ),
         serial=any(endpoint.startswith("pty:") for endpoint in endpoints),
     )  # fmt: skip
 
 
-def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | None) -> ModbusExtras | None:
+def _extras(
+    kind: str, path: Path, endpoints: tuple[str, ...], device: OneDeviceOptions, recording: Path | None
+) -> ModbusExtras | None:
     """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
     from fieldtwin.emulators.device_faults import check_device
+    from fieldtwin.emulators.faults.frames import framing_of
     from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.gateway.core.endpoint import Endpoint
     from fieldtwin.gateway.core.files.profile_file import load_profile
-    from fieldtwin.run.emulate.device import ModbusExtras
+    from fieldtwin.run.emulate.device import ModbusExtras, plant_of
 
     values, faults = device.values, device.faults_file
     if not (values or faults or device.any_unit):
@@ -160,7 +164,8 @@ def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | N
         unknown = next((name for name in held if name not in profile.tags), None)
         if unknown is not None:
             raise UsageError(f"{profile.name} has no tag {unknown!r}", expected=", ".join(profile.tags))
-    said = load_faults(Path(faults), lambda spec: check_device(spec, profile)) if faults else ()
+    framings = {framing_of(plant_of(Endpoint.parse(url))) for url in endpoints}
+    said = load_faults(Path(faults), lambda spec: check_device(spec, profile, framings)) if faults else ()
     return ModbusExtras(held, said, device.seed, device.any_unit)
 
 

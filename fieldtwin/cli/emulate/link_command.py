@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +73,10 @@ def command(near: str, far: str, faults_file: str | None, framing: str, seed: in
     on_can = any(end.is_can for end in ends)
     if on_can and not (all(end.is_can for end in ends) and faults_file):
         raise UsageError(f"{near} and {far}: a CAN link needs two CAN buses and --faults", expected="--faults FILE")
-    check = check_can_link if on_can else check_link
+    frames = Framing.RAW if on_can else Framing(framing)
+    check = check_can_link if on_can else partial(check_link, framing=frames)
     said = load_faults(Path(faults_file), check) if faults_file else ()
-    return asyncio.run(_run(*ends, said, Framing.RAW if on_can else Framing(framing), seed, check))
+    return asyncio.run(_run(*ends, said, frames, seed, check))
 
 
 def _endpoint(text: str) -> Endpoint:

@@ -16,7 +16,8 @@ from fieldtwin.console import stderr
 from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.device_faults import DeviceFaults
 from fieldtwin.emulators.endpoints.ports import OsPorts
-from fieldtwin.emulators.host import EmulatorHost, ModbusWire, framing_of
+from fieldtwin.emulators.faults.frames import framing_of
+from fieldtwin.emulators.host import EmulatorHost, ModbusWire
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.canopen.emulated_node import NodeOptions, emulated_node
 from fieldtwin.emulators.models.modbus.emulated_modbus import (
@@ -184,7 +185,7 @@ def replayed_units(
 
 def _kind(profile: DeviceProfile, wires: list[Endpoint]) -> ConnectionKind:
     """Return the connection of the emulated device: that of its first endpoint. A modem is on TCP."""
-    on_line = _plant(wires[0]).is_serial and profile.inbox is None
+    on_line = plant_of(wires[0]).is_serial and profile.inbox is None
     return RS232Connection if on_line else TCPConnection
 
 
@@ -233,7 +234,7 @@ async def serve_units(
             expected="rtu:PATH, ascii:PATH, pty:PATH, tcp://HOST:PORT, rtu+tcp://HOST:PORT, udp://HOST:PORT or tls://HOST:PORT",
         )
     named = f"units {', '.join(map(str, units))} on"
-    plant, listen = _plant(wire), wire
+    plant, listen = plant_of(wire), wire
     if wire.scheme in SERIAL_SCHEMES and not Path(wire.path).is_char_device():
         listen = Endpoint("pty", path=wire.path)
     served = ModbusWire(str(wire), listen, plant, echo=wire.param("echo") == "1", any_unit=any_unit)
@@ -299,7 +300,7 @@ def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
     return replace(wire, params=tuple((usual | dict(wire.params)).items()))
 
 
-def _plant(wire: Endpoint) -> Endpoint:
+def plant_of(wire: Endpoint) -> Endpoint:
     """Return the endpoint that states the framing and the serial settings of `wire`: of a line, or `wire` itself."""
     if wire.scheme not in ("pty", "rtu+tcp", *SERIAL_SCHEMES):
         return wire

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+from fieldtwin.emulators.faults.can_fault import only_sends
 from fieldtwin.emulators.faults.fault import InjectionPoint
 from fieldtwin.emulators.faults.registry import FAULTS, fault_class
 from fieldtwin.emulators.faults.schema import parse_fault
@@ -112,12 +113,8 @@ def _fitting(system: System, wanted: RandomFaults, device: str, tag: str) -> Ite
         if kind.kind is InjectionPoint.VALUE:  # the device reports a wrong value: only on request
             if wanted.kinds and (_struck(system, name, device) if not tag else tag in _struck(system, name, device)):
                 yield name
-        elif kind.kind is (InjectionPoint.CAN if endpoint.is_can else InjectionPoint.BYTES) and _is_seen(
-            name, endpoint
-        ):
-            fits = not tag or _can_aim(system, name, device, tag)
-            if fits:
-                yield name
+        elif _is_seen(name, endpoint) and _can_aim(system, name, device, tag):
+            yield name
 
 
 def _is_seen(name: str, endpoint: Endpoint) -> bool:
@@ -174,7 +171,7 @@ def _of_member(member: GroupMember, seed: int, last_s: float, wanted: RandomFaul
         of_values = FAULTS[fault["name"]].kind is InjectionPoint.VALUE
         if tag or of_values:
             fault["register"] = tag or random.choice(_struck(system, fault["name"], device))
-        if random.random() < 0.5 and not of_values:
+        if random.random() < 0.5 and not of_values and not only_sends(FAULTS[fault["name"]]):
             fault["probability"] = round(random.uniform(0.1, 1.0), 2)
         if fault["until"] > fault["from"]:
             number += 1

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Aim, DelayedBytes, FaultEffect, Hang, ValueFault, WireFault
+from fieldtwin.emulators.faults.fault import Active, Aim, DelayedBytes, FaultEffect, Hang, ValueFault, WireFault, passed
 from fieldtwin.emulators.faults.frames import Assembler, FaultFrame, FrameDirection, Framing, understood
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import parse_fault
@@ -453,3 +453,28 @@ def test_every_fault_takes_every_frame(data: bytes, framing: Framing, kind: type
 
 def test_every_fault_is_in_these_tables() -> None:
     assert set(FAULTS) <= set(re.findall(r'"([a-z-]+)"', Path(__file__).read_text()))
+
+
+REQUESTS = ("1103 0000 0002", "1101 0000 0008", "1106 0000 0102", "1110 0000 0002 04 000A 0102")
+REPLIES = (REPLY, "1101 01 5A", "1106 0000 0102", "1110 0000 0002", "1183 02")
+
+
+def frames_of(framing: Framing) -> list[FaultFrame]:
+    made_of = {
+        Framing.RTU: line,
+        Framing.ASCII: ascii_,
+        Framing.MBAP: lambda adu: b"\0\7\0\0" + len(bytes.fromhex(adu)).to_bytes(2) + bytes.fromhex(adu),
+    }.get(framing, lambda adu: b"\x30\x1f" + b"\x5a" * 31)
+    ways = ((FrameDirection.REQUEST, REQUESTS), (FrameDirection.REPLY, REPLIES))
+    return [understood(way, framing, made_of(adu)) for way, texts in ways for adu in texts]
+
+
+@pytest.mark.parametrize("framing", Framing)
+@pytest.mark.parametrize("name", [name for name, kind in FAULTS.items() if issubclass(kind, WireFault)])
+def test_a_fault_declares_the_framings_in_which_it_changes_anything(name: str, framing: Framing) -> None:
+    kind = FAULTS[name]
+    assert issubclass(kind, WireFault)
+    random = Random(3)
+    struck = {f.function for f in frames_of(framing) if made(name).strike(f, random) != passed(f.data)}
+    assert bool(struck) is (framing in kind.framings)
+    assert not kind.functions or struck <= kind.functions

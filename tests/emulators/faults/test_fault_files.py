@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from random import Random
 
 import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.emulate.faults_command import command
+from fieldtwin.emulators.faults.can_engine import aimed
+from fieldtwin.emulators.faults.fault import Active, Aim
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.json_schema import fault_defs
 from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import load_faults, parse_fault, seconds
+from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.site.system import load_system
@@ -125,6 +129,24 @@ def test_they_are_listed() -> None:
         ("{name: drop, device: ctd, direction: replly}", "did you mean 'reply'", 31),
         ("{name: drop, device: ctd, unti: 5s}", "did you mean 'until'", 31),
         ("{name: drop, device: ctd, until: soon}", "5s, 250ms, 2min or 24h", 31),
+        (
+            "{name: corrupt-crc, bus: lan}",
+            "fault corrupt-crc changes nothing in Modbus TCP frames; expected RTU frames or ASCII frames",
+            6,
+        ),
+        ("{name: wrong-transaction, device: ctd}", "changes nothing in RTU frames; expected Modbus TCP frames", 6),
+        ("{name: fewer-registers, device: ctd, function: 6}", "expected function 01h, 02h, 03h, 04h, 17h; got", 41),
+        ("{name: drop, device: ctd, address: 'holding:3', function: 4}", "strikes no frame here", 31),
+        ("{name: drop, device: ctd, unit: 77}", "ctd has a different address; expected 1; got 77", 31),
+        ("{name: heartbeat-loss, device: inclinometer, cob_id: 0x185}", "changes no frame with the COB-ID 185h", 50),
+        (
+            "{name: heartbeat-loss, device: inclinometer, register: slope_long}",
+            "changes no frame that names an object",
+            50,
+        ),
+        ("{name: sdo-toggle, device: inclinometer, index: 0x6010}", "changes no frame that names an object", 45),
+        ("{name: sdo-abort, device: inclinometer, index: 0x6010, direction: request}", "names an object", 45),
+        ("{name: boot-storm, device: inclinometer, nth: 3}", "sends frames of its own", 45),
     ],
 )
 def test_a_fault_that_a_system_cannot_have_is_refused_at_its_position(
@@ -137,6 +159,35 @@ def test_a_fault_that_a_system_cannot_have_is_refused_at_its_position(
         load_faults(path, lambda spec: target(system, spec))
     assert e.value.line == 2
     assert abs(e.value.column - column) <= 5
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "{name: corrupt-crc, device: ctd, function: 3}",
+        "{name: wrong-transaction, bus: lan, unit: 1}",
+        "{name: fewer-registers, device: ctd, address: 'holding:3'}",
+        "{name: heartbeat-loss, device: inclinometer, cob_id: 0x705}",
+        "{name: sdo-abort, device: inclinometer, register: slope_long}",
+        "{name: duplicate-node, device: inclinometer, index: 0x1000}",
+        "{name: sync-jitter, device: inclinometer, cob_id: 0x080}",
+        "{name: lost-frame, bus: can0, cob_id: 0x185}",
+        "{name: bus-off, device: inclinometer}",
+    ],
+)
+def test_a_fault_with_an_effect_at_its_target_is_accepted(tmp_path: Path, said: str) -> None:
+    system = load_system("observatory")
+    path = tmp_path / "f.yaml"
+    path.write_text(f"faults:\n  - {said}\n")
+    assert load_faults(path, lambda spec: target(system, spec))
+
+
+def test_a_segment_names_no_object() -> None:
+    active = Active("f", parse_fault({"name": "lost-frame"}).make(), Aim(index=0x4142), Random(1), 0, None)
+    assert not aimed(active, CanFrame(0x585, bytes.fromhex("01 42 41 00 00 00 00 00")))
+    assert not aimed(active, CanFrame(0x605, bytes.fromhex("60 42 41 00 00 00 00 00")))
+    assert aimed(active, CanFrame(0x585, bytes.fromhex("43 42 41 00 00 00 00 00")))
+    assert aimed(active, CanFrame(0x605, bytes.fromhex("40 42 41 00 00 00 00 00")))
 
 
 def test_the_schema_knows_each_fault_as_it_is_read() -> None:

@@ -28,8 +28,6 @@ class Row(NamedTuple):
     why: str
     well_s: float
     said: dict[str, Any] = {}  # noqa: RUF012  nobody changes it
-    strikes: bool = True
-    """RTU has no transaction IDs: there the fault changes nothing, and does not count as struck."""
 
 
 ROWS = [
@@ -57,7 +55,6 @@ ROWS = [
     Row("lan", "wrong-unit", "timeout", 2.0),
     Row("line", "wrong-function", "wire_error", 2.0, {"code": 3}),
     Row("lan", "wrong-function", "wire_error", 2.0, {"code": 3}),
-    Row("line", "wrong-transaction", "", 0.1, strikes=False),
     Row("lan", "wrong-transaction", "timeout", 2.0),
     Row("line", "fewer-registers", "wire_error timeout", 2.0),
     Row("lan", "fewer-registers", "wire_error", 2.0),
@@ -216,7 +213,7 @@ def _wrong_with_driver(row: Row, seen: Seen) -> list[str]:
 
 def _wrong(row: Row, seen: Seen) -> list[str]:
     found = []
-    if bool(seen.struck) != row.strikes:
+    if not seen.struck:
         found.append("it struck" if seen.struck else "it never struck")
     expected = set(row.why.split())
     if not seen.reasons <= expected or (expected and not seen.reasons):

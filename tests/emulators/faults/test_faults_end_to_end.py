@@ -214,7 +214,7 @@ def _wrong_with_driver(row: Row, seen: Seen) -> list[str]:
 def _wrong(row: Row, seen: Seen) -> list[str]:
     found = []
     if not seen.struck:
-        found.append("it struck" if seen.struck else "it never struck")
+        found.append("it never struck")
     expected = set(row.why.split())
     if not seen.reasons <= expected or (expected and not seen.reasons):
         found.append(f"not good because {sorted(seen.reasons)} instead of {row.why or 'never'}")

@@ -49,8 +49,8 @@ _REASONS: dict[Reason, tuple[str, str]] = {
     ),
     Reason.NOT_OPERATIONAL: (
         "The CANopen node is not in OPERATIONAL, so it sends no PDOs, or the PLC's program that makes the value has stopped.",
-        "See why the node left OPERATIONAL: EMCY messages and boot-ups in the trace. `fieldtwin plc status` shows a "
-        "stopped program.",
+        "See why the node left OPERATIONAL: EMCY messages and boot-ups in the trace. A read-only plant starts no node: "
+        "the plant's own NMT master must. `fieldtwin plc status` shows a stopped program.",
     ),
     Reason.HEARTBEAT_LOST: (
         "The CANopen node sent no heartbeat within the consumer time.",

@@ -86,6 +86,8 @@ def _devices(before: Mapping[str, DeviceStatus], now: Mapping[str, DeviceStatus]
         elif not device.online and device.error and (was is None or was.online or was.error != device.error):
             named = {**fields, "error": device.error}
             found.append(ServiceEvent(Priority.WARNING, "device_offline", f"{name}: {device.error}", named))
+        if device.unstarted and (was is None or not was.unstarted):
+            found.append(ServiceEvent(Priority.WARNING, "device_not_started", f"{name}: {device.unstarted}", fields))
         codes = device.emcy or []
         if codes and codes != ((was.emcy if was is not None else None) or []):
             named = {**fields, "emcy": " ".join(codes)}

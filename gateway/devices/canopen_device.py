@@ -132,6 +132,18 @@ class CanopenDriver(DeviceDriver):
         return state is NmtState.OPERATIONAL and not self.master.heartbeat_lost(self.node)
 
     @property
+    def unbrought(self) -> tuple[str, ...]:
+        """Return the tags that TPDOs of the node carry and do not bring, because the node is not OPERATIONAL (7.3.2.2).
+
+        A node without a heartbeat counts as OPERATIONAL for the TPDOs that it has sent. The state of a node whose heartbeat was
+        lost is unknown.
+        """
+        if self.operational or self.master.heartbeat_lost(self.node):
+            return ()
+        unknown = self.master.node_state(self.node) is None
+        return tuple(name for seen in self.tpdos if not (unknown and seen.frames) for name in seen.tags)
+
+    @property
     def is_watched(self) -> bool:
         """Return whether a loss of the node would be noticed: its heartbeat has a consumer time and has been received.
 

@@ -64,6 +64,8 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     conflicts: int | UnsetType = UNSET
     """Of a CANopen node: replies from a second node with the same ID."""
     conflict: str | UnsetType = UNSET
+    unstarted: str | UnsetType = UNSET
+    """Of a CANopen node that the gateway does not start: which tags have no value until another NMT master starts it."""
     boots: int | UnsetType = UNSET
     bring_ups: int | UnsetType = UNSET
     emcys: int | UnsetType = UNSET

@@ -165,6 +165,8 @@ def troubles(session: RunSession) -> list[str]:
     for name, device in (gateway.devices if gateway else {}).items():
         if device.error and device.error != closed.get(device.bus):
             found.append(f"{name}: {device.error}")
+        if device.unstarted:
+            found.append(f"{name}: {device.unstarted}")
     if session.plc_status is not None and session.plc_status.error:
         found.append(f"PLC: {session.plc_status.error}")
     if gateway is not None:
@@ -365,7 +367,8 @@ def print_summary(summary: dict[str, Any]) -> None:
     for name, device in summary["devices"].items():
         mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
         plays = f", from {device['plays']}" if "plays" in device else ""
-        stdout.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
+        note = f", but {device['note']}" if device.get("note") else ""
+        stdout.print(f"  {name:<14} {mark}{plays}{note}", soft_wrap=True, highlight=False)
     for program, states in summary["states"].items():
         stdout.print(f"  {program:<14} {' → '.join(states) or 'no scan observed'}")
     for bus, row in summary["exchanges"].items():

@@ -146,6 +146,7 @@ def _devices(gateway: GatewayStatus | None, field: FieldStatus | None) -> dict[s
     emulated = field.devices if field is not None else {}
     return {
         name: {"state": "good" if d.online else "bad", "error": d.error}
+        | ({"note": d.unstarted} if d.unstarted else {})
         | ({"plays": emulated[name].plays} if name in emulated else {})
         for name, d in (gateway.devices if gateway is not None else {}).items()
     }

@@ -243,6 +243,7 @@ class CanopenBus:
                 error=node.error or node.conflict,
                 conflicts=node.conflicts,
                 conflict=node.conflict,
+                unstarted=self._unstarted(node),
                 identity_error=node.driver.identity_error,
                 boots=node.boots,
                 bring_ups=node.bring_ups,
@@ -269,6 +270,18 @@ class CanopenBus:
             )
             for node in self.nodes.values()
         }
+
+    def _unstarted(self, status: NodeStatus) -> str:
+        """Return which tags have no value because the gateway does not start the node; empty if it is started."""
+        driver = status.driver
+        if not status.online or self._master is None or (self._allow_writes and driver.config.start):
+            return ""
+        if not (tags := driver.unbrought):
+            return ""
+        why = "the system file has no `start: true`" if self._allow_writes else "a read-only plant starts no node"
+        state = self._master.node_state(driver.node)
+        is_in = f"is in {state.name.replace('_', '-')}" if state is not None else "has sent no heartbeat"
+        return f"the node {is_in} and sends no TPDO with {', '.join(tags)}; {why}: another NMT master must start it"
 
     # -- running --------------------------------------------------------------------------------------------------------
 
@@ -384,6 +397,7 @@ class CanopenBus:
         for tag in driver.profile.tags.values():
             if tag.readable:  # only now is it known which tags a TPDO brings, and when
                 self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
+        self._tags.put_bad([f"{driver.config.name}.{tag}" for tag in driver.unbrought], Reason.NOT_OPERATIONAL)
         status.online, status.error = True, ""
         status.bring_ups += 1
         status.backoff.reset()

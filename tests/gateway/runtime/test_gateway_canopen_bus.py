@@ -151,11 +151,17 @@ def test_without_permission_the_mapping_is_adopted_and_nothing_is_written(tmp_pa
         async with rig(tmp_path, allow_writes=False) as r:
             node = r.plug_node()
             await eventually(lambda: r.status.online)
-            assert r.quality("slope_long")[0] == "bad"  # no master started it
+            assert r.quality("slope_long") == ("bad", "not operational")
+            told = r.bus.device_statuses(0)["incl"].unstarted
+            assert told == (
+                "the node has sent no heartbeat and sends no TPDO with slope_long, slope_lateral; a read-only plant starts no "
+                "node: another NMT master must start it"
+            )
             operator = r.server.attach("operator")
             await operator.send(CanFrame(0, bytes([1, NODE])))  # the plant's own master does
             await eventually(lambda: r.quality("slope_long") == ("good", "none"))
             assert r.tags.current("incl.slope_long", 0).value == 12.34
+            assert r.bus.device_statuses(0)["incl"].unstarted == ""
             await operator.aclose()
             uploads = [f.data[0] >> 5 for f in r.frames if f.can_id == SDO_TO_NODE]
             assert set(uploads) == {2}  # SDO uploads, and not one download

@@ -45,7 +45,7 @@ class CanFault(Fault):
 
 
 def only_sends(kind: type[Fault]) -> bool:
-    """Return whether a fault sends frames of its own when it is injected, and changes none."""
+    """Return whether a fault only sends frames when it is injected and changes no frame of the node."""
     return issubclass(kind, CanFault) and kind.appears is not CanFault.appears
 
 

@@ -49,13 +49,13 @@ def ours(framing: str, count: int, transactions: int) -> float:
     bank = MapBank([CellSpan("holding", 0, len(VALUES))])
     bank.poke("holding", 0, *VALUES)
     units = {UNIT: ModbusUnit(bank)}
-    slave = MbapServer(units) if framing == "mbap" else RtuServer(units)
+    server = MbapServer(units) if framing == "mbap" else RtuServer(units)
     framer = MbapFramer() if framing == "mbap" else RtuFramer()
     wanted = tuple(VALUES[:count])
 
     def exchange(now_ns: int) -> None:
         transaction = Transaction(framer, UNIT, ReadRegisters("holding", 0, count), timeout_ns=TIMEOUT_NS)
-        [answer] = slave.feed(transaction.start(now_ns), now_ns)
+        [answer] = server.feed(transaction.start(now_ns), now_ns)
         reply = transaction.feed(answer, now_ns)
         assert reply is not None
         assert reply.registers == wanted

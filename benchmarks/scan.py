@@ -40,13 +40,13 @@ from fieldtwin.gateway.wallclock import WallClock, run
 
 async def main():
     end = await PtyEnd.open(Path(sys.argv[1]), Endpoint.parse("pty:x"), SerialSettings(9600, "8N1"))
-    slave = RtuServer({{n: ModbusUnit(MapBank([CellSpan("holding", 0, 10)])) for n in {PRESENT}}})
+    server = RtuServer({{n: ModbusUnit(MapBank([CellSpan("holding", 0, 10)])) for n in {PRESENT}}})
     print("ready", flush=True)
-    await serve_rtu(end, slave, WallClock(), {LATENCY_S})
+    await serve_rtu(end, server, WallClock(), {LATENCY_S})
 
 run(main())
 """
-MASTER = """
+CLIENT = """
 import sys, time, minimalmodbus, serial
 path, timeout_s, units = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 device = minimalmodbus.Instrument(path, 1)
@@ -79,7 +79,7 @@ def ours(port: Path, timeout_s: float, units: int) -> float:
 
 
 def peers(port: Path, timeout_s: float, units: int) -> float:
-    words = [python(), "-c", MASTER, str(port), str(timeout_s), str(units)]
+    words = [python(), "-c", CLIENT, str(port), str(timeout_s), str(units)]
     told = subprocess.run(words, check=True, capture_output=True, text=True).stdout.split()
     assert [int(u) for u in told[1:]] == [u for u in PRESENT if u <= units], told
     return float(told[0])

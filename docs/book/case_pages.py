@@ -130,7 +130,7 @@ def _example(title: str, lines: Iterable[str]) -> str:
 
 def _client_bytes(row: str) -> Iterator[str]:
     """Return examples of a request and the bytes that come back, as a client sees them."""
-    plain = [v for v in _vectors("modbus_master.toml") if v["id"].startswith(row)]
+    plain = [v for v in _vectors("modbus_client.toml") if v["id"].startswith(row)]
     for vector in plain[:EXAMPLES]:
         result = vector.get("error") or "the value is accepted"
         yield _example(
@@ -143,7 +143,7 @@ def _client_bytes(row: str) -> Iterator[str]:
 
 def _device_bytes(row: str) -> Iterator[str]:
     """Return examples of what a device receives and answers."""
-    for vector in [v for v in _vectors("modbus_slave.toml") if v["id"].startswith(row)][:EXAMPLES]:
+    for vector in [v for v in _vectors("modbus_server.toml") if v["id"].startswith(row)][:EXAMPLES]:
         lines = []
         for step in vector["steps"]:
             lines += [f"{step['at_ms']:>6} ms  received  {step['hear']}"] if step["hear"] else []

@@ -56,7 +56,7 @@ def _entries() -> Iterable[Explanation]:
         meaning = []
         for _, tested, case in of:
             sent = (
-                f"fieldtwin {case.does or 'only listens'}" if case.role == "master" else f"fieldtwin sends: {case.does}"
+                f"fieldtwin {case.does or 'only listens'}" if case.role == "client" else f"fieldtwin sends: {case.does}"
             )
             meaning.append(f"Test of {tested}: {sent}. Expected: {case.must or 'go on'}. {WEIGHT[case.basis]}")
         run = " or ".join(f"`fieldtwin check {command} ... --only {id}`" for command, _, _ in of)

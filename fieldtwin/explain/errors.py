@@ -21,7 +21,7 @@ _TODO: dict[type[e.FieldtwinError], str] = {
     e.ReplyTimeout: "Check power, wiring, unit ID or node ID, baud rate and parity; `fieldtwin scan` tries them. A slow device "
     "needs a longer timeout.",
     e.CrcError: "Check termination, biasing, A and B, ground, baud rate and parity; `fieldtwin line` listens for such faults.",
-    e.Desync: "Two masters on one line, a late reply to an earlier request, or a gateway that mixes up its clients cause this. "
+    e.Desync: "Two clients on one line, a late reply to an earlier request, or a gateway that mixes up its clients cause this. "
     "Look at the frames before it.",
     e.WrongSize: "The device sends another number of registers than was requested. Read fewer at a time, and report it to "
     "the manufacturer.",

@@ -8,9 +8,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from typing import Any
 
+from fieldtwin.gateway.core.files.nearest import nearest
 from fieldtwin.testing.runner import WorkerProcess
 
 POLL_S = 0.02
@@ -33,7 +33,7 @@ class RunningPlc:
         """Return ``value``, ``quality``, ``reason``, ``age_s``, ``unit``, ``forced`` and ``side`` (input or output) of a tag."""
         __tracebackhide__ = True
         if name not in self.names:
-            near = get_close_matches(name, self.names, n=3) or self.names[:10]
+            near = nearest(name, self.names, most=3) or self.names[:10]
             raise KeyError(f"no tag or variable {name!r}; there are {', '.join(near)}")
         row: dict[str, Any] = self._runner.call("image", id=self._bench, tag=name)
         return row

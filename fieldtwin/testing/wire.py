@@ -10,9 +10,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any
 
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.testing.runner import WorkerProcess
 
 POLL_S = 0.02
@@ -215,8 +215,8 @@ def _check(like: dict[str, Any]) -> None:
     """Refuse a selection that no exchange can match: a test that expects zero of them would always pass."""
     __tracebackhide__ = True
     for key in like.keys() - _FIELDS - {"tag"}:
-        near = get_close_matches(key, [*_FIELDS, "tag"], 1)
-        hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(sorted(_FIELDS | {'tag'}))}"
+        names = sorted({*_FIELDS, "tag"})
+        hint = did_you_mean(key, names, otherwise=f"expected one of {', '.join(names)}")
         raise TypeError(f"an exchange has no {key!r}; {hint}")
     for key, known in (("problem", PROBLEMS), ("access", ACCESSES)):
         if key in like and like[key] not in known:

@@ -388,7 +388,7 @@ def test_a_bus_is_followed_frame_by_frame_and_nothing_is_sent(tmp_path: Path) ->
         clock, stop = WallClock(), asyncio.Event()
         server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000)
         try:
-            talker, ear = server.attach("talker"), server.attach("ear")
+            talker, listener = server.attach("talker"), server.attach("listener")
             target = target_of(f"can:fieldtwin/127.0.0.1:{server.bound.path.rpartition(':')[2]}")
             with RotatingFile(tmp_path / "bus.log") as file:
                 following = asyncio.create_task(follow_bus(target, CanLogSink(file, clock), stop=stop))
@@ -398,9 +398,9 @@ def test_a_bus_is_followed_frame_by_frame_and_nothing_is_sent(tmp_path: Path) ->
                 await eventually(lambda: file.lines == len(said), what="all frames are in the log")
                 stop.set()
                 lost = await following
-            heard = [await ear.recv() for _ in said]
+            heard = [await listener.recv() for _ in said]
             assert [(f.can_id, f.data) for f in heard] == [(f.can_id, f.data) for f in said]
-            assert not ear.inbound.data_stream
+            assert not listener.inbound.data_stream
             return lost
         finally:
             await server.aclose()

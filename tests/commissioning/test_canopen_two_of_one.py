@@ -137,12 +137,12 @@ def test_one_producer_is_not_taken_for_two(period_ms: int, jitter: list[float]) 
 
 @given(st.integers(2, 1000), st.floats(0.05, 0.3), st.booleans())
 def test_two_producers_of_one_period_are_noticed(period_ms: int, apart: float, counted: bool) -> None:
-    ear = BusListener()
+    listener = BusListener()
     for number in range(40):
         for shift in (0.0, apart):
             counter = bytes([number % 240 + 1]) if counted else b""
-            ear.feed(CanFrame(0x80, counter), round((number + shift) * period_ms * NS_PER_MS))
-    assert "two producers" in ear.heard.sync_producers
+            listener.feed(CanFrame(0x80, counter), round((number + shift) * period_ms * NS_PER_MS))
+    assert "two producers" in listener.heard.sync_producers
 
 
 @pytest.mark.parametrize("restarts", [1, 2])

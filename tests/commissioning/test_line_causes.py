@@ -76,7 +76,7 @@ def test_wrong_settings_are_the_first_cause_and_the_right_ones_the_remedy(hidden
     run_virtually(main())
 
 
-def test_a_unit_that_never_answers_another_master_is_named() -> None:
+def test_a_unit_that_never_answers_another_client_is_named() -> None:
     async def main() -> None:
         line = UartLine({}, counts=True, chatter=(exchange(5, 1), (exchange(30, 2)[0], None)))
         report = await look(line)
@@ -131,11 +131,11 @@ def test_a_bus_with_traffic_and_one_with_errors() -> None:
 
 
 def heard_of(data: bytes) -> Heard:
-    ear = LineListener("rtu")
+    listener = LineListener("rtu")
     for i in range(0, len(data), 16):
-        ear.feed(data[i : i + 16], i * 10_000_000)
-    ear.settle(1 << 60)
-    return ear.heard
+        listener.feed(data[i : i + 16], i * 10_000_000)
+    listener.settle(1 << 60)
+    return listener.heard
 
 
 @pytest.mark.parametrize(

@@ -178,11 +178,11 @@ FRAMES = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8), remot
 @given(st.lists(FRAMES, max_size=50))
 @settings(max_examples=60, deadline=None)
 def test_listening_to_anything_never_fails(frames: list[CanFrame]) -> None:
-    ear = BusListener()
+    listener = BusListener()
     for i, frame in enumerate(frames):
-        ear.feed(frame, i * 1_000_000)
-    assert ear.heard.frames == len(frames)
-    assert all(1 <= n <= 127 for n in ear.heard.nodes)
+        listener.feed(frame, i * 1_000_000)
+    assert listener.heard.frames == len(frames)
+    assert all(1 <= n <= 127 for n in listener.heard.nodes)
 
 
 def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:

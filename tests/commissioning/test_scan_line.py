@@ -88,7 +88,7 @@ def test_traffic_reveals_settings_and_units_and_nothing_is_sent(hidden: str, cou
     run_virtually(main())
 
 
-def test_sharing_a_bus_asks_between_the_exchanges_of_the_other_master() -> None:
+def test_sharing_a_bus_asks_between_the_exchanges_of_the_other_client() -> None:
     async def main() -> None:
         line = UartLine({7: meter()}, counts=True, chatter=(exchange(5, 1), exchange(6, 2)))
         found = await scan(line, share_bus=True, units=(5, 7, 8))
@@ -204,11 +204,11 @@ def test_ascii_lines_are_found_as_well() -> None:
 @given(st.lists(st.binary(max_size=40), max_size=20))
 @settings(max_examples=60, deadline=None)
 def test_listening_to_anything_counts_it_and_never_fails(chunks: list[bytes]) -> None:
-    ear = LineListener("rtu")
+    listener = LineListener("rtu")
     for i, chunk in enumerate(chunks):
-        ear.feed(chunk, i * 20_000_000)
-    ear.settle(10**12)
-    heard = ear.heard
+        listener.feed(chunk, i * 20_000_000)
+    listener.settle(10**12)
+    heard = listener.heard
     assert heard.bytes == sum(map(len, chunks))
     assert 0 <= heard.good_bytes <= heard.bytes
 

@@ -23,7 +23,7 @@ from fieldtwin.cli.main import cli
 from fieldtwin.conformance.core.case import failed
 from fieldtwin.conformance.core.results import CaseResult, as_scenario, case_json
 from fieldtwin.explain.cases import LISTS
-from fieldtwin.reports.conformance.client import render_master_html
+from fieldtwin.reports.conformance.client import render_client_html
 from fieldtwin.reports.junit import render_junit
 from fieldtwin.results.model import Report
 
@@ -121,7 +121,7 @@ def reports() -> tuple[str, str, dict[str, object]]:
     result = CaseResult(case, failed("published 3333"))
     scenario = as_scenario(result, "client", "again", frozenset())
     junit = render_junit(Report("client", [scenario])).decode()
-    return render_master_html([result], "client", ["check"], "today"), junit, case_json(result, "device")
+    return render_client_html([result], "client", ["check"], "today"), junit, case_json(result, "device")
 
 
 def test_explain_names_the_page_of_a_case(monkeypatch: pytest.MonkeyPatch):

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
-from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_MASTERS
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CLIENTS
 from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_CLIENTS
 from fieldtwin.conformance.devices.canopen.cases import CASES as CANOPEN_DEVICES
 from fieldtwin.conformance.devices.modbus.cases import CASES as MODBUS_DEVICES
@@ -39,7 +39,7 @@ PRINTED = {
     "cases": [
         *(case.id for cases in (MODBUS_DEVICES, CANOPEN_DEVICES) for case in cases),
         *(case.about.id for case in MODBUS_CLIENTS),
-        *(case.about.id for case in CANOPEN_MASTERS),
+        *(case.about.id for case in CANOPEN_CLIENTS),
     ],
 }
 

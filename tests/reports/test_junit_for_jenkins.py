@@ -142,7 +142,7 @@ while True:
 """A careless client: it sends the next request after every reply, whatever the reply is."""
 
 
-def test_a_check_of_a_master_writes_the_flavour_that_was_asked_for(tmp_path: Path) -> None:
+def test_a_check_of_a_client_writes_the_flavour_that_was_asked_for(tmp_path: Path) -> None:
     out = tmp_path / "out.xml"
     words = ["check", "modbus-client", "--listen", "tcp://127.0.0.1:0", "--only", "MB-013", "--patience", "1s"]
     done = CliRunner().invoke(

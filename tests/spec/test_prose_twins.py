@@ -62,8 +62,8 @@ async def mailbox_talk(r: Rig) -> None:
     """The work of a transmitter's driver: it reads which messages were taken, takes a message, acknowledges it, sends one."""
     driver = r.register_driver("modem")
     assert isinstance(driver, TransmitterDriver)
-    ear: Consumer[COMMAND] = Consumer(driver.emitter.event)
-    driver.emitter.subscribe(ear)  # type: ignore[arg-type]
+    subscriber: Consumer[COMMAND] = Consumer(driver.emitter.event)
+    driver.emitter.subscribe(subscriber)  # type: ignore[arg-type]
     await driver.synchronise()
     await driver.receive("inbox")
     await driver.acknowledge()

@@ -78,15 +78,15 @@ async def both_ways(r: Rig) -> None:
     """ReadFromDriver: the driver sends, the device receives. ReadFromDevice: the device sends, the driver receives."""
     driver, unit = r.register_driver("ctd"), r.unit("ctd")
     assert isinstance(unit.emulator, SensorEmulator)
-    ear: Consumer[DATA] = Consumer(driver.emitter.event)
-    driver.emitter.subscribe(ear)
+    subscriber: Consumer[DATA] = Consumer(driver.emitter.event)
+    driver.emitter.subscribe(subscriber)
     await driver.receive("values")
     driver.consumer.observe(driver.command("sample_period_s", 3600))
     await driver.send()
     assert list(unit.bank.read("holding", 1, 1, CLOCK.monotonic_ns())) == [3600]
     await driver.receive("values")
     held = b"".join(word.to_bytes(2) for word in unit.bank.read("input", 0, 10, CLOCK.monotonic_ns()))
-    assert ear.consume().data == held
+    assert subscriber.consume().data == held
     assert sum(unit.emulator.executed.values()) == unit.counters.requests == unit.counters.replies
 
 

@@ -18,7 +18,7 @@ PERIODS = st.integers(-32768, 32767)
 PAYLOADS = st.lists(st.binary(max_size=20), max_size=10)
 
 
-class Ears:
+class Listeners:
     """A control logic, and consumers of its events."""
 
     def __init__(self) -> None:
@@ -85,57 +85,57 @@ def test_ControlLogic_LogData_needs_a_positive_period(period_s: int, data: bytes
 @given(periods=st.lists(PERIODS, max_size=20))
 def test_ControlLogic_sendCmd_drains_the_transmitter_queue_and_relays_every_command(periods: list[int]) -> None:
     """Rulings 1 and 5: a period is always relayed, also 0 and negative; emitting never waits for the log."""
-    ears = Ears()
-    ears.send(*periods)
-    assert not ears.logic.transmitter.queue
-    assert list(ears.commands.queue) == [encode_period(p) for p in periods]
-    assert ears.logic.period_s == (periods[-1] if periods else 0)
+    listeners = Listeners()
+    listeners.send(*periods)
+    assert not listeners.logic.transmitter.queue
+    assert list(listeners.commands.queue) == [encode_period(p) for p in periods]
+    assert listeners.logic.period_s == (periods[-1] if periods else 0)
 
 
 @given(periods=st.lists(PERIODS, max_size=20))
 def test_ControlLogic_sendCmd_logs_under_the_period_as_it_is_after_SetPeriod(periods: list[int]) -> None:
     """Ruling 1: the command that starts sampling is logged, the one that ends it is not."""
-    ears = Ears()
-    ears.send(*periods)
-    assert ears.log == [("command", encode_period(p).data) for p in periods if p > 0]
+    listeners = Listeners()
+    listeners.send(*periods)
+    assert listeners.log == [("command", encode_period(p).data) for p in periods if p > 0]
 
 
 def test_ControlLogic_the_same_command_twice_is_two_commands() -> None:
     """Rulings 2 and 17."""
-    ears = Ears()
-    ears.send(5, 5)
-    assert len(ears.commands.queue) == 2
-    assert ears.log == [("command", b"\0\5")] * 2
+    listeners = Listeners()
+    listeners.send(5, 5)
+    assert len(listeners.commands.queue) == 2
+    assert listeners.log == [("command", b"\0\5")] * 2
 
 
 @given(payloads=PAYLOADS, period_s=PERIODS)
 def test_ControlLogic_sendRsp_drains_the_sensor_queue_and_emits_payloads_unaltered(
     payloads: list[bytes], period_s: int
 ) -> None:
-    ears = Ears()
-    ears.send(period_s)
+    listeners = Listeners()
+    listeners.send(period_s)
     responses = [MEASUREMENT(p) for p in payloads]
     for response in responses:
-        ears.logic.sensor.observe(response)
-    ears.logic.send_rsp(2)
-    assert not ears.logic.sensor.queue
-    assert all(emitted is response for emitted, response in zip(ears.responses.queue, responses, strict=True))
-    logged = [data for kind, data in ears.log if kind == "response"]
+        listeners.logic.sensor.observe(response)
+    listeners.logic.send_rsp(2)
+    assert not listeners.logic.sensor.queue
+    assert all(emitted is response for emitted, response in zip(listeners.responses.queue, responses, strict=True))
+    logged = [data for kind, data in listeners.log if kind == "response"]
     assert logged == (payloads if period_s > 0 else [])
 
 
 @given(bits=st.binary(max_size=5).filter(lambda b: len(b) != 2))
 def test_ControlLogic_data_that_is_not_a_command_changes_nothing(bits: bytes) -> None:
     """Ruling 11: a case that the paper omits gives a typed error, here a count and an entry in the log."""
-    ears = Ears()
-    ears.send(3)
+    listeners = Listeners()
+    listeners.send(3)
     with pytest.raises(Desync):
-        ears.logic.set_period(COMMAND(bits))
-    ears.logic.transmitter.observe(COMMAND(bits))
-    ears.logic.send_cmd(1)
-    assert ears.logic.period_s == 3
-    assert ears.logic.bad_commands == 1
-    assert len(ears.commands.queue) == 1
+        listeners.logic.set_period(COMMAND(bits))
+    listeners.logic.transmitter.observe(COMMAND(bits))
+    listeners.logic.send_cmd(1)
+    assert listeners.logic.period_s == 3
+    assert listeners.logic.bad_commands == 1
+    assert len(listeners.commands.queue) == 1
 
 
 def test_ControlLogic_dataLog_is_bounded_ordered_and_keeps_duplicates() -> None:

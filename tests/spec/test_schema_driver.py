@@ -109,16 +109,16 @@ def test_DeviceDriver_Receive_is_read_then_emit(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
             driver, unit = r.register_driver("ctd"), r.unit("ctd")
-            ears: list[Consumer[DATA]] = [Consumer(driver.emitter.event) for _ in range(2)]
-            for ear in ears:
-                driver.emitter.subscribe(ear)
+            subscribers: list[Consumer[DATA]] = [Consumer(driver.emitter.event) for _ in range(2)]
+            for subscriber in subscribers:
+                driver.emitter.subscribe(subscriber)
             await driver.receive("values")  # the reference: the age of that sample is unknown
             driver.consumer.observe(driver.command("sample_period_s", 3600))
             await driver.send()  # the first sample is taken at once
             await driver.receive("values")
             words = unit.bank.read("input", 0, 10, CLOCK.monotonic_ns())
             sample = MEASUREMENT(b"".join(word.to_bytes(2) for word in words))
-            assert [list(ear.queue) for ear in ears] == [[sample], [sample]]
+            assert [list(subscriber.queue) for subscriber in subscribers] == [[sample], [sample]]
 
     run(main())
 
@@ -136,13 +136,13 @@ def test_SensorDriver_result_of_a_command_is_a_RESPONSE(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
             driver = r.register_driver("ctd")
-            ear: Consumer[DATA] = Consumer(driver.emitter.event)
-            driver.emitter.subscribe(ear)
+            subscriber: Consumer[DATA] = Consumer(driver.emitter.event)
+            driver.emitter.subscribe(subscriber)
             await driver.receive("values")
             driver.consumer.observe(driver.command("sample_period_s", 3600))
             await driver.send()
             await driver.receive("values")
-            assert isinstance(ear.consume(), RESPONSE)
+            assert isinstance(subscriber.consume(), RESPONSE)
 
     run(main())
 
@@ -168,8 +168,8 @@ def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFact
             assert isinstance(driver, TransmitterDriver)
             near = r.unit("modem").bank
             assert isinstance(near, DistortedRegisters)
-            ear: Consumer[DATA] = Consumer(driver.emitter.event)
-            driver.emitter.subscribe(ear)
+            subscriber: Consumer[DATA] = Consumer(driver.emitter.event)
+            driver.emitter.subscribe(subscriber)
             await driver.synchronise()
             outbox, inbox = driver.profile.outbox, driver.profile.inbox
             assert outbox is not None
@@ -185,7 +185,7 @@ def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFact
                 await driver.receive("inbox")
                 await driver.receive("inbox")  # the same sequence again is the same message
                 await driver.acknowledge()
-            assert list(ear.queue) == [COMMAND(payload) for payload in payloads]
+            assert list(subscriber.queue) == [COMMAND(payload) for payload in payloads]
             assert r.unit("modem").unlisted == 0  # all requests of the driver are in the command list
             executed = r.unit("modem").emulator.executed
             assert set(executed) == {"send", "receive", "acknowledge"}

@@ -33,15 +33,15 @@ def test_EventHandler_of_another_event_is_refused() -> None:
 @given(items=ITEMS, consumers=st.integers(0, 4))
 def test_Producer_Emit_passes_exactly_what_occurred_to_every_Consumer(items: list[DATA], consumers: int) -> None:
     producer: Producer[DATA] = Producer("response")
-    ears: list[Consumer[DATA]] = [Consumer("response") for _ in range(consumers)]
+    subscribers: list[Consumer[DATA]] = [Consumer("response") for _ in range(consumers)]
     deaf: Consumer[DATA] = Consumer("response")
-    for ear in ears:
-        producer.subscribe(ear)
+    for subscriber in subscribers:
+        producer.subscribe(subscriber)
     for item in items:
         producer.emit(item)
-    for ear in ears:
-        assert len(ear.queue) == len(items)
-        assert all(heard is item for heard, item in zip(ear.queue, items, strict=True))
+    for subscriber in subscribers:
+        assert len(subscriber.queue) == len(items)
+        assert all(heard is item for heard, item in zip(subscriber.queue, items, strict=True))
     assert not deaf.queue
 
 

@@ -37,10 +37,10 @@ async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
         bank.poke("holding", 0, *(100 * number + i for i in range(64)))
     plant = Endpoint.parse(f"rtu:{tmp_path / 'line'}?{LINE}")
     end = await PtyEnd.open(tmp_path / "line", plant, None)
-    slave = RtuServer({n: ModbusUnit(bank) for n, bank in banks.items()})
+    server = RtuServer({n: ModbusUnit(bank) for n, bank in banks.items()})
     try:
         async with Nursery() as nursery:
-            nursery.start(serve_rtu(end, slave, WallClock()), "units")
+            nursery.start(serve_rtu(end, server, WallClock()), "units")
             yield banks
     finally:
         await end.aclose()

@@ -82,7 +82,7 @@ def mbpoll(port: Path, unit: int, address: int, *values: str) -> str:
     return done.stdout + done.stderr
 
 
-def check_a_master(port: Path) -> None:
+def check_a_client(port: Path) -> None:
     text = mbpoll(port, 21, 200)
     assert re.search(r"^\[200\]:\s+[01]$", text, re.MULTILINE), text
     text = mbpoll(port, 22, 200)
@@ -93,14 +93,14 @@ def check_a_master(port: Path) -> None:
 
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
-def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> None:
+def test_a_client_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> None:
     system = a_system(tmp_path / "systems", 1, tmp_path / "no-such-port")
     with fieldtwin(tmp_path / "run", "run", str(system), "--prototype", "--instance", "p") as program:
         gateway = program.control("p", "gateway")
         wait_for(lambda: gateway("get")["bridge"]["door"]["listening"], 15)
         masters = tmp_path / "run" / "p" / "bridge-door"
         wait_for(lambda: f"clients of bridge door  →  {masters}" in program.err, 5)
-        check_a_master(masters)
+        check_a_client(masters)
         text = mbpoll(masters, 21, 34, "3")
         assert "Written 1 references" in text, text
         status = gateway("get")
@@ -116,7 +116,7 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
 @pytest.mark.long
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
-def test_a_master_on_a_line_reaches_tcp_units_of_a_plant(tmp_path: Path) -> None:
+def test_a_client_on_a_line_reaches_tcp_units_of_a_plant(tmp_path: Path) -> None:
     async def main() -> None:
         clock = WallClock()
         bank = MapBank([CellSpan("holding", 0, 300)])
@@ -143,7 +143,7 @@ def use_the_plant(tmp_path: Path, system: Path, masters: Path) -> None:
         gateway = program.control("p", "gateway")
         wait_for(lambda: gateway("get")["bridge"]["door"]["listening"], 15)
         wait_for(lambda: gateway("get")["devices"]["relay"]["online"], 15)
-        check_a_master(masters)
+        check_a_client(masters)
         assert "Illegal function" in mbpoll(masters, 21, 34, "3")  # a plant is read-only unless told otherwise
         status: dict[str, Any] = gateway("get")
         assert status["bridge"]["door"]["counters"]["refused"] == 1

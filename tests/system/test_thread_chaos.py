@@ -16,7 +16,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
-from mosquitto_here import broker
+from local_mosquitto import broker
 from procs import CHECKOUT, Fieldtwin, fieldtwin, free_port, no_tracebacks, wait_for
 from stores import ask, log_of, own
 

@@ -153,9 +153,9 @@ def test_a_dump_that_was_killed_continues(tmp_path: Path) -> None:
     out = tmp_path / "d.jsonl"
 
     async def main() -> None:
-        slave = MbapServer({1: our_unit()})
+        server = MbapServer({1: our_unit()})
         listener = await SocketListener.open(
-            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, slave, WallClock(), latency_s=0.002)
+            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, server, WallClock(), latency_s=0.002)
         )
         arguments = ["dump", str(listener.bound), "input:0..999", "-o", str(out), "--rate", "200", "--json"]
 
@@ -171,7 +171,7 @@ def test_a_dump_that_was_killed_continues(tmp_path: Path) -> None:
             os.kill(first.pid, signal.SIGKILL)
             await first.communicate()
             kept = out.read_bytes().count(b'"us"')
-            asked = slave.requests
+            asked = server.requests
             assert asked - 1 <= kept <= asked
             second = await start("--resume")
             stdout, stderr = await second.communicate()

@@ -39,13 +39,13 @@ async def fieldtwin(*words: str) -> tuple[int, dict[str, Any], str]:
     return program.returncode, json.loads(out), err.decode()
 
 
-def slave() -> RtuServer:
+def make_device() -> RtuServer:
     return RtuServer({5: ModbusUnit(MapBank([CellSpan("holding", 0, 8)]))})
 
 
 async def answer_at(end: PtyEnd, speed: int) -> None:
     """A device whose UART runs at `speed`; data sent at a different speed is noise to it."""
-    device, port = slave(), os.open(end.device, os.O_RDWR | os.O_NOCTTY)
+    device, port = make_device(), os.open(end.device, os.O_RDWR | os.O_NOCTTY)
     try:
         while True:
             data = await end.read()
@@ -85,7 +85,7 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
 
 def test_rtu_over_tcp_and_a_missing_device() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        device = slave()
+        device = make_device()
         while data := await reader.read(256):
             for reply in device.feed(data, WallClock().monotonic_ns()):
                 writer.write(reply)

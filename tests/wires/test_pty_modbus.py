@@ -95,7 +95,7 @@ async def take(port: int, count: int) -> bytes:
     return bytes(data)
 
 
-def test_a_master_may_disconnect_and_connect_again(tmp_path: Path) -> None:
+def test_a_client_may_disconnect_and_connect_again(tmp_path: Path) -> None:
     async def main() -> None:
         unit = make_unit()
         slave = RtuServer({1: unit})
@@ -218,7 +218,7 @@ print("done")
 
 @pytest.mark.interop
 @pytest.mark.parametrize("kind", ["rtu", "tcp"])
-def test_pymodbus_as_a_master(tmp_path: Path, kind: str) -> None:
+def test_pymodbus_as_a_client(tmp_path: Path, kind: str) -> None:
     async def main() -> None:
         unit = make_unit()
         script = (sys.executable, "-c", PYMODBUS_MASTER, kind)

@@ -270,11 +270,11 @@ def test_a_client_that_does_not_read_its_answers_is_not_read_from_and_gets_all_o
 
     async def main() -> None:
         served: list[SocketEnd] = []
-        slave = MbapServer(units(), max_in_flight=1_000_000)
+        server = MbapServer(units(), max_in_flight=1_000_000)
 
         async def serve(client: SocketEnd) -> None:
             served.append(client)
-            await serve_mbap(client, slave, WallClock())
+            await serve_mbap(client, server, WallClock())
 
         listener = await SocketListener.open(ANY_PORT, serve)
         reader, writer = await connect(listener)
@@ -285,12 +285,12 @@ def test_a_client_that_does_not_read_its_answers_is_not_read_from_and_gets_all_o
             if writer.transport.get_write_buffer_size() > 1_000_000:
                 break
             await asyncio.sleep(0)
-        await eventually(lambda: slave.requests > 0)
-        assert slave.requests < asked
+        await eventually(lambda: server.requests > 0)
+        assert server.requests < asked
         size = 0
         while size < asked * 259:
             size += len(await reader.read(1 << 20))
-        assert slave.requests == asked
+        assert server.requests == asked
         await hang_up(writer)
         await listener.aclose()
 

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from local_mosquitto import Mosquitto, broker, program
 from modbus_pki import Pki, make_pki
-from mosquitto_here import Mosquitto, broker, program
 from support import eventually, run
 from thread_rig import Twin, equal, value
 

@@ -57,7 +57,7 @@ def command() -> None:
 
 
 @dataclass(frozen=True)
-class MasterOptions:
+class ClientOptions:
     """The published values of the client or master under test, and its times."""
 
     probe: str = option(
@@ -125,7 +125,7 @@ class MasterOptions:
     click.option("--echo", is_flag=True, help="The client is set up for a line that echoes its requests."),
     click.option("--ascii", "in_ascii", is_flag=True, help="On pty:PATH: the client uses Modbus ASCII."),
 )
-@group("Client or master", master=MasterOptions)
+@group("Client or master", client=ClientOptions)
 @group("Test cases", choice=CaseOptions)
 @group("Results", files=ResultOptions)
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
@@ -134,7 +134,7 @@ def modbus_client(
     hold: tuple[str, ...],
     echo: bool,
     in_ascii: bool,
-    master: MasterOptions,
+    client: ClientOptions,
     choice: CaseOptions,
     files: ResultOptions,
     argv: tuple[str, ...],
@@ -160,13 +160,13 @@ def modbus_client(
         return files.list_cases(cases)
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
-    plan = master.plan(choice, cases, frozenset({"echo"} if echo else ()))
+    plan = client.plan(choice, cases, frozenset({"echo"} if echo else ()))
     options = Options(
         Endpoint.parse(listen),
         plan,
-        _words(master.values),
-        master.probe,
-        frozenset(master.none),
+        _words(client.values),
+        client.probe,
+        frozenset(client.none),
         _held(hold),
         in_ascii,
         command=argv,
@@ -197,7 +197,7 @@ def modbus_client(
         help="An object's bytes as sent, such as 6041:00=3702; repeatable.",
     ),
 )
-@group("Client or master", master=MasterOptions)
+@group("Client or master", client=ClientOptions)
 @group("Test cases", choice=CaseOptions)
 @group("Results", files=ResultOptions)
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
@@ -208,7 +208,7 @@ def canopen_master(
     heartbeat_s: float,
     size: str,
     hold: tuple[str, ...],
-    master: MasterOptions,
+    client: ClientOptions,
     choice: CaseOptions,
     files: ResultOptions,
     argv: tuple[str, ...],
@@ -234,13 +234,13 @@ def canopen_master(
         return files.list_cases(cases)
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
-    plan = master.plan(choice, cases)
+    plan = client.plan(choice, cases)
     options = Options(
         Endpoint.parse(listen),
         plan,
-        _words(master.values),
-        master.probe,
-        frozenset(master.none),
+        _words(client.values),
+        client.probe,
+        frozenset(client.none),
         command=argv,
         objects=_objects(hold),
         size=int(size),
@@ -274,20 +274,20 @@ def _judged(
 ) -> int:
     """Run the test, show the results, write the files, and return the exit code."""
     from fieldtwin.cli.test.check_view import CheckProgress
-    from fieldtwin.conformance.clients.frame_log import MasterLog
+    from fieldtwin.conformance.clients.frame_log import ClientLog
     from fieldtwin.conformance.clients.results import as_json, as_report
     from fieldtwin.conformance.clients.session import Listener
     from fieldtwin.conformance.core.results import waive
     from fieldtwin.gateway.wallclock import run
-    from fieldtwin.reports.conformance.client import write_master_html
+    from fieldtwin.reports.conformance.client import write_client_html
 
-    argv, title = sys.argv[1:], f"master on {endpoint}"
+    argv, title = sys.argv[1:], f"client on {endpoint}"
     words = shlex.join(["fieldtwin", *argv])
     waivers = choice.waivers(cases)
     started = datetime.now(UTC)
     began = started.isoformat(timespec="seconds")
     with ExitStack() as stack:
-        log = stack.enter_context(MasterLog(files.log_path, endpoint, words)) if files.log_path else None
+        log = stack.enter_context(ClientLog(files.log_path, endpoint, words)) if files.log_path else None
         progress = stack.enter_context(CheckProgress(sum(case.chosen(plan.only) for case in cases)))
         listener = Listener(progress.say, progress.tell, *([log.on_event] if log is not None else []))
         found = run(judge(listener))
@@ -307,7 +307,7 @@ def _judged(
         results,
         as_json(about, results, argv),
         as_report(results, title, argv, began, choice.bases),
-        lambda path: write_master_html(results, title, argv, began, path, choice.bases),
+        lambda path: write_client_html(results, title, argv, began, path, choice.bases),
         choice,
     )
 

@@ -77,18 +77,18 @@ class CanScan:
         return self.asked > 0
 
 
-class _EarTap(Tap):
+class _ListenerTap(Tap):
     """A tap that passes received frames to the listener while the scan sends."""
 
-    def __init__(self, ear: BusListener) -> None:
-        self._ear = ear
+    def __init__(self, listener: BusListener) -> None:
+        self._listener = listener
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
         pass
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
         if direction is Direction.RECEIVED:
-            self._ear.feed(frame, t_ns)
+            self._listener.feed(frame, t_ns)
 
 
 class CanScanner:
@@ -113,9 +113,9 @@ class CanScanner:
         self._tell, self._stop = on_progress, stop
         self._connector, self._clock = connector, clock or WallClock()
         self._facts = facts
-        self._ear = BusListener()
-        self._taps = (_EarTap(self._ear), *taps)
-        self.result = CanScan(url, heard=self._ear.heard)
+        self._listener = BusListener()
+        self._taps = (_ListenerTap(self._listener), *taps)
+        self.result = CanScan(url, heard=self._listener.heard)
 
     async def run(self) -> CanScan:
         """Run the scan. Raises `Unreachable` where the bus cannot be joined, `UsageError` if its bit rate is different."""
@@ -123,11 +123,11 @@ class CanScanner:
         try:
             self.result.facts = self._facts(self._endpoint)
             await self._listen()
-            self.result.heard = deepcopy(self._ear.heard)  # later frames include answers to the scan
+            self.result.heard = deepcopy(self._listener.heard)  # later frames include answers to the scan
             if self._may_ask():
                 await self._ask()
         finally:
-            if (second := self._ear.heard.sync_producers) not in ("", *self.result.notes):
+            if (second := self._listener.heard.sync_producers) not in ("", *self.result.notes):
                 self.result.notes.append(second)
             self.result.took_s = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
             self.result.stopped = self._stop()
@@ -161,9 +161,9 @@ class CanScanner:
         for rate in ADAPTER_RATES:
             if self._stop():
                 return
-            before = self._ear.heard.frames
+            before = self._listener.heard.frames
             await self._hear(self._silent_endpoint(), rate, RATE_LISTEN_S, f"listening at {rate} bit/s")
-            if self._ear.heard.frames > before:
+            if self._listener.heard.frames > before:
                 result.bitrate = rate
                 result.notes.append(f"frames are whole at {rate} bit/s")
                 await self._hear(self._silent_endpoint(), rate, self._options.listen_s)
@@ -181,7 +181,7 @@ class CanScanner:
             result.bitrate = result.bitrate or (known if isinstance(known, int) else 0)
             began_ns = clock.monotonic_ns()
             while not self._stop() and (elapsed_s := (clock.monotonic_ns() - began_ns) / NS_PER_S) < listen_s:
-                heard = self._ear.heard
+                heard = self._listener.heard
                 self._tell(PhaseProgress(phase, elapsed_s, listen_s, f"{heard.frames} frames", len(heard.nodes)))
                 await clock.sleep_until_ns(clock.monotonic_ns() + round(min(0.1, listen_s - elapsed_s) * NS_PER_S))
                 connection.inbound.data_stream.clear()  # already counted when it arrived
@@ -197,7 +197,7 @@ class CanScanner:
     # -- asking ---------------------------------------------------------------------------------------------------
 
     def _may_ask(self) -> bool:
-        heard, result, facts = self._ear.heard, self.result, self.result.facts
+        heard, result, facts = self._listener.heard, self.result, self.result.facts
         assert facts is not None
         if self._options.listen_only or self._stop():
             return False
@@ -240,7 +240,7 @@ class CanScanner:
 
     def _met_master(self) -> bool:
         """Return whether another master, silent during the listening, has begun to send."""
-        if self._options.share_bus or not self._ear.heard.has_master:
+        if self._options.share_bus or not self._listener.heard.has_master:
             return False
         note = "another master started to send, so the scan stopped; --share-bus continues, one node at a time"
         if note not in self.result.notes:
@@ -261,7 +261,7 @@ class CanScanner:
 
     async def _sdo_is_free(self, node: int) -> bool:
         """Wait until no other master uses SDO. Return False if another master uses this node, or does not stop in time."""
-        clock, masters = self._clock, self._ear.heard.sdo_masters
+        clock, masters = self._clock, self._listener.heard.sdo_masters
         deadline_ns = clock.monotonic_ns() + round(PATIENCE_S * NS_PER_S)
         while masters:
             if node in masters:
@@ -277,7 +277,7 @@ class CanScanner:
 
     async def _look_for_unconfigured(self, master: CanopenMaster, done_s: float, total_s: float) -> None:
         result = self.result
-        if self._ear.heard.lss_requests:
+        if self._listener.heard.lss_requests:
             result.notes.append("another LSS master is active, so there is no fastscan")
             return
         with _lss(master, self._clock) as lss:

@@ -28,7 +28,7 @@ from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing
 from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
-"""Silence in seconds before each question on a line with another master."""
+"""Silence in seconds before each question on a line with another client."""
 QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
 """Default timeout of each reply, in seconds.
 
@@ -252,24 +252,24 @@ class ModbusScanner:
 
     async def _audition(self, settings: SerialSettings, listen_s: float, *, whole: bool = False) -> Audition:
         """Listen at `settings`: for `listen_s` with `whole`, else until the result is clear."""
-        ear = LineListener(self._framing)
+        listener = LineListener(self._framing)
         url = str(plan.with_settings(self._endpoint, settings))
         async with bytes_at(url, taps=self._taps, connector=self._connector, clock=self._clock) as connection:
             before = _counters(connection)
             began_ns = self._clock.monotonic_ns()
             while not self._stop():
                 elapsed_s = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
-                clear = dwell_over(ear.heard, elapsed_s)
-                if (clear or not ear.heard.bytes) and elapsed_s >= listen_s if whole else clear:
+                clear = dwell_over(listener.heard, elapsed_s)
+                if (clear or not listener.heard.bytes) and elapsed_s >= listen_s if whole else clear:
                     break
-                detail = f"{plan.name_of(settings)}, {ear.heard.bytes} bytes, {ear.heard.frames} frames"
+                detail = f"{plan.name_of(settings)}, {listener.heard.bytes} bytes, {listener.heard.frames} frames"
                 self._tell(PhaseProgress("listening", elapsed_s, max(listen_s, elapsed_s), detail))
                 data = await connection.read_within(0.1)
-                ear.feed(data, self._clock.monotonic_ns())
-            ear.settle(self._clock.monotonic_ns() + NS_PER_S)
+                listener.feed(data, self._clock.monotonic_ns())
+            listener.settle(self._clock.monotonic_ns() + NS_PER_S)
             after = _counters(connection)
             errors = after.since(before) if after is not None and before is not None else None
-        return Audition(settings, ear.heard, errors)
+        return Audition(settings, listener.heard, errors)
 
     # -- questions ------------------------------------------------------------------------------------------------
 

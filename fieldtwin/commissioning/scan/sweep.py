@@ -107,9 +107,9 @@ class UnitSweep:
         self.echo = False
         """Sent bytes come back."""
         self.foreign = 0
-        """Number of good frames of another master or its units."""
+        """Number of good frames of another client or its units."""
         self.other_requests = 0
-        """Number of good requests of another master."""
+        """Number of good requests of another client."""
         self.noise_bytes = 0
         self.never_silent = False
         self.asked = 0

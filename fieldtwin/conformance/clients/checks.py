@@ -1,6 +1,6 @@
 """Checks that cases share: pure functions of an `Observation`.
 
-The first ones apply to every master in every case: it continues, it does not flood, it sends only valid requests, and
+The first ones apply to every client in every case: it continues, it does not flood, it sends only valid requests, and
 it never publishes the value of a bad frame. The others are specific to cases.
 """
 
@@ -24,7 +24,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import Verdict
 
 FLOOD_FACTOR = 5.0
-"""Multiple of the usual rate that is a flood. A master that tries four times and polls on stays below it."""
+"""Multiple of the usual rate that is a flood. A client that tries four times and polls on stays below it."""
 FLOOD_FLOOR = 30
 """Number of requests within the case that is not a flood, however low the usual rate is."""
 NEEDS_PROBE = "only its published values show this: give --probe"
@@ -48,14 +48,14 @@ def all_of(*rules: Rule) -> CheckFunction:
     return judge
 
 
-# -- every master -----------------------------------------------------------------------------------------------------
+# -- every client -----------------------------------------------------------------------------------------------------
 
 
 def goes_on(seen: Observation) -> Finding | None:
-    """Check that the master still runs, and asks again once the device replies correctly."""
+    """Check that the client still runs, and asks again once the device replies correctly."""
     for ended in seen.of(Ended, seen.begun_ns):
         return failed(
-            f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first faulty answer"
+            f"the client ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first faulty answer"
         )
     asked = next(seen.of(RequestSeen, seen.over_ns + 1), None)
     if asked is None:
@@ -66,7 +66,7 @@ def goes_on(seen: Observation) -> Finding | None:
 
 
 def asks_cleanly(seen: Observation) -> Finding | None:
-    """Check that the master sends only valid requests."""
+    """Check that the client sends only valid requests."""
     for bad in seen.of(Garbled, seen.begun_ns):
         return failed(f"sent {len(bad.data)} bytes that are no request: {bad.data[:16].hex(' ')}")
     return None
@@ -124,7 +124,7 @@ def needs_probe(seen: Observation) -> Finding | None:
 
 
 def owes(*rules: Rule) -> CheckFunction:
-    """Check the duties of every master, then `rules`; passed only if the probe saw all published values."""
+    """Check the duties of every client, then `rules`; passed only if the probe saw all published values."""
     return all_of(*DUTIES, *rules, sees_all_values)
 
 
@@ -138,7 +138,7 @@ survives = owes()
 
 
 def took_odd_answer(seen: Observation) -> Finding | None:
-    """Check that the master took the value from the faulty answers, before the correct ones came again."""
+    """Check that the client took the value from the faulty answers, before the correct ones came again."""
     if not seen.probed:
         return skipped(NEEDS_PROBE)
     first = next((s for s in seen.of(ValuePublished, seen.begun_ns) if s.word is seen.after), None)
@@ -151,9 +151,9 @@ def took_odd_answer(seen: Observation) -> Finding | None:
 
 
 def keeps_waiting(seen: Observation) -> Finding | None:
-    """Check that the master waits long enough for a reply.
+    """Check that the client waits long enough for a reply.
 
-    On a line, a frame after the next request answers the first one: a master that has asked again gave up waiting for
+    On a line, a frame after the next request answers the first one: a client that has asked again gave up waiting for
     it.
     """
     for told in seen.of(ReplySent, seen.begun_ns):
@@ -174,7 +174,7 @@ def keeps_waiting(seen: Observation) -> Finding | None:
 _TAKES: tuple[Rule, ...] = (took_odd_answer, publishes_good_again, sees_all_values)
 accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, *_TAKES)
 accepts_on_line = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, keeps_waiting, *_TAKES)
-"""As `accepts`, for a master that has one request at a time."""
+"""As `accepts`, for a client that has one request at a time."""
 either = owes(needs_probe)
 """Taken or discarded, both are right; a wrong value is not."""
 
@@ -182,8 +182,8 @@ either = owes(needs_probe)
 def answers_at_once(seen: Observation) -> Finding | None:
     """Check that a short frame is noticed on arrival: the next request comes sooner than after silence.
 
-    A master may also see it at once and then back off for about as long as it waits for silence. Therefore the second
-    frame is sent later than the first: a master that waits out its timeout asks again at the same time after both
+    A client may also see it at once and then back off for about as long as it waits for silence. Therefore the second
+    frame is sent later than the first: a client that waits out its timeout asks again at the same time after both
     requests.
     """
     gaps_s = [
@@ -239,7 +239,7 @@ def backs_off(seen: Observation) -> Finding | None:
 
 
 def quarantines(seen: Observation) -> Finding | None:
-    """Check that the master waits before it repeats a request that timed out.
+    """Check that the client waits before it repeats a request that timed out.
 
     After a timeout, a late reply of the same shape cannot be distinguished from a prompt reply to the same question. If
     a probe saw the late value, another check has already decided; otherwise it is a failure only if the user stated the
@@ -259,7 +259,7 @@ def quarantines(seen: Observation) -> Finding | None:
 
 
 def late_is_not_data(seen: Observation) -> Finding | None:
-    """Check as `publishes_nothing_bad`, but inconclusive without the master's timeout, within which it may accept a reply."""
+    """Check as `publishes_nothing_bad`, but inconclusive without the client's timeout, within which it may accept a reply."""
     bad = publishes_nothing_bad(seen)
     if bad is not None and not seen.timeout_s:
         return inconclusive(f"{bad.reason}; a failure if its timeout is {seen.habit.silent_gap_s:.2f} s: say --timeout")
@@ -281,7 +281,7 @@ late_other = all_of(another_shape_came, *DUTIES, needs_probe, sees_all_values)
 
 
 def checks_echo_of_write(seen: Observation) -> Finding | None:
-    """Check that the master notices a differing echo of a write: it repeats it, reads it back, or reports it."""
+    """Check that the client notices a differing echo of a write: it repeats it, reads it back, or reports it."""
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if first is None:
         return inconclusive("no write was seen")

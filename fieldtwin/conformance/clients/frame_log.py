@@ -1,6 +1,6 @@
-"""Log the frames of a master under test and its hostile device.
+"""Log the frames of a client under test and its hostile device.
 
-The JSON lines are like those of `fieldtwin.commissioning.access.frame_log`. The directions are the master's: the frames that it
+The JSON lines are like those of `fieldtwin.commissioning.access.frame_log`. The directions are the client's: the frames that it
 sent, and those that it received.
 """
 
@@ -13,8 +13,8 @@ from fieldtwin.conformance.core.evidence import line_of
 from fieldtwin.conformance.core.observation import Event, Garbled, ReplySent, RequestSeen, Sent
 
 
-class MasterLog(FrameLog):
-    """Appends to `path`; `where` is the endpoint on which the master is served, `words` the command line."""
+class ClientLog(FrameLog):
+    """Appends to `path`; `where` is the endpoint on which the client is served, `words` the command line."""
 
     def __init__(self, path: Path, where: str, words: str) -> None:
         super().__init__(path, words)

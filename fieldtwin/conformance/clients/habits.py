@@ -1,4 +1,4 @@
-"""Checks of a master's own behaviour: its requests over the whole run against the standard."""
+"""Checks of a client's own behaviour: its requests over the whole run against the standard."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def bounded_addresses(seen: Observation) -> Finding:
 
 
 def few_connections(seen: Observation) -> Finding:
-    """Check that a master that loses a connection closes its end: each one that stays open occupies one of the device's."""
+    """Check that a client that loses a connection closes its end: each one that stays open occupies one of the device's."""
     count = most = 0
     for event in seen.events:
         count += isinstance(event, ObservedConnection) - isinstance(event, Left)

@@ -1,6 +1,6 @@
-"""Probes for the values that the master under test publishes, which show whether a bad frame became a value.
+"""Probes for the values that the client under test publishes, which show whether a bad frame became a value.
 
-A probe learns the representation of the two correct words (`learn`), however the master converts them: scaled, as a
+A probe learns the representation of the two correct words (`learn`), however the client converts them: scaled, as a
 float, in two registers. A later value that equals neither came from data that no correct answer contained.
 """
 
@@ -75,7 +75,7 @@ class Classifier:
 
 
 class RegisterProbe:
-    """Registers of a Modbus TCP server, polled: the master's own, or those of an HMI behind it.
+    """Registers of a Modbus TCP server, polled: the client's own, or those of an HMI behind it.
 
     An exception is not a value.
     """
@@ -139,7 +139,7 @@ class _Lines:
 
 
 class OutputProbe:
-    """Whole numbers in the output of the master's program.
+    """Whole numbers in the output of the client's program.
 
     The program also prints other text, so a line is identified by its form: its text without the numbers. While the
     probe learns, it notes the forms and the positions in them of the correct words. Later, a number at such a position
@@ -195,7 +195,7 @@ class OutputProbe:
 
 
 class MarkedOutputProbe:
-    """The values that the master's program prints after `mark` in a line. Any other text after it means "no value"."""
+    """The values that the client's program prints after `mark` in a line. Any other text after it means "no value"."""
 
     def __init__(self, mark: str, classifier: Classifier) -> None:
         self._value = re.compile(re.escape(mark) + r"\s*([^\s,;:\"'(){}\[\]]+)")

@@ -19,7 +19,7 @@ OnText = Callable[[str, bool], None]
 
 
 def environment(endpoint: Endpoint) -> dict[str, str]:
-    """Return the environment variables that tell the program its endpoint. `endpoint` is the master's side of it."""
+    """Return the environment variables that tell the program its endpoint. `endpoint` is the client's side of it."""
     env = {"FIELDTWIN_ENDPOINT": str(endpoint)}
     if endpoint.is_serial:
         env["FIELDTWIN_TTY"] = endpoint.path

@@ -42,7 +42,7 @@ class Recorder:
         return tuple(reversed(found))
 
     def habit(self, since_ns: int, until_ns: int, silent_gap_s: float = 0.0) -> Habit:
-        """Return the polling behaviour of the master between two moments."""
+        """Return the polling behaviour of the client between two moments."""
         asked = [e for e in self._events if isinstance(e, RequestSeen) and since_ns <= e.t_ns <= until_ns]
         gaps = [(b.t_ns - a.t_ns) / NS_PER_S for a, b in itertools.pairwise(asked)]
         times: dict[bytes, list[int]] = {}

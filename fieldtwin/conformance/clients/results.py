@@ -1,4 +1,4 @@
-"""Results of a test of a master as JSON and for JUnit. `fieldtwin.conformance.core.results` has what devices have too."""
+"""Results of a test of a client as JSON and for JUnit. `fieldtwin.conformance.core.results` has what devices have too."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from fieldtwin.conformance.core.evidence import reproduce
 from fieldtwin.conformance.core.results import ONLY_REQUIRED, CaseResult, as_scenario, case_json, document, summary
 from fieldtwin.results.model import Report
 
-KIND = "fieldtwin check-master"
+KIND = "fieldtwin check-client"
 VERSION = 1
 
 
 def as_json(about: Mapping[str, Any], results: Sequence[CaseResult], argv: Sequence[str]) -> dict[str, Any]:
-    """Return the whole test of a master. `about` names the test, `argv` is the command line, for `reproduce`."""
+    """Return the whole test of a client. `about` names the test, `argv` is the command line, for `reproduce`."""
     cases = [
         case_json(r, "device", reproduce=reproduce(argv, r.case.id), wire=[line.as_json() for line in r.wire])
         for r in results

@@ -1,7 +1,7 @@
-"""Run the cases against a master, one after the other, and check each.
+"""Run the cases against a client, one after the other, and check each.
 
-The run first measures the master's usual behaviour. The device replies correctly before and after each case. A case
-that cannot be carried out is skipped with the reason; a case without the master's participation is inconclusive.
+The run first measures the client's usual behaviour. The device replies correctly before and after each case. A case
+that cannot be carried out is skipped with the reason; a case without the client's participation is inconclusive.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 POLL_S = 0.01
 STEADY = 3
-"""Number of polls that show the master's usual behaviour."""
+"""Number of polls that show the client's usual behaviour."""
 MANY = 1_000_000
 """Maximum number of strikes of a case that continues until its value was seen."""
 
@@ -90,10 +90,10 @@ class HostileDevice(Protocol[C_contra]):
 
 @dataclass(frozen=True, slots=True)
 class ClientPlan(CasePlan):
-    """The plan of a run against a master.
+    """The plan of a run against a client.
 
-    `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
-    the time until the master's first request.
+    `timeout_s` is the client's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
+    the time until the client's first request.
     """
 
     at_most: Impact = Impact.DISRUPT
@@ -103,11 +103,11 @@ class ClientPlan(CasePlan):
 
 
 @dataclass
-class MasterRun(Generic[C]):
-    """One conformance test of a master.
+class ClientRun(Generic[C]):
+    """One conformance test of a client.
 
     `traits` are the features of the endpoint, for `framings` of cases; `silent` is a case that leaves a request
-    unanswered, which measures the master's timeout. `tell` is called with each result.
+    unanswered, which measures the client's timeout. `tell` is called with each result.
     """
 
     stage: HostileDevice[C]
@@ -147,7 +147,7 @@ class MasterRun(Generic[C]):
     # -- the run --------------------------------------------------------------------------------------------------
 
     async def run(self) -> list[CaseResult]:
-        """Return the results in the order of the cases. Raises `Unreachable` if no master ever sent a request."""
+        """Return the results in the order of the cases. Raises `Unreachable` if no client ever sent a request."""
         await self._learn()
         chosen = [case for case in self.cases if case.about.chosen(self.plan.only)]
         for case in [c for c in chosen if c.wants != "nothing"]:
@@ -157,7 +157,7 @@ class MasterRun(Generic[C]):
         return self.results
 
     async def _learn(self) -> None:
-        """Measure the master's polling behaviour, the representation of the correct words, and its response timeout."""
+        """Measure the client's polling behaviour, the representation of the correct words, and its response timeout."""
         stage = self.stage
         if not await self._until(
             lambda: any(isinstance(e, RequestSeen) for e in stage.recorder.since(0)), self.plan.wait_s
@@ -320,7 +320,7 @@ class MasterRun(Generic[C]):
         return await self._until(lambda: self.stage.recorder.count(ReplySent, since_ns) >= count, within_s)
 
     async def _until(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Wait for `condition` and return whether it holds; also end when the master has ended."""
+        """Wait for `condition` and return whether it holds; also end when the client has ended."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + within_s
         while not condition():

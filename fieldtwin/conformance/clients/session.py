@@ -16,7 +16,7 @@ from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, t
 from fieldtwin.conformance.clients.modbus.pty_line import PtyLine
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.clients.program import OnText, ProgramUnderTest
-from fieldtwin.conformance.clients.run import C, ClientPlan, MasterRun
+from fieldtwin.conformance.clients.run import C, ClientPlan, ClientRun
 from fieldtwin.conformance.core.observation import Event, Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.ports import OsPorts
@@ -83,7 +83,7 @@ async def judge_modbus_client(options: Options, listener: Listener) -> list[Case
         theirs = await _open(options.listen, stage, nursery, closing, "ascii" if in_ascii else "rtu")
         here = traits(scheme) | (PtyLine.traits() if options.listen.scheme == "pty" else frozenset())
         probe, on_text = _probe(options, nursery)
-        run = MasterRun(stage, CASES, SILENT, options.plan, here, probe, listener.tell)
+        run = ClientRun(stage, CASES, SILENT, options.plan, here, probe, listener.tell)
         return await _judged(run, options, theirs, on_text, listener)
 
 
@@ -108,12 +108,12 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
         nursery.start(stage.serve(connection), "nodes")
         probe, on_text = _probe(options, nursery)
         here = CAN_TRAITS | ({"heartbeat"} if options.heartbeat_s else set())
-        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, here, probe, listener.tell)
+        run = ClientRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, here, probe, listener.tell)
         return await _judged(run, options, bus.bound, on_text, listener)
 
 
 async def _judged(
-    run: MasterRun[C], options: Options, theirs: Endpoint, on_text: OnText, listener: Listener
+    run: ClientRun[C], options: Options, theirs: Endpoint, on_text: OnText, listener: Listener
 ) -> list[CaseResult]:
     """Run the cases, with the program under test if there is one."""
     task = asyncio.current_task()
@@ -138,7 +138,7 @@ async def _judged(
 async def _open(
     listen: Endpoint, stage: HostileServer, nursery: Nursery, closing: AsyncExitStack, framing: str
 ) -> Endpoint:
-    """Serve `listen`; returns the master's side of it."""
+    """Serve `listen`; returns the client's side of it."""
     if listen.scheme in ("tcp", "rtu+tcp"):
         server = await OsPorts().listen(listen, stage.serve, MAX_CLIENTS)
         closing.push_async_callback(server.aclose)

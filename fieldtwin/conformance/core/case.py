@@ -1,4 +1,4 @@
-"""A test case: its ID in the test-case list, the action of the device, the expected reaction of the master, and its check.
+"""A test case: its ID in the test-case list, the action of the device, the expected reaction of the client, and its check.
 
 Protocols are elsewhere.
 """
@@ -14,18 +14,18 @@ from fieldtwin.conformance.core.observation import Observation
 from fieldtwin.results.model import Verdict
 
 TRAIL_S = 0.3
-"""Default time that a case continues after the master has recovered, so that late effects are seen."""
+"""Default time that a case continues after the client has recovered, so that late effects are seen."""
 
 
 class Impact(Enum):
-    """Impact level of a case on the equipment behind the master, in rising order."""
+    """Impact level of a case on the equipment behind the client, in rising order."""
 
     OBSERVE = "observe"
     """No effect: it only listens."""
     READ = "read"
-    """The simulated device answers reads with faults; the plant behind the master stays unchanged."""
+    """The simulated device answers reads with faults; the plant behind the client stays unchanged."""
     WRITE = "write"
-    """The simulated device answers writes with faults, so the master may repeat them."""
+    """The simulated device answers writes with faults, so the client may repeat them."""
     DISRUPT = "disrupt"
     """The connection is cut, or the line is disturbed for all devices on it."""
 
@@ -122,7 +122,7 @@ class About:
     @property
     def role(self) -> str:
         """Return the tested role."""
-        return "master"
+        return "client"
 
     @property
     def required_by(self) -> str:

@@ -1,4 +1,4 @@
-"""The evidence of a verdict about a master: the frames and events of its case as lines, and the command that repeats it."""
+"""The evidence of a verdict about a client: the frames and events of its case as lines, and the command that repeats it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ABORT = 0x80
 class Line:
     """One event.
 
-    `t_ms` counts from the first request that received a wrong reply. `by` is ``master``, ``device``, ``probe`` or
+    `t_ms` counts from the first request that received a wrong reply. `by` is ``client``, ``device``, ``probe`` or
     ``program``; `data` is a frame in hex (a CAN frame in candump format), and `text` describes it.
     """
 
@@ -62,7 +62,7 @@ def line_of(event: Event) -> tuple[str, str, str]:
     """Return the sender, the frame, and a description in words."""
     match event:
         case RequestSeen():
-            return "master", event.frame or event.target.hex(" "), _request(event)
+            return "client", event.frame or event.target.hex(" "), _request(event)
         case ReplySent():
             text = _abort(event.data) if "#" in event.frame else ""
             return (
@@ -73,17 +73,17 @@ def line_of(event: Event) -> tuple[str, str, str]:
         case Sent():
             frame = CanFrame(int.from_bytes(event.data[:2], "big"), event.data[2:])
             sdo = cob_id.SDO_REQUEST_BASE < frame.can_id < cob_id.SDO_REQUEST_BASE + 0x80
-            return "master", str(frame), _abort(frame.data) if sdo else ""
+            return "client", str(frame), _abort(frame.data) if sdo else ""
         case Garbled():
-            return "master", event.data.hex(" "), "no request"
+            return "client", event.data.hex(" "), "no request"
         case ObservedConnection():
             return (
                 ("device", "", "gives the port back")
                 if event.by_us
-                else ("master", "", f"opens connection {event.client}")
+                else ("client", "", f"opens connection {event.client}")
             )
         case Left():
-            return ("device" if event.by_us else "master"), "", f"closes connection {event.client}"
+            return ("device" if event.by_us else "client"), "", f"closes connection {event.client}"
         case ValuePublished():
             return "probe", "", f"published {event.text or 'no value'} ({event.word.value})"
         case Ended():

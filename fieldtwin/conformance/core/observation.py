@@ -1,4 +1,4 @@
-"""The observations of a case about the master under test: frames and times, and the published values. Plain values.
+"""The observations of a case about the client under test: frames and times, and the published values. Plain values.
 
 Checks receive only an `Observation`, so that they can be tested without a connection.
 """
@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class RequestSeen:
-    """A whole request of the master.
+    """A whole request of the client.
 
     `target` is the shape of a request: equal for one that is repeated (Modbus: unit ID and PDU; SDO: node ID and the
     eight bytes). `tag` is the transaction ID, 0 where there is none. `frame` is the whole frame, in hex or in candump
@@ -47,7 +47,7 @@ class ReplySent:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A frame of the master that expects no answer: NMT, SYNC, a PDO, an SDO abort.
+    """A frame of the client that expects no answer: NMT, SYNC, a PDO, an SDO abort.
 
     `data` is two bytes of identifier (big-endian), then the frame's.
     """
@@ -59,7 +59,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """Bytes of the master that do not form a request."""
+    """Bytes of the client that do not form a request."""
 
     t_ns: int
     client: int
@@ -68,7 +68,7 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class ObservedConnection:
-    """A connection of the master, numbered from 1. A serial line and a bus have one that is always there; `by_us`: the case
+    """A connection of the client, numbered from 1. A serial line and a bus have one that is always there; `by_us`: the case
     took the port away and gave it back."""
 
     t_ns: int
@@ -100,7 +100,7 @@ class Word(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ValuePublished:
-    """A value that the master publishes, as the probe reports it. `text` is the text that was read."""
+    """A value that the client publishes, as the probe reports it. `text` is the text that was read."""
 
     t_ns: int
     word: Word
@@ -121,7 +121,7 @@ E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, ObservedConnection, Left
 
 @dataclass(frozen=True, slots=True)
 class Habit:
-    """The polling behaviour of the master without faults. Seconds.
+    """The polling behaviour of the client without faults. Seconds.
 
     `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests;
     `silent_gap_s`: from an unanswered request to the next request, 0 if not measured; `rate_per_s`: requests.
@@ -139,8 +139,8 @@ class Observation:
 
     `begun_ns`: the first request that received a wrong reply; `over_ns`: the end of the device's last fault, after
     which it replied correctly; `until_ns`: the end of the observation. `before` is the word that was held before,
-    `after` the one from `begun_ns` on, also in faulty frames if the master is to accept them, `last` the one from
-    `over_ns` on. `timeout_s`: the master's response timeout as stated by the user, 0 if not stated.
+    `after` the one from `begun_ns` on, also in faulty frames if the client is to accept them, `last` the one from
+    `over_ns` on. `timeout_s`: the client's response timeout as stated by the user, 0 if not stated.
     """
 
     events: tuple[Event, ...]

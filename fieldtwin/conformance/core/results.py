@@ -1,4 +1,4 @@
-"""Results of conformance tests of devices and masters: waived or not, counted, as JSON and for the reports."""
+"""Results of conformance tests of devices and clients: waived or not, counted, as JSON and for the reports."""
 
 from __future__ import annotations
 

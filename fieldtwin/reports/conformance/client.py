@@ -1,4 +1,4 @@
-"""The conformance report of a master as one HTML file."""
+"""The conformance report of a client as one HTML file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldtwin.reports.conformance.page import render_page
 from fieldtwin.reports.file import put
 
 
-def write_master_html(
+def write_client_html(
     results: Sequence[CaseResult],
     title: str,
     argv: Sequence[str],
@@ -23,10 +23,10 @@ def write_master_html(
     fail_on: frozenset[Basis] = ONLY_REQUIRED,
 ) -> None:
     """Write the report; raises `FileInvalid` where that is not possible."""
-    put(path, render_master_html(results, title, argv, started, fail_on))
+    put(path, render_client_html(results, title, argv, started, fail_on))
 
 
-def render_master_html(
+def render_client_html(
     results: Sequence[CaseResult],
     title: str,
     argv: Sequence[str],

@@ -39,7 +39,7 @@ class WorkerBench:
         self._clock = clock
         self._folder = folder
         self._nursery = Nursery()
-        self._ears: list[CanConnection] = []
+        self._listeners: list[CanConnection] = []
 
     async def open(self) -> None:
         await self.field.open()
@@ -47,14 +47,14 @@ class WorkerBench:
         self._nursery.start(self.field.run(), "field simulator")
         for bus, listening in self.field.listening.items():
             if listening.is_can:
-                ear = await self.field.join(bus, "test")
-                self._ears.append(ear)
-                self._nursery.start(self._listen(bus, ear), f"listener on {bus}")
+                listener = await self.field.join(bus, "test")
+                self._listeners.append(listener)
+                self._nursery.start(self._listen(bus, listener), f"listener on {bus}")
 
-    async def _listen(self, bus: str, ear: CanConnection) -> None:
+    async def _listen(self, bus: str, listener: CanConnection) -> None:
         try:
             while True:
-                self.log.on_frame(bus, await ear.recv())
+                self.log.on_frame(bus, await listener.recv())
         except ConnectionLost:
             await asyncio.Event().wait()  # the bus is closed, but the test may continue
 
@@ -69,8 +69,8 @@ class WorkerBench:
         if self.plc is not None:
             await self.plc.aclose()
         await self._nursery.__aexit__(None, None, None)
-        for ear in self._ears:
-            await ear.aclose()
+        for listener in self._listeners:
+            await listener.aclose()
         await self.field.aclose()
         shutil.rmtree(self._folder, ignore_errors=True)
 

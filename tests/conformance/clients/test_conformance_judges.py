@@ -64,7 +64,7 @@ def _good() -> list[Event]:
         ([ValuePublished(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
         ([ValuePublished(_at(0.5), Word.OTHER, "0")], "published 0, which no correct answer contained, 0"),
         ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
-        ([Ended(_at(0.7), 3)], "the master ended, exit code 3, 0.70 s"),
+        ([Ended(_at(0.7), 3)], "the client ended, exit code 3, 0.70 s"),
         ([RequestSeen(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
         ([ObservedConnection(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
     ],
@@ -81,7 +81,7 @@ def test_a_good_client_passes_and_earlier_traffic_does_not_count() -> None:
     assert judges.rejects(_seen(before, *_good())).verdict is Verdict.PASSED
 
 
-def test_a_master_that_is_silent_afterwards_is_wedged() -> None:
+def test_a_client_that_is_silent_afterwards_is_wedged() -> None:
     finding = judges.survives(_seen(*_good()[:2]))
     assert finding.verdict is Verdict.FAILED
     assert "no request for 4.0 s" in finding.reason
@@ -160,7 +160,7 @@ def test_every_case_describes_itself(cases: tuple[object, ...]) -> None:
     assert len({about.id for about in abouts}) == len(abouts)
     for about in abouts:
         assert all((about.title, about.clause, about.does, about.must)), about.id
-        assert about.role == "master"
+        assert about.role == "client"
 
 
 NOT_OF_MASTERS = {
@@ -179,7 +179,7 @@ def test_every_row_of_the_list_has_a_case_or_does_not_concern_clients(
     assert played | set(NOT_OF_MASTERS[prefix]) == set(range(1, rows + 1))
 
 
-def test_a_master_that_gives_the_connection_up_needs_no_quarantine() -> None:
+def test_a_client_that_gives_the_connection_up_needs_no_quarantine() -> None:
     events: list[Event] = [
         RequestSeen(_at(0), 1, READ),
         Left(_at(0.2), 1),

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from masters_in_memory import Publish, judge
-from test_strange_masters_judged import CANOPEN, run_check
+from clients_in_memory import Publish, judge
+from test_third_party_clients_judged import CANOPEN, run_check
 
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe
 from fieldtwin.conformance.core.observation import Word
@@ -66,7 +66,7 @@ def _poller(
 
 
 @pytest.mark.parametrize(
-    ("master", "verdict", "says"),
+    ("client", "verdict", "says"),
     [
         (_poller(0.05, 0.21), Verdict.PASSED, ""),
         (_poller(0.05, 0.25), Verdict.INCONCLUSIVE, "it backs off"),
@@ -76,9 +76,9 @@ def _poller(
     ],
 )
 def test_a_client_that_backs_off_does_not_count_as_waiting_for_silence(
-    master: Callable[..., object], verdict: Verdict, says: str
+    client: Callable[..., object], verdict: Verdict, says: str
 ) -> None:
-    result = judge(master, LINE, "MB-021")["MB-021"]  # type: ignore[arg-type]
+    result = judge(client, LINE, "MB-021")["MB-021"]  # type: ignore[arg-type]
     assert (result.verdict, says in result.reason) == (verdict, True), result.reason
 
 
@@ -88,7 +88,7 @@ def test_without_the_timeout_a_wait_after_an_exception_is_inconclusive() -> None
 
 
 @pytest.mark.parametrize("pause_s", [0.002, 0.005, 0.020, 0.030, 0.100, 0.300])
-def test_a_master_that_gives_up_at_another_units_reply_fails_whatever_its_pause(pause_s: float) -> None:
+def test_a_client_that_gives_up_at_another_units_reply_fails_whatever_its_pause(pause_s: float) -> None:
     result = judge(_poller(pause_s, flushes=True), LINE, "MB-015b")["MB-015b"]  # type: ignore[arg-type]
     assert result.verdict is Verdict.FAILED, result.reason
 

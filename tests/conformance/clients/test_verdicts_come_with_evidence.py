@@ -15,7 +15,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
-from test_strange_masters_judged import CANOPEN, environment
+from test_third_party_clients_judged import CANOPEN, environment
 
 from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
 from fieldtwin.conformance.core.evidence import reproduce
@@ -43,7 +43,7 @@ def _run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -> None:
-    (tmp_path / "master.py").write_text(TAKES_ALL)
+    (tmp_path / "client.py").write_text(TAKES_ALL)
     words = [
         "check",
         "modbus-client",
@@ -57,11 +57,11 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
         "14,56a",
     ]
     words += ["--junit", "j.xml", "--html", "r.html", "-o", "r.json", "--log", "w.jsonl", "--json"]
-    done = _run([*words, "--", sys.executable, "master.py", "--only", "mine"], tmp_path)
+    done = _run([*words, "--", sys.executable, "client.py", "--only", "mine"], tmp_path)
     assert done.returncode == 1, done.stderr
     document = json.loads(done.stdout)
     assert json.loads((tmp_path / "r.json").read_text()) == document
-    assert (document["kind"], document["version"]) == ("fieldtwin check-master", 1)
+    assert (document["kind"], document["version"]) == ("fieldtwin check-client", 1)
     about = document["about"]
     assert (about["protocol"], about["endpoint"], about["at_most"]) == ("modbus", "tcp://127.0.0.1:0", "disrupt")
     assert about["command"].startswith("fieldtwin check modbus-client")
@@ -70,9 +70,9 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     case = results["MB-056a"]
     assert case["verdict"] == "failed", case
     device = [line["data"] for line in case["wire"] if line["by"] == "device"]
-    master = [line["data"] for line in case["wire"] if line["by"] == "master"]
+    client = [line["data"] for line in case["wire"] if line["by"] == "client"]
     poisoned = next(data for data in device if data.endswith("0d 05"))
-    assert any(data.endswith("00 00 00 06 01 03 00 00 00 01") for data in master)
+    assert any(data.endswith("00 00 00 06 01 03 00 00 00 01") for data in client)
     assert any(line["text"] == "published 3333 (poison)" for line in case["wire"])
     failure = next(
         f
@@ -112,7 +112,7 @@ def test_the_reproduce_line_names_the_case_before_the_program(argv: str, line: s
 
 
 def test_canopens_aborts_are_decoded_in_the_evidence(tmp_path: Path) -> None:
-    (tmp_path / "master.py").write_text(CANOPEN)
+    (tmp_path / "client.py").write_text(CANOPEN)
     words = [
         "check",
         "canopen-master",
@@ -123,7 +123,7 @@ def test_canopens_aborts_are_decoded_in_the_evidence(tmp_path: Path) -> None:
         "--probe",
         "output",
     ]
-    done = _run([*words, "--only", "1", "--json", "--", sys.executable, "master.py"], tmp_path)
+    done = _run([*words, "--only", "1", "--json", "--", sys.executable, "client.py"], tmp_path)
     (case,) = json.loads(done.stdout)["cases"]
     texts = [line["text"] for line in case["wire"] if line["data"].startswith("605#80")]
     assert texts, case
@@ -165,9 +165,9 @@ while True:
 def test_a_port_that_the_case_releases_is_not_a_connection_of_the_client(tmp_path: Path) -> None:
     """Defect: the evidence said that the client opened a connection, but the reason said that the client sent nothing
     any more."""
-    (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)
+    (tmp_path / "client.py").write_text(GIVES_UP_ITS_PORT)
     words = ["check", "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
-    words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "master.py"]
+    words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "client.py"]
     (result,) = json.loads(_run(words, tmp_path).stdout)["cases"]
     assert (result["verdict"], "it has stopped" in result["reason"]) == ("failed", True), result
     assert [(line["by"], line["text"]) for line in result["wire"] if line["text"]] == [

@@ -84,7 +84,7 @@ def test_results_as_json_and_junit(tmp_path: Path) -> None:
     assert json.loads(json.dumps(first))["impact"] == "read"
     assert (first["verdict"], second["verdict"]) == ("failed", "skipped")
     write_junit(
-        as_report(results, "master", ["check", "modbus-client"], "2027-01-01T00:00:00+00:00"), tmp_path / "j.xml"
+        as_report(results, "client", ["check", "modbus-client"], "2027-01-01T00:00:00+00:00"), tmp_path / "j.xml"
     )
     suite = ET.parse(tmp_path / "j.xml").getroot().find("testsuite")
     assert suite is not None
@@ -95,6 +95,6 @@ def test_results_as_json_and_junit(tmp_path: Path) -> None:
     assert "--only MB-015a" in (failure.text or "")
     about = {p.get("name"): p.get("value") for p in suite.findall("testcase[1]/properties/property")}
     assert about == {
-        "case": "MB-015a", "role": "master", "impact": "read", "requirement": "MB-015",
+        "case": "MB-015a", "role": "client", "impact": "read", "requirement": "MB-015",
         "basis": "standard", "clause": "SL 2.4.1; libmodbus PR #860",
     }  # fmt: skip

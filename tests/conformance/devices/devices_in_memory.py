@@ -65,8 +65,8 @@ def on_modbus(
                 if serve is not None:
                     nursery.start(serve(end), "device")
                     return await use(net, url, clock)
-                slave = AsciiServer(units) if endpoint.scheme == "ascii" else RtuServer(units)
-                nursery.start(serve_rtu(end, slave, clock), "device")
+                server = AsciiServer(units) if endpoint.scheme == "ascii" else RtuServer(units)
+                nursery.start(serve_rtu(end, server, clock), "device")
                 return await use(net, url, clock)
             if endpoint.scheme == "udp":
                 datagrams = await net.datagrams(endpoint)

@@ -33,7 +33,7 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.protocols.modbus.frames.crc import crc16, with_crc
-from fieldtwin.reports.conformance.client import render_master_html
+from fieldtwin.reports.conformance.client import render_client_html
 from fieldtwin.reports.conformance.device import render_html
 from fieldtwin.reports.conformance.page import overall
 from fieldtwin.reports.junit import render_junit
@@ -110,7 +110,7 @@ def test_only_a_required_case_is_red_and_gives_exit_code_1() -> None:
     assert exit_code([good, robust], robust_counts) == 1
     assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check", robust_counts)) == "failed"
     assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check")) == "passed"
-    assert _headline(render_master_html([good, robust], "x", ["check"], "2027-01-01", robust_counts)) == "failed"
+    assert _headline(render_client_html([good, robust], "x", ["check"], "2027-01-01", robust_counts)) == "failed"
     junit = render_junit(as_report(SUBJECT, [good, field, deviation], "fieldtwin check"))
     assert b'failures="1"' in junit
     assert b"field problem finding: answers twice" in junit

@@ -26,10 +26,10 @@ def test_scenario(path: Path) -> None:
 
 SLAVES, MASTERS, BRIDGE, PORTS, BUS = range(5)
 WHERE = {
-    SLAVES: ("what devices do", ("vectors/modbus_slave.toml", "vectors/canopen_slave.toml")),
+    SLAVES: ("what devices do", ("vectors/modbus_server.toml", "vectors/canopen_slave.toml")),
     MASTERS: (
         "what a master can do and no system asks of it: broadcasts, block transfers, LSS",
-        ("vectors/modbus_master_rows.toml", "vectors/canopen_master.toml"),
+        ("vectors/modbus_client_rows.toml", "vectors/canopen_master.toml"),
     ),
     BRIDGE: ("clients of the bridge, which a scenario has none of", ("wires", "system", "vectors/modbus_gateway.toml")),
     PORTS: ("real ports and sockets, which virtual time has none of", ("wires", "gateway", "emulators")),

@@ -254,8 +254,8 @@ def test_datagrams() -> None:
             {"name": "duplicate", "every": 2},
         )
         device = FaultyDatagrams(await OsPorts().datagrams(Endpoint.parse("udp://127.0.0.1:0")), faults)
-        slave = MbapServer({1: ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))})
-        serving = asyncio.create_task(serve_udp(device, slave, WallClock()))
+        server = MbapServer({1: ModbusUnit(MapBank([CellSpan("holding", 0, 1)]))})
+        serving = asyncio.create_task(serve_udp(device, server, WallClock()))
         heard: asyncio.Queue[bytes] = asyncio.Queue()
 
         class Asking(asyncio.DatagramProtocol):

@@ -16,7 +16,7 @@ import pytest
 
 TESTS = Path(__file__).parents[2]
 CASES = [f"MB-{number:03}" for number in range(1, 71)]
-MUTATIONS = ("modbus_master", "modbus_slave", "modbus_gateway", "gateway_bridge")
+MUTATIONS = ("modbus_client", "modbus_server", "modbus_gateway", "gateway_bridge")
 WIRES_ONLY = {58, 59, 60, 61, 62, 63, 65, 66, 67, 28}
 """Gateways with several clients, connection limits, ports: named tests, not rows of bytes."""
 NO_GARBAGE = {
@@ -31,9 +31,9 @@ def toml(name: str) -> Any:
     return tomllib.loads((TESTS / f"{name}.toml").read_text())
 
 
-SLAVE: list[dict[str, Any]] = toml("vectors/modbus_slave")["vector"]
-MASTER: list[dict[str, Any]] = toml("vectors/modbus_master_rows")["row"]
-REPLIES: list[dict[str, Any]] = toml("vectors/modbus_master")["vector"]
+SERVER: list[dict[str, Any]] = toml("vectors/modbus_server")["vector"]
+CLIENT: list[dict[str, Any]] = toml("vectors/modbus_client_rows")["row"]
+REPLIES: list[dict[str, Any]] = toml("vectors/modbus_client")["vector"]
 GATEWAY: list[dict[str, Any]] = toml("vectors/modbus_gateway")["row"]
 
 
@@ -44,7 +44,7 @@ def named_tests() -> set[str]:
 
 
 NAMED = named_tests()
-ROWS = {row["id"][:6] for row in SLAVE} | {row["case"] for row in MASTER} | {row["case"] for row in GATEWAY}
+ROWS = {row["id"][:6] for row in SERVER} | {row["case"] for row in CLIENT} | {row["case"] for row in GATEWAY}
 
 
 def test_rows_name_cases() -> None:
@@ -67,14 +67,14 @@ def test_each_case_has_a_mutation(case: str) -> None:
 def test_each_row_of_bytes_runs_in_three_ways() -> None:
     """All rows run whole. At least one row of each case runs byte by byte and with trailing garbage."""
     bytewise, garbage = defaultdict[str, bool](bool), defaultdict[str, bool](bool)
-    for row in SLAVE:
+    for row in SERVER:
         bytewise[row["id"][:6]] |= not row.get("whole_only", False)
         garbage[row["id"][:6]] |= row.get("tail", True) and not row.get("closed", False)
     assert [case for case, played in bytewise.items() if not played] == ["MB-053"]  # one byte is always valid
     assert all(garbage.values())
     bytewise.clear()
     garbage.clear()
-    for row in MASTER:
+    for row in CLIENT:
         bytewise[row["case"]] |= row.get("bytewise", True)
         garbage[row["case"]] |= any(ask.get("tail", True) and bool(ask.get("arrives")) for ask in row["ask"])
     assert all(bytewise.values())
@@ -85,10 +85,10 @@ def test_mutations_name_rows_that_there_are() -> None:
     """A renamed row would leave its mutation without a test."""
     ways = ("whole", "bytewise", "garbage")
     there = {
-        "tests/emulators/modbus/test_slave_vectors.py": {row["id"] for row in SLAVE},
+        "tests/emulators/modbus/test_server_vectors.py": {row["id"] for row in SERVER},
         "tests/gateway/modbus/test_modbus_vectors.py": {row["id"] for row in REPLIES},
-        "tests/gateway/modbus/test_modbus_master_rows.py": {
-            f"{r['case']} {r['title']}-{way}" for r in MASTER for way in ways
+        "tests/gateway/modbus/test_modbus_client_rows.py": {
+            f"{r['case']} {r['title']}-{way}" for r in CLIENT for way in ways
         },
         "tests/gateway/runtime/test_gateway_rows.py": {
             f"{r['case']} {r['title']}-{way}" for r in GATEWAY for way in ways

@@ -1,7 +1,7 @@
 """100 MB of garbage through every Modbus receiver: it stores a frame or two, and receives a request after the garbage.
 
 This covers garbage that each receiver discards fast enough for a default run; slower kinds, one MB each, are in
-test_slave_flood.py and in test_modbus_properties.py, where the client's framers get their 100 MB.
+test_server_flood.py and in test_modbus_properties.py, where the client's framers get their 100 MB.
 """
 
 from __future__ import annotations
@@ -55,29 +55,29 @@ def flood(feed: Callable[[bytes, int], object], kept: Callable[[], int], kind: s
 
 
 @pytest.mark.parametrize("kind", ["zeros", "ones"])
-def test_an_rtu_slave(kind: str) -> None:
-    slave = RtuServer(units())
-    now_ns = flood(slave.feed, lambda: slave.pending, kind)
-    assert slave.counters.noise_bytes >= CHUNKS * CHUNK - 600
-    slave.feed(b"", now_ns + NS_PER_S)
-    assert len(slave.feed(READ_FRAME, now_ns + 2 * NS_PER_S)) == 1
+def test_an_rtu_server(kind: str) -> None:
+    server = RtuServer(units())
+    now_ns = flood(server.feed, lambda: server.pending, kind)
+    assert server.counters.noise_bytes >= CHUNKS * CHUNK - 600
+    server.feed(b"", now_ns + NS_PER_S)
+    assert len(server.feed(READ_FRAME, now_ns + 2 * NS_PER_S)) == 1
 
 
 @pytest.mark.parametrize("kind", ["zeros", "random"])
-def test_an_ascii_slave(kind: str) -> None:
-    slave = AsciiServer(units())
-    now_ns = flood(slave.feed, lambda: slave.pending, kind)
-    assert len(slave.feed(b":010300000001FB\r\n", now_ns + 2 * NS_PER_S)) == 1
+def test_an_ascii_server(kind: str) -> None:
+    server = AsciiServer(units())
+    now_ns = flood(server.feed, lambda: server.pending, kind)
+    assert len(server.feed(b":010300000001FB\r\n", now_ns + 2 * NS_PER_S)) == 1
 
 
 @pytest.mark.parametrize("kind", sorted(GARBAGE))
-def test_a_tcp_slave(kind: str) -> None:
-    slave = MbapServer(units())
+def test_a_tcp_server(kind: str) -> None:
+    server = MbapServer(units())
     chunks = 4 if kind == "zeros" else CHUNKS  # ADUs of length 0, one in six bytes, each dropped separately
-    flood(slave.feed, lambda: slave.pending, kind, chunks)
-    assert slave.requests == 0
-    assert (slave.desync is None) == (kind in ("zeros", "another protocol"))
-    answered = slave.feed(READ_ADU, 2 * NS_PER_S)
+    flood(server.feed, lambda: server.pending, kind, chunks)
+    assert server.requests == 0
+    assert (server.desync is None) == (kind in ("zeros", "another protocol"))
+    answered = server.feed(READ_ADU, 2 * NS_PER_S)
     assert len(answered) == (1 if kind == "another protocol" else 0) or kind == "zeros"
 
 

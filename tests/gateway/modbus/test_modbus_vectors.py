@@ -1,4 +1,4 @@
-"""The wire vectors of tests/vectors/modbus_master.toml against the pure transaction: whole, byte by byte, with garbage."""
+"""The wire vectors of tests/vectors/modbus_client.toml against the pure transaction: whole, byte by byte, with garbage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fieldtwin.gateway.protocols.modbus.requests import diagnostics, files, iden
 from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
-VECTORS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_master.toml").read_text())["vector"]
+VECTORS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_client.toml").read_text())["vector"]
 TIMEOUT_NS = 1_000_000_000
 BYTE_NS = 573_000
 

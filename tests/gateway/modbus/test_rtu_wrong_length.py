@@ -40,13 +40,13 @@ def make_unit() -> ModbusUnit:
 def test_the_answer_is_exception_03_as_on_tcp(hexadecimal: str, piece: int) -> None:
     pdu = bytes.fromhex(hexadecimal)
     unit = make_unit()
-    slave = RtuServer({7: unit})
+    server = RtuServer({7: unit})
     frame = with_crc(b"\x07" + pdu)
-    replies = [reply for at in range(0, len(frame), piece) for reply in slave.feed(frame[at : at + piece], 1000 + at)]
-    replies += slave.feed(b"", 2000 + FRAME_GAP_NS)
+    replies = [reply for at in range(0, len(frame), piece) for reply in server.feed(frame[at : at + piece], 1000 + at)]
+    replies += server.feed(b"", 2000 + FRAME_GAP_NS)
     assert replies == [with_crc(bytes((7, pdu[0] | 0x80, 0x03)))]
     assert not any(unit.bank.read("holding", 0, 10, 0))
-    assert slave.counters.crc_errors == 0
+    assert server.counters.crc_errors == 0
     adu = (len(pdu) + 1).to_bytes(2)
     on_tcp = MbapServer({7: make_unit()}).feed(b"\0\1\0\0" + adu + b"\x07" + pdu, 0)
     assert b"".join(on_tcp)[7:] == bytes((pdu[0] | 0x80, 0x03))
@@ -54,25 +54,25 @@ def test_the_answer_is_exception_03_as_on_tcp(hexadecimal: str, piece: int) -> N
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)
 def test_a_request_to_another_unit_of_a_wrong_length_gets_silence(hexadecimal: str) -> None:
-    slave = RtuServer({7: make_unit()})
-    assert slave.feed(with_crc(b"\x08" + bytes.fromhex(hexadecimal)), 0) == []
-    assert slave.feed(b"", FRAME_GAP_NS) == []
+    server = RtuServer({7: make_unit()})
+    assert server.feed(with_crc(b"\x08" + bytes.fromhex(hexadecimal)), 0) == []
+    assert server.feed(b"", FRAME_GAP_NS) == []
 
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)
 def test_a_good_request_after_it_is_answered(hexadecimal: str) -> None:
-    slave = RtuServer({7: make_unit()})
-    slave.feed(with_crc(b"\x07" + bytes.fromhex(hexadecimal)), 0)
-    replies = slave.feed(with_crc(bytes.fromhex("07 03 0000 0001")), FRAME_GAP_NS)
+    server = RtuServer({7: make_unit()})
+    server.feed(with_crc(b"\x07" + bytes.fromhex(hexadecimal)), 0)
+    replies = server.feed(with_crc(bytes.fromhex("07 03 0000 0001")), FRAME_GAP_NS)
     assert replies[-1] == with_crc(bytes.fromhex("07 03 02 0000"))
 
 
 @given(st.binary(max_size=300), st.integers(1, 64))
 def test_noise_is_answered_only_if_its_check_sum_is_right(data: bytes, piece: int) -> None:
     """An invalid frame is never answered, however it is divided."""
-    slave = RtuServer({7: make_unit()})
-    heard = [e for at in range(0, len(data), piece) for e in slave.receive(data[at : at + piece], at)]
-    heard += slave.receive(b"", 1000 + FRAME_GAP_NS)
+    server = RtuServer({7: make_unit()})
+    heard = [e for at in range(0, len(data), piece) for e in server.receive(data[at : at + piece], at)]
+    heard += server.receive(b"", 1000 + FRAME_GAP_NS)
     assert all(with_crc(e.heard[:-2]) == e.heard for e in heard)
 
 

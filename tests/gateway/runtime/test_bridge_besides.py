@@ -96,7 +96,7 @@ async def reverse(
         audit.close()
 
 
-def test_a_master_on_a_line_reaches_units_on_tcp(tmp_path: Path) -> None:
+def test_a_client_on_a_line_reaches_units_on_tcp(tmp_path: Path) -> None:
     async def main() -> None:
         async with reverse(tmp_path, 0.0) as (client, bridge, _):
             assert (await client.read_registers(7, "holding", 1, 2)).registers == (301, 302)
@@ -108,7 +108,7 @@ def test_a_master_on_a_line_reaches_units_on_tcp(tmp_path: Path) -> None:
     run(main())
 
 
-def test_mb_012_an_answer_that_comes_after_the_master_went_on_is_never_sent(tmp_path: Path) -> None:
+def test_mb_012_an_answer_that_comes_after_the_client_went_on_is_never_sent(tmp_path: Path) -> None:
     async def main() -> None:
         async with reverse(tmp_path, 0.2) as (client, bridge, _):
             with pytest.raises(ReplyTimeout):

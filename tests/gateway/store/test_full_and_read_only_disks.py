@@ -18,7 +18,7 @@ from pathlib import Path
 from sqlite3 import connect
 
 import pytest
-from postgres_here import cluster
+from local_postgres import cluster
 
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from postgres_here import server
+from local_postgres import server
 from support import run
 
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mosquitto_here import broker
+from local_mosquitto import broker
 from support import eventually, run
 from test_thread_carriers import modems, until_equal, virtually
 from test_thread_mqtt import edge, host

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from mosquitto_here import Mosquitto, broker
+from local_mosquitto import Mosquitto, broker
 from support import eventually, run
 from thread_rig import SCHEMA, ShakyCarrier, Twin, equal, value
 

@@ -68,7 +68,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction,
 
 
 SILENT = _bad("MB-000", "no reply", ROBUST, "", line_plays.nothing, "is silent")
-"""Not a listed case: it measures the master's timeout."""
+"""Not a listed case: it measures the client's timeout."""
 
 CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", REQUIRED, "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),
@@ -186,7 +186,7 @@ CASES: tuple[ModbusCase, ...] = (
     _case("MB-068", "wrong baud rate or parity", ROBUST, OWN, CUT, line_plays.garbage, judges.survives,
           "answers with what a wrong baud rate makes of a reply", "go on, without a flood of requests").on(framings=RTU,
           strikes=3),
-    _case("MB-069", "two masters on one line", FIELD, "pymodbus #432", CUT, line_plays.collision, judges.rejects,
+    _case("MB-069", "two clients on one line", FIELD, "pymodbus #432", CUT, line_plays.collision, judges.rejects,
           "overlays the reply with another frame", "never take it as data").on(framings=RTU),
     _bad("MB-070a", "ASCII: a bad LRC", REQUIRED, "SL 2.5.2.2", line_plays.bad_lrc, "sends a wrong LRC").on(framings=ASCII),
     _good("MB-070b", "ASCII: a second colon", REQUIRED, "SL 2.5.2.1", line_plays.second_colon,

@@ -1,6 +1,6 @@
 """The correct Modbus device underneath the hostile one: every address exists, every function of the standard works.
 
-All registers and bits hold one word, so that every value that a master reads and publishes is known; it reads back the
+All registers and bits hold one word, so that every value that a client reads and publishes is known; it reads back the
 values that it wrote.
 """
 

@@ -185,7 +185,7 @@ class _Client:
                 left -= 1
                 self._stage.pending -= 1
         except ConnectionLost:
-            pass  # the master hung up before it was answered
+            pass  # the client hung up before it was answered
         finally:
             self._stage.pending -= left
             self._stage.on_event()

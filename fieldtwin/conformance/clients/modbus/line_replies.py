@@ -87,7 +87,7 @@ def other_unit(scene: RequestContext) -> list[Move]:
 
 
 def other_unit_first(scene: RequestContext) -> list[Move]:
-    """Reply after another unit's reply, with a changing delay, so that no pause of the master hides its reaction."""
+    """Reply after another unit's reply, with a changing delay, so that no pause of the client hides its reaction."""
     after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
     return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), after_s)]
 

@@ -1,4 +1,4 @@
-"""The virtual port that a master under test opens. A case can unplug it, restore it under its name, and hold it."""
+"""The virtual port that a client under test opens. A case can unplug it, restore it under its name, and hold it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PtyLine:
         return frozenset({"port"} if os.geteuid() == 0 else {"port", "lock"})
 
     async def run(self) -> None:
-        """Serve the master; when the port is unplugged, do as the move says, and continue to serve."""
+        """Serve the client; when the port is unplugged, do as the move says, and continue to serve."""
         plugged_in_again = False
         while True:
             await self._stage.serve(self._port, plugged_in_again=plugged_in_again)
@@ -66,7 +66,7 @@ class PtyLine:
         await self._port.aclose()
 
     def _unplug(self, move: Unplug) -> None:
-        """Stop serving the master; `run` notices it."""
+        """Stop serving the client; `run` notices it."""
         self._stage.pending += 1
         self._unplugged = move
         self._closing = asyncio.get_running_loop().create_task(self._port.aclose(), name="unplugging")

@@ -51,7 +51,7 @@ class RequestContext:
     """One request that is to be misanswered.
 
     `request` is unit id and PDU, `tag` its transaction id. `true` is the honest response PDU, `false` one of the same shape with
-    the poisoned word. `nth` counts the requests of the case from 0. `timeout_s` is the master's response timeout, or the best
+    the poisoned word. `nth` counts the requests of the case from 0. `timeout_s` is the client's response timeout, or the best
     guess. `first` is the case's first scene, None in it.
     """
 

@@ -130,7 +130,7 @@ def _neighbours(wire: DeviceConnection) -> list[int]:
 
 
 async def other_unit(wire: DeviceConnection) -> Finding:
-    """MB-029: requests to other units. Three that answer alike are one device that answers for all."""
+    """MB-029: requests to other units. Three units that give the same answer are one device."""
     said = []
     for unit in _neighbours(wire):
         heard = await wire.ask(wire.good, unit, due=False)
@@ -141,7 +141,7 @@ async def other_unit(wire: DeviceConnection) -> Finding:
     pdus = {heard.first.pdu if heard.first else heard.rest for _, heard in said}
     units = ", ".join(str(unit) for unit, _ in said)
     if len(pdus) == 1:
-        return failed(f"answers for units {units} alike: {said[0][1]}")
+        return failed(f"units {units} give the same answer: {said[0][1]}")
     raise Unsaid(f"units {units} answer, each differently: there are other units on this line")
 
 
@@ -189,7 +189,7 @@ async def wrong_baud_rate(wire: DeviceConnection) -> Finding:
     return await silent_then_good(wire, await wire.hear())
 
 
-async def two_masters(wire: DeviceConnection) -> Finding:
+async def two_clients(wire: DeviceConnection) -> Finding:
     """MB-069: send two overlapping requests, combined bit by bit."""
     one, other = wire.frame(wire.good), framed("rtu", wire.unit, read_of(0x04, 0x1234, 9))
     if wire.framing == "ascii":

@@ -251,7 +251,7 @@ def test_mb_047_counters_of_the_unit() -> None:
     assert ask(unit, "08 00 14 00 00") == "08 00 14 00 00"
     assert ask(unit, "08 00 0A 00 00") == "08 00 0A 00 00"
     assert [counter(sub) for sub in (0x0B, 0x0C, 0x0D, 0x0F)] == [0, 0, 0, 0]
-    assert unit.counters.exceptions == 1, "the evidence is not the master's to clear"
+    assert unit.counters.exceptions == 1, "a client cannot clear the evidence"
     unit.counters.bus_messages += 0x10000
     assert counter(0x0B) == 0, "16 bits, wrapping"
 

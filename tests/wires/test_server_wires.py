@@ -111,11 +111,11 @@ class UdpClient:
 @contextlib.asynccontextmanager
 async def udp_server(unit: ModbusUnit, **options: float) -> AsyncIterator[tuple[UdpEnd, MbapServer, UdpClient]]:
     end = await UdpEnd.open(ANY_UDP)
-    slave = MbapServer({1: unit})
-    task = asyncio.create_task(serve_udp(end, slave, WallClock(), **options))
+    server = MbapServer({1: unit})
+    task = asyncio.create_task(serve_udp(end, server, WallClock(), **options))
     client = UdpClient()
     try:
-        yield end, slave, client
+        yield end, server, client
     finally:
         client.socket.close()
         await end.aclose()
@@ -166,14 +166,14 @@ def test_one_device_on_every_wire_at_once(tmp_path: Path, pki: Pki) -> None:
 def test_udp_each_datagram_for_itself() -> None:
     async def main() -> None:
         unit = make_unit()
-        async with udp_server(unit) as (end, slave, client):
+        async with udp_server(unit) as (end, server, client):
             # truncated, length FFFFh, not Modbus, empty: none of them damages the next one, or is joined to it
             answer = await client.ask(
                 end.bound, READ[:5], READ[:4] + b"\xff\xff" + READ[6:], b"GET / HTTP/1.1", b"", READ
             )
             assert answer == REPLY
             assert unit.counters.requests == 1
-            assert slave.discarded == 3
+            assert server.discarded == 3
             two = await client.ask(end.bound, READ + WRITE + READ[:3])
             assert two == REPLY
             assert await client.ask(end.bound) == WRITE, "a reply a datagram"

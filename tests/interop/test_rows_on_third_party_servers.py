@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import Any
 
 import pytest
-from slave_rows import PEERS, VECTORS, asked_of, load_rows, play_on
+from server_rows import PEERS, VECTORS, asked_of, load_rows, play_on
 
 pytestmark = [pytest.mark.interop, pytest.mark.timeout(120)]
 KNOWN: dict[str, Any] = tomllib.loads((VECTORS / "known_failures.toml").read_text())

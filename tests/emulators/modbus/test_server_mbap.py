@@ -22,7 +22,7 @@ READ = "03 0000 0002"
 VALUES = "03 04 00AA 00BB"
 
 
-def make_slave(*unit_ids: int, max_in_flight: int = 16) -> MbapServer:
+def make_server(*unit_ids: int, max_in_flight: int = 16) -> MbapServer:
     units = {}
     for unit_id in unit_ids or (1,):
         bank = MapBank([CellSpan("holding", 0, 125)])
@@ -57,13 +57,13 @@ ROWS = [
 
 @pytest.mark.parametrize(("heard", "expected"), ROWS)
 def test_whole_bytewise_and_with_a_tail(heard: bytes, expected: list[bytes]) -> None:
-    assert make_slave().feed(heard, 0) == expected
-    slave = make_slave()
-    assert [r for i in range(len(heard)) for r in slave.feed(heard[i : i + 1], i)] == expected, "MB-051"
-    slave = make_slave()
-    assert slave.feed(heard + OURS[:7], 0) == expected
-    assert slave.feed(OURS[7:], 0) == [ANSWER]
-    one, other = make_slave(), make_slave()
+    assert make_server().feed(heard, 0) == expected
+    server = make_server()
+    assert [r for i in range(len(heard)) for r in server.feed(heard[i : i + 1], i)] == expected, "MB-051"
+    server = make_server()
+    assert server.feed(heard + OURS[:7], 0) == expected
+    assert server.feed(OURS[7:], 0) == [ANSWER]
+    one, other = make_server(), make_server()
     assert one.answer(heard + OURS[:7], 0) + one.answer(OURS[7:], 0) == b"".join([*expected, ANSWER])
     assert other.answer(heard, 0) + other.answer(OURS, 0) == b"".join([*expected, ANSWER])
     assert one.requests == other.requests
@@ -71,42 +71,42 @@ def test_whole_bytewise_and_with_a_tail(heard: bytes, expected: list[bytes]) -> 
 
 
 def test_mb_053_more_at_once_than_allowed() -> None:
-    slave = make_slave(max_in_flight=2)
+    server = make_server(max_in_flight=2)
     writes = [adu(i, 1, f"06 0005 000{i}") for i in range(4)]
-    assert slave.feed(b"".join(writes), 0) == [writes[0], writes[1], adu(2, 1, "86 06"), adu(3, 1, "86 06")]
-    assert slave.units[1].bank.read("holding", 5, 1, 0) == [1], "a refused write was executed"
-    assert slave.feed(writes[3], 0) == [writes[3]]
-    counters = slave.units[1].counters
+    assert server.feed(b"".join(writes), 0) == [writes[0], writes[1], adu(2, 1, "86 06"), adu(3, 1, "86 06")]
+    assert server.units[1].bank.read("holding", 5, 1, 0) == [1], "a refused write was executed"
+    assert server.feed(writes[3], 0) == [writes[3]]
+    counters = server.units[1].counters
     assert (counters.requests, counters.replies, counters.busy) == (5, 5, 2)
 
 
 @pytest.mark.parametrize("length", [0xFFFF, 255, 0x8000])
 def test_mb_055_a_length_that_cannot_be(length: int) -> None:
-    slave = make_slave()
-    assert slave.feed(OURS + adu(7, 1, READ, length=length) + OURS, 0) == [ANSWER]
-    assert slave.desync is not None
-    assert "2 to 254" in str(slave.desync)
-    assert slave.feed(OURS, 0) == [], "nothing after it can be trusted"
-    assert slave.answer(OURS, 0) == b""
+    server = make_server()
+    assert server.feed(OURS + adu(7, 1, READ, length=length) + OURS, 0) == [ANSWER]
+    assert server.desync is not None
+    assert "2 to 254" in str(server.desync)
+    assert server.feed(OURS, 0) == [], "nothing after it can be trusted"
+    assert server.answer(OURS, 0) == b""
 
 
 def test_mb_054_and_055_are_counted() -> None:
-    slave = make_slave()
-    slave.feed(adu(7, 1, READ, protocol=1) + b"\x00\x07\x00\x00\x00\x00\x00\x07\x00\x00\x00\x01\x01" + OURS, 0)
-    assert (slave.discarded, slave.requests) == (3, 1)
+    server = make_server()
+    server.feed(adu(7, 1, READ, protocol=1) + b"\x00\x07\x00\x00\x00\x00\x00\x07\x00\x00\x00\x01\x01" + OURS, 0)
+    assert (server.discarded, server.requests) == (3, 1)
 
 
 def test_mb_057_several_units_behind_one_address() -> None:
-    slave = make_slave(1, 2)
-    assert slave.feed(adu(5, 2, READ), 0) == [adu(5, 2, VALUES)]
-    assert slave.feed(adu(5, 0, READ), 0) == [adu(5, 0, "83 0A")], "0 names nobody in particular there"
-    assert slave.units[1].counters.requests == 0
+    server = make_server(1, 2)
+    assert server.feed(adu(5, 2, READ), 0) == [adu(5, 2, VALUES)]
+    assert server.feed(adu(5, 0, READ), 0) == [adu(5, 0, "83 0A")], "0 names nobody in particular there"
+    assert server.units[1].counters.requests == 0
     with pytest.raises(UsageError, match="0 to 255"):
-        make_slave(256)
+        make_server(256)
 
 
 def test_two_connections_one_unit() -> None:
-    one = make_slave()
+    one = make_server()
     two = MbapServer(one.units)
     one.feed(OURS[:9], 0)
     assert two.feed(OURS, 0) == [ANSWER]
@@ -116,11 +116,11 @@ def test_two_connections_one_unit() -> None:
 
 @given(st.lists(st.binary(max_size=300), max_size=8))
 def test_garbage_never_raises_and_stays_bounded(chunks: list[bytes]) -> None:
-    slave = make_slave()
+    server = make_server()
     for chunk in chunks:
-        for reply in slave.feed(chunk, 0):
+        for reply in server.feed(chunk, 0):
             assert len(reply) == 6 + int.from_bytes(reply[4:6], "big")
-        assert slave.pending < 260
+        assert server.pending < 260
 
 
 @given(
@@ -135,13 +135,13 @@ def test_garbage_never_raises_and_stays_bounded(chunks: list[bytes]) -> None:
     st.data(),
 )
 def test_the_cut_does_not_matter(adus: list[bytes], data: st.DataObject) -> None:
-    slave = make_slave()
+    server = make_server()
     stream = b"".join(adus)
     replies: list[bytes] = []
     at = 0
     while at < len(stream):
         size = data.draw(st.integers(1, 300))
-        replies += slave.feed(stream[at : at + size], 0)
+        replies += server.feed(stream[at : at + size], 0)
         at += size
     assert replies == [ANSWER] * adus.count(OURS)
-    assert slave.pending == 0
+    assert server.pending == 0

@@ -6,7 +6,7 @@ import asyncio
 from functools import partial
 
 import pytest
-from masters_in_memory import (
+from clients_in_memory import (
     PERIOD_S,
     TIMEOUT_S,
     Publish,
@@ -88,7 +88,7 @@ async def _write(client: ModbusClient) -> None:
         await client.write_register(17, 7, 42)
 
 
-def test_a_prompt_master_with_several_requests_takes_part_in_the_rest() -> None:
+def test_a_prompt_client_with_several_requests_takes_part_in_the_rest() -> None:
     results = judge(_prompt, LINE, "MB-012", "MB-013", "MB-019", "MB-021", "MB-024")
     found = {id: (r.verdict, r.reason) for id, r in results.items()}
     assert found["MB-012"][0] is Verdict.PASSED, found

@@ -1,6 +1,6 @@
 """The rows of the list of Modbus edge cases that concern the client, each on the whole client.
 
-A row of tests/vectors/modbus_master_rows.toml has bytes and times in, bytes and times out, and the resulting state. It runs
+A row of tests/vectors/modbus_client_rows.toml has bytes and times in, bytes and times out, and the resulting state. It runs
 whole, byte by byte and with trailing garbage, in virtual time, so times are exact.
 """
 
@@ -23,7 +23,7 @@ from fieldtwin.gateway.protocols.modbus.requests import diagnostics, files, iden
 from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
-ROWS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_master_rows.toml").read_text())["row"]
+ROWS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_client_rows.toml").read_text())["row"]
 MS = 1_000_000
 TOLERANCE_NS = 1_000
 

@@ -16,21 +16,21 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from masters_in_memory import judge, ours
-from test_strange_masters_judged import environment
+from clients_in_memory import judge, ours
+from test_third_party_clients_judged import environment
 
 from fieldtwin.cli.test.check_view import listed, print_results, style_of, why
-from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_MASTERS
-from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_MASTERS
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CLIENTS
+from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_CLIENTS
 from fieldtwin.conformance.clients.results import as_json, as_report
 from fieldtwin.conformance.core.case import OTHER_WIRE, OWN, About, Basis, failed, passed, skipped
 from fieldtwin.conformance.core.results import CaseResult, exit_code
 from fieldtwin.conformance.devices.canopen import cases as canopen_devices
 from fieldtwin.conformance.devices.modbus import cases as modbus_devices
-from fieldtwin.reports.conformance.client import render_master_html
+from fieldtwin.reports.conformance.client import render_client_html
 from fieldtwin.reports.junit import render_junit
 
-MASTERS: dict[str, About] = {case.about.id: case.about for case in (*MODBUS_MASTERS, *CANOPEN_MASTERS)}
+CLIENTS: dict[str, About] = {case.about.id: case.about for case in (*MODBUS_CLIENTS, *CANOPEN_CLIENTS)}
 DEVICES: tuple[About, ...] = (*modbus_devices.CASES, *canopen_devices.CASES)
 CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")
 """A source that begins with a clause of a Modbus document or of CiA 301."""
@@ -38,7 +38,7 @@ REPORT = re.compile(r"(?:^|; )[\w-]+(?: PR)? #\d+")
 """A source that names a report of a different project."""
 
 
-@pytest.mark.parametrize("case", [*MASTERS.values(), *DEVICES], ids=lambda case: f"{case.role}-{case.id}")
+@pytest.mark.parametrize("case", [*CLIENTS.values(), *DEVICES], ids=lambda case: f"{case.role}-{case.id}")
 def test_every_case_has_a_basis_and_a_source_that_fits_it(case: About) -> None:
     for basis, source in [(case.basis, case.clause), *((e.basis, e.clause) for e in case.elsewhere)]:
         if basis is Basis.STANDARD:
@@ -69,11 +69,11 @@ def test_a_result_has_the_basis_and_the_clause_of_its_wire(
         assert (case.basis, case.clause, case.elsewhere) == (*expected, ())
 
 
-def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None:
-    good = CaseResult(MASTERS["MB-002"], passed())
-    robust = CaseResult(MASTERS["MB-021"], failed("waits out its timeout"))
-    field = CaseResult(MASTERS["MB-008"], failed("the value came only later"))
-    deviation = CaseResult(MASTERS["MB-011"], failed("published 3333"))
+def test_only_a_required_case_of_a_client_is_red_and_gives_exit_code_1() -> None:
+    good = CaseResult(CLIENTS["MB-002"], passed())
+    robust = CaseResult(CLIENTS["MB-021"], failed("waits out its timeout"))
+    field = CaseResult(CLIENTS["MB-008"], failed("the value came only later"))
+    deviation = CaseResult(CLIENTS["MB-011"], failed("published 3333"))
     assert exit_code([good, robust, field]) == 0
     assert exit_code([good, robust, field], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 1
     assert exit_code([good, field], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 0
@@ -81,17 +81,17 @@ def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None
     assert exit_code([good, deviation]) == 1
     assert "red" in style_of(deviation)
     assert "red" not in style_of(robust) + style_of(field)
-    page = render_master_html([good, robust, field], "master on x", ["check"], "2027-01-01T00:00:00+00:00")
+    page = render_client_html([good, robust, field], "client on x", ["check"], "2027-01-01T00:00:00+00:00")
     assert '<span class="pill inconclusive">! robustness</span>' in page
     assert '<span class="pill inconclusive">! field problem</span>' in page
     assert '"pill failed' not in page
     assert "robustness: the standard does not require it" in page
     assert "SL: MODBUS over Serial Line V1.02" in page
-    can = render_master_html(
-        [CaseResult(MASTERS["CO-001"], passed())], "master on x", ["check"], "2027-01-01T00:00:00+00:00"
+    can = render_client_html(
+        [CaseResult(CLIENTS["CO-001"], passed())], "client on x", ["check"], "2027-01-01T00:00:00+00:00"
     )
     assert "A number alone is a clause of CiA 301 v4.2.0" in can
-    page = render_master_html([good, robust, deviation], "master on x", ["check"], "2027-01-01T00:00:00+00:00")
+    page = render_client_html([good, robust, deviation], "client on x", ["check"], "2027-01-01T00:00:00+00:00")
     assert "required by the standard" in page
     assert page.index("MB-011") < page.index("MB-021"), "deviations come first"
     junit = render_junit(as_report([good, robust, deviation], "x", ["check"], "2027-01-01T00:00:00+00:00"))
@@ -103,7 +103,7 @@ def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None
 
 
 def test_the_list_of_cases_has_the_basis_on_each_wire() -> None:
-    case = listed(MASTERS["MB-015a"])
+    case = listed(CLIENTS["MB-015a"])
     assert case["basis"] == "standard"
     assert case["elsewhere"] == [{"wire": "TCP", "basis": "robustness", "clause": "TG 4.4.1.3; libmodbus PR #860"}]
 
@@ -119,16 +119,16 @@ def test_the_list_of_cases_has_the_basis_on_each_wire() -> None:
     ],
 )
 def test_a_failure_names_the_clause_that_requires_it_or_its_kind(id: str, said: str) -> None:
-    assert why(CaseResult(MASTERS[id], failed("seen"))) == said
+    assert why(CaseResult(CLIENTS[id], failed("seen"))) == said
 
 
 def test_the_printed_results_name_clauses_and_omit_cases_for_other_wires(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     results = [
-        CaseResult(MASTERS["MB-016"], failed("published 3333")),
-        CaseResult(MASTERS["MB-021"], failed("waits")),
-        CaseResult(MASTERS["MB-070a"], skipped(OTHER_WIRE)),
+        CaseResult(CLIENTS["MB-016"], failed("published 3333")),
+        CaseResult(CLIENTS["MB-021"], failed("waits")),
+        CaseResult(CLIENTS["MB-070a"], skipped(OTHER_WIRE)),
     ]
     print_results(results)
     printed = capsys.readouterr()
@@ -163,11 +163,11 @@ while True:
 
 
 def _check(folder: Path, fail_on: tuple[str, ...], *more: str) -> subprocess.CompletedProcess[str]:
-    (folder / "master.py").write_text(TAKES_ANY_UNIT)
+    (folder / "client.py").write_text(TAKES_ANY_UNIT)
     words = ["check", "modbus-client", "--listen", "tcp://127.0.0.1:0", "--timeout", "1s", "--probe", "output"]
     argv = [sys.executable, "-m", "fieldtwin", *words, "--only", "15a,56a", *fail_on, *more]
     return subprocess.run(
-        [*argv, "--", sys.executable, "master.py"],
+        [*argv, "--", sys.executable, "client.py"],
         capture_output=True, text=True, timeout=120, env=environment(), cwd=folder, check=False,
     )  # fmt: skip
 

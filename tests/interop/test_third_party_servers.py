@@ -129,7 +129,7 @@ async def ask(client: ModbusClient) -> None:
 
 
 @pytest.mark.parametrize(("name", "wire"), SPOKEN)
-def test_a_strange_slave_is_read_and_written(name: str, wire: str, tmp_path: Path) -> None:
+def test_a_third_party_server_is_read_and_written(name: str, wire: str, tmp_path: Path) -> None:
     there = find_library("modbus") if name == "libmodbus" else importlib.util.find_spec(name)
     if there is None:
         pytest.skip(f"{name} is not installed")

@@ -1,4 +1,4 @@
-"""The wire vectors of tests/vectors/modbus_slave.toml against the pure servers: whole, byte by byte, with trailing garbage."""
+"""The wire vectors of tests/vectors/modbus_server.toml against the pure servers: whole, byte by byte, with trailing garbage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
-VECTORS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_slave.toml").read_text())["vector"]
+VECTORS = tomllib.loads((Path(__file__).parents[2] / "vectors" / "modbus_server.toml").read_text())["vector"]
 LINE = SerialSettings(19200, "8E1")
 BYTE_NS = 572_917
 LONG_PAUSE_NS = 2_000 * NS_PER_MS
@@ -58,13 +58,13 @@ class Rig:
         self.vector = vector
         self.wire = vector.get("wire", "rtu")
         self.units = {n: make_unit(vector.get("even_only", False)) for n in vector.get("units", [1])}
-        self.slave: LineServer | MbapServer
+        self.server: LineServer | MbapServer
         if self.wire in ("mbap", "udp"):
-            self.slave = MbapServer(self.units, vector.get("max_in_flight", 16))
+            self.server = MbapServer(self.units, vector.get("max_in_flight", 16))
         elif self.wire == "ascii":
-            self.slave = AsciiServer(self.units)
+            self.server = AsciiServer(self.units)
         else:
-            self.slave = RtuServer(self.units, strict=LINE if self.wire == "rtu-strict" else None)
+            self.server = RtuServer(self.units, strict=LINE if self.wire == "rtu-strict" else None)
 
     def bytes_of(self, text: str) -> bytes:
         return text.encode() if self.wire == "ascii" else bytes.fromhex(text)
@@ -72,14 +72,14 @@ class Rig:
     def feed(self, data: bytes, now_ns: int, piece: int) -> list[bytes]:
         """Feed `data`, whose last byte arrives at `now_ns`, in pieces of `piece` bytes."""
         if self.wire == "udp":
-            assert isinstance(self.slave, MbapServer)
-            return [exchange.reply for exchange in self.slave.receive_datagram(data, now_ns) if exchange.reply]
+            assert isinstance(self.server, MbapServer)
+            return [exchange.reply for exchange in self.server.receive_datagram(data, now_ns) if exchange.reply]
         if not data:
-            return self.slave.feed(b"", now_ns)
+            return self.server.feed(b"", now_ns)
         said = []
         for end in range(len(data) % piece or piece, len(data) + 1, piece):
             at_ns = now_ns - (len(data) - end) * BYTE_NS
-            said += self.slave.feed(data[max(0, end - piece) : end], at_ns)
+            said += self.server.feed(data[max(0, end - piece) : end], at_ns)
         return said
 
     def play(self, piece: int, tail: bytes = b"") -> int:
@@ -107,7 +107,7 @@ class Rig:
         for name, value in self.vector.get("counters", {}).items():
             assert getattr(self.units[1].counters, name) == value, name
         for name, value in self.vector.get("line", {}).items():
-            assert getattr(self.slave.counters, name) == value, name  # type: ignore[union-attr]
+            assert getattr(self.server.counters, name) == value, name  # type: ignore[union-attr]
 
     def check_alive(self, now_ns: int) -> None:
         """After any input, a request after a pause is answered; on a closed connection nothing is."""
@@ -117,11 +117,11 @@ class Rig:
         }
         request, length = requests.get(self.wire.replace("udp", "mbap"), (bytes.fromhex("01 01 0000 0001 FDCA"), 6))
         said = self.feed(request, now_ns + LONG_PAUSE_NS, len(request))
-        said += self.slave.feed(b"", now_ns + 2 * LONG_PAUSE_NS)
+        said += self.server.feed(b"", now_ns + 2 * LONG_PAUSE_NS)
         if self.vector.get("closed"):
             assert said == []
-            assert isinstance(self.slave, MbapServer)
-            assert self.slave.desync is not None
+            assert isinstance(self.server, MbapServer)
+            assert self.server.desync is not None
         else:
             assert [len(reply) for reply in said] == [length], "the wire is wedged"
 
@@ -176,7 +176,7 @@ def test_with_half_an_adu_after_it(vector: dict[str, Any]) -> None:
         assert rig.feed(following[cut:], now_ns, 1000) == [bytes.fromhex("0099 0000 0004 01 01 01 00")]
 
 
-def test_every_row_for_slaves_has_a_vector() -> None:
+def test_every_row_for_servers_has_a_vector() -> None:
     """Rows 10, 64 and 65 are about sockets and ports: tests/wires."""
     rows = {int(vector["id"][3:6]) for vector in VECTORS}
     wanted = {1, 4, 5, 7, 8, 9, 26, 27, *range(29, 58), 68, 69, 70}

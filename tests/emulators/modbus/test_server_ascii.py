@@ -34,26 +34,26 @@ def make_units(*unit_ids: int) -> dict[int, ModbusUnit]:
 
 def test_a_frame_of_the_standard_s_kind() -> None:
     assert READ == b":010300000002FA\r\n"
-    slave = AsciiServer(make_units())
-    (exchange,) = slave.receive(READ, 0)
+    server = AsciiServer(make_units())
+    (exchange,) = server.receive(READ, 0)
     assert (exchange.heard, exchange.reply) == (READ, READ_REPLY)
 
 
 def test_the_delimiter_can_be_changed() -> None:
-    slave = AsciiServer(make_units())
+    server = AsciiServer(make_units())
     change = framed("01 08 0003 3B00")
-    assert slave.feed(change, 0) == [change], "answered as it was asked"
-    assert slave.feed(READ[:-1] + b";", 1) == [READ_REPLY[:-1] + b";"]
-    assert slave.feed(READ, 2) == [], "LF ends nothing any more"
-    assert slave.feed(READ[:-1] + b";", 3) == [READ_REPLY[:-1] + b";"]
+    assert server.feed(change, 0) == [change], "answered as it was asked"
+    assert server.feed(READ[:-1] + b";", 1) == [READ_REPLY[:-1] + b";"]
+    assert server.feed(READ, 2) == [], "LF ends nothing any more"
+    assert server.feed(READ[:-1] + b";", 3) == [READ_REPLY[:-1] + b";"]
 
 
 def test_every_unit_of_a_line_counts_damaged_frames() -> None:
-    slave = AsciiServer(make_units(1, 2))
-    slave.feed(READ[:-4] + b"00\r\n" + READ, 0)
-    assert [u.counters.bus_errors for u in slave.units.values()] == [1, 1]
-    assert [u.counters.bus_messages for u in slave.units.values()] == [1, 2], "a reply is its neighbour's message"
-    assert (slave.counters.frames, slave.counters.crc_errors, slave.counters.noise_bytes) == (1, 1, 17)
+    server = AsciiServer(make_units(1, 2))
+    server.feed(READ[:-4] + b"00\r\n" + READ, 0)
+    assert [u.counters.bus_errors for u in server.units.values()] == [1, 1]
+    assert [u.counters.bus_messages for u in server.units.values()] == [1, 2], "a reply is its neighbour's message"
+    assert (server.counters.frames, server.counters.crc_errors, server.counters.noise_bytes) == (1, 1, 17)
 
 
 CHUNKS = st.lists(
@@ -67,14 +67,14 @@ CHUNKS = st.lists(
 
 @given(CHUNKS)
 def test_garbage_never_raises_and_a_frame_after_it_is_answered(chunks: list[tuple[bytes, int]]) -> None:
-    slave = AsciiServer(make_units())
+    server = AsciiServer(make_units())
     now_ns = 0
     for data, wait_ns in chunks:
-        slave.feed(data, now_ns)
-        assert slave.pending < MAX_CHARACTERS
+        server.feed(data, now_ns)
+        assert server.pending < MAX_CHARACTERS
         now_ns += wait_ns
-    slave.feed(b"\r\n", now_ns)
-    assert slave.feed(READ, now_ns) == [READ_REPLY], "a colon begins a frame, whatever was before"
+    server.feed(b"\r\n", now_ns)
+    assert server.feed(READ, now_ns) == [READ_REPLY], "a colon begins a frame, whatever was before"
 
 
 @given(CHUNKS, st.integers(1, 50))
@@ -103,19 +103,19 @@ RTU_READ = bytes.fromhex("01 03 0000 0002 C40B")
 
 class StrictLine:
     def __init__(self) -> None:
-        self.slave = RtuServer(make_units(), strict=LINE)
+        self.server = RtuServer(make_units(), strict=LINE)
         self.now_ns = 0
         self.replies: list[bytes] = []
 
     def chars(self, data: bytes) -> StrictLine:
         for i in range(len(data)):
             self.now_ns += CHAR_NS
-            self.replies += self.slave.feed(data[i : i + 1], self.now_ns)
+            self.replies += self.server.feed(data[i : i + 1], self.now_ns)
         return self
 
     def pause(self, chars: float) -> StrictLine:
         self.now_ns += round(chars * CHAR_NS)
-        self.replies += self.slave.feed(b"", self.now_ns)
+        self.replies += self.server.feed(b"", self.now_ns)
         return self
 
 
@@ -124,13 +124,13 @@ def test_mb_005_strict_a_pause_over_t1_5_spoils_the_frame() -> None:
     assert len(StrictLine().chars(RTU_READ[:4]).pause(1.4).chars(RTU_READ[4:]).pause(3.6).replies) == 1
     line = StrictLine().chars(RTU_READ[:4]).pause(1.6).chars(RTU_READ[4:]).pause(3.6)
     assert line.replies == []
-    assert line.slave.counters.crc_errors == 1
+    assert line.server.counters.crc_errors == 1
     assert len(line.chars(RTU_READ).pause(3.6).replies) == 1
 
 
 def test_mb_007_strict_two_frames_need_t3_5_between_them() -> None:
     line = StrictLine().chars(RTU_READ + RTU_READ).pause(4)
-    assert (line.replies, line.slave.counters.noise_bytes) == ([], 16)
+    assert (line.replies, line.server.counters.noise_bytes) == ([], 16)
     assert len(line.chars(RTU_READ).pause(3.6).chars(RTU_READ).pause(3.6).replies) == 2
     assert len(line.chars(RTU_READ).replies) == 2, "not before the pause"
 
@@ -139,8 +139,8 @@ def test_mb_007_strict_two_frames_need_t3_5_between_them() -> None:
 def test_strict_frames_of_a_wrong_length(length: int) -> None:
     line = StrictLine()
     line.now_ns += length * CHAR_NS
-    assert line.slave.feed(bytes(length), line.now_ns) == []
-    assert line.slave.pending == length
+    assert line.server.feed(bytes(length), line.now_ns) == []
+    assert line.server.pending == length
     line.pause(4)
-    assert line.slave.counters.noise_bytes == length
+    assert line.server.counters.noise_bytes == length
     assert len(line.chars(RTU_READ).pause(3.6).replies) == 1

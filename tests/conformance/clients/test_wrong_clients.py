@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 import pytest
-from masters_in_memory import LAZY_S, Publish, judge, judge_canopen
+from clients_in_memory import LAZY_S, Publish, judge, judge_canopen
 
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.rtu.receiver import crc16, with_crc
@@ -53,7 +53,7 @@ async def _answer(line: ByteConnection) -> bytes:
         return got
 
 
-def _master(take: Take, pause_s: float = LAZY_S) -> Callable[..., object]:
+def _client(take: Take, pause_s: float = LAZY_S) -> Callable[..., object]:
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
         line = await net.open_bytes(endpoint)
         while True:
@@ -78,16 +78,16 @@ def _master(take: Take, pause_s: float = LAZY_S) -> Callable[..., object]:
         (_checks_crc_only, "MB-013", "published 3333"),
     ],
 )
-def test_a_master_that_believes_too_much_or_too_little_fails(take: Take, case: str, says: str) -> None:
+def test_a_client_that_believes_too_much_or_too_little_fails(take: Take, case: str, says: str) -> None:
     pause_s = 0.0 if case == "MB-013" else LAZY_S
-    result = judge(_master(take, pause_s), "rtu:/line?baudrate=19200", case)[case]  # type: ignore[arg-type]
+    result = judge(_client(take, pause_s), "rtu:/line?baudrate=19200", case)[case]  # type: ignore[arg-type]
     assert result.verdict is Verdict.FAILED, result.reason
     assert says in result.reason
 
 
 def test_a_late_reply_is_only_a_failure_if_the_timeout_is_known() -> None:
-    master = _master(_checks_crc_only, 0.0)
-    result = judge(master, "rtu:/line?baudrate=19200", "MB-013", timeout_s=0.0)["MB-013"]  # type: ignore[arg-type]
+    client = _client(_checks_crc_only, 0.0)
+    result = judge(client, "rtu:/line?baudrate=19200", "MB-013", timeout_s=0.0)["MB-013"]  # type: ignore[arg-type]
     assert result.verdict is Verdict.INCONCLUSIVE
     assert "say --timeout" in result.reason
 
@@ -123,7 +123,7 @@ async def _floods(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publi
             await asyncio.sleep(LAZY_S)
 
 
-def test_a_master_that_asks_a_busy_device_at_once_does_not_back_off() -> None:
+def test_a_client_that_asks_a_busy_device_at_once_does_not_back_off() -> None:
     result = judge(_floods, "rtu:/line?baudrate=19200", "MB-024")["MB-024"]
     assert result.verdict is Verdict.FAILED
     assert "does not back off" in result.reason
@@ -215,7 +215,7 @@ def _sdo(
 
 
 @pytest.mark.parametrize(
-    ("master", "case", "verdict", "says"),
+    ("client", "case", "verdict", "says"),
     [
         (_sdo(whole_s=TIMEOUT_S), "CO-022", Verdict.FAILED, "were not accepted"),
         (_sdo(stale=True), "CO-024", Verdict.FAILED, "asked again 0.0"),
@@ -233,9 +233,9 @@ def _sdo(
     ],
 )
 def test_one_mistake_of_an_sdo_client_is_one_failure(
-    master: Callable[..., object], case: str, verdict: Verdict, says: str
+    client: Callable[..., object], case: str, verdict: Verdict, says: str
 ) -> None:
-    result = judge_canopen(master, case)[case]  # type: ignore[arg-type]
+    result = judge_canopen(client, case)[case]  # type: ignore[arg-type]
     assert result.verdict is verdict, result.reason
     assert says in result.reason
 
@@ -270,15 +270,15 @@ TO_ALL = bytes((0, 6, 0, 1, 0, 1))
 
 
 @pytest.mark.parametrize(
-    ("master", "case", "says"),
+    ("client", "case", "says"),
     [
         (_tcp(b""), "MB-064c", "was not published"),
         (_tcp(b"", closes=False), "MB-065b", "connections at once"),
         (_tcp(TO_ALL, again=True), "MB-028", "it waited for an answer"),
     ],
 )
-def test_a_master_that_handles_connections_badly_fails(master: Callable[..., object], case: str, says: str) -> None:
-    result = judge(master, "tcp://127.0.0.1:0", case)[case]  # type: ignore[arg-type]
+def test_a_client_that_handles_connections_badly_fails(client: Callable[..., object], case: str, says: str) -> None:
+    result = judge(client, "tcp://127.0.0.1:0", case)[case]  # type: ignore[arg-type]
     assert result.verdict is Verdict.FAILED, result.reason
     assert says in result.reason
 
@@ -313,8 +313,8 @@ def _in_ascii(*, checks: bool, newest: bool) -> Callable[..., object]:
     ("checks", "newest", "case", "says"),
     [(False, True, "MB-070a", "published 3333"), (True, False, "MB-070b", "were not accepted")],
 )
-def test_a_master_that_reads_ascii_badly_fails(checks: bool, newest: bool, case: str, says: str) -> None:
-    master = _in_ascii(checks=checks, newest=newest)
-    result = judge(master, "ascii:/line?baudrate=19200&frame=7E1", case)[case]  # type: ignore[arg-type]
+def test_a_client_that_reads_ascii_badly_fails(checks: bool, newest: bool, case: str, says: str) -> None:
+    client = _in_ascii(checks=checks, newest=newest)
+    result = judge(client, "ascii:/line?baudrate=19200&frame=7E1", case)[case]  # type: ignore[arg-type]
     assert result.verdict is Verdict.FAILED, result.reason
     assert says in result.reason

@@ -1,4 +1,4 @@
-"""Run the rows of tests/vectors/modbus_slave.toml on third-party servers, over real ptys and sockets, all at the same
+"""Run the rows of tests/vectors/modbus_server.toml on third-party servers, over real ptys and sockets, all at the same
 time.
 
 Only behaviour visible to a client is tested: bytes, pauses, readable cells, and whether the wire is still usable
@@ -41,7 +41,7 @@ Row = dict[str, Any]
 
 
 def load_rows() -> list[Row]:
-    rows: list[Row] = tomllib.loads((VECTORS / "modbus_slave.toml").read_text())["vector"]
+    rows: list[Row] = tomllib.loads((VECTORS / "modbus_server.toml").read_text())["vector"]
     return rows
 
 

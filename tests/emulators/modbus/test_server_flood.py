@@ -70,51 +70,51 @@ def garbage(kind: str) -> Iterator[bytes]:
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "colons", "halves"])
 @pytest.mark.parametrize("kind", ["rtu", "ascii", "strict"])
 def test_a_line(kind: str, flood: str) -> None:
-    slave, request = make_line(kind)
+    server, request = make_line(kind)
     now_ns, heard = NS_PER_S, 0
     with bounded_memory():
         for chunk in garbage(flood):
             now_ns += len(chunk) * 100_000
-            slave.feed(chunk, now_ns)
+            server.feed(chunk, now_ns)
             heard += len(chunk)
-            assert kind == "strict" or slave.pending < 600
+            assert kind == "strict" or server.pending < 600
     now_ns += 3 * NS_PER_S
-    slave.feed(b"", now_ns)
-    assert slave.counters.noise_bytes >= heard - 600 * slave.counters.frames, "what is dropped is counted"
+    server.feed(b"", now_ns)
+    assert server.counters.noise_bytes >= heard - 600 * server.counters.frames, "what is dropped is counted"
     now_ns += 20_000_000
-    replies = slave.feed(request, now_ns)
-    replies += slave.feed(b"", now_ns + 3 * NS_PER_S)
+    replies = server.feed(request, now_ns)
+    replies += server.feed(b"", now_ns + 3 * NS_PER_S)
     assert len(replies) == 1
 
 
 def test_a_line_byte_by_byte() -> None:
     """The receiver tries every byte of a flood, but must not try all of them again with each."""
-    slave, request = make_line("rtu")
+    server, request = make_line("rtu")
     data = next(garbage("random"))
     for i in range(len(data)):
-        slave.feed(data[i : i + 1], NS_PER_S + i * 1000)
-    assert slave.counters.crc_errors <= 1, "one run of noise"
-    assert len(slave.feed(request, 2 * NS_PER_S)) == 1
+        server.feed(data[i : i + 1], NS_PER_S + i * 1000)
+    assert server.counters.crc_errors <= 1, "one run of noise"
+    assert len(server.feed(request, 2 * NS_PER_S)) == 1
 
 
 def test_a_request_in_the_middle_of_a_flood_is_found() -> None:
-    slave, request = make_line("rtu")
+    server, request = make_line("rtu")
     data = next(garbage("random"))
-    replies = slave.feed(data + request + data, NS_PER_S)
+    replies = server.feed(data + request + data, NS_PER_S)
     assert len(replies) == 1
-    assert slave.units[1].counters.requests == 1
+    assert server.units[1].counters.requests == 1
 
 
 @pytest.mark.timeout(60 + MEGABYTES)
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "protocol 1"])
 def test_a_stream(flood: str) -> None:
     """Zeros are ADUs of length 0, each dropped separately; the others are invalid at once."""
-    slave = MbapServer(make_units())
+    server = MbapServer(make_units())
     heard = bytes.fromhex("0001 0001 0006 01 03 0000 0001") * (CHUNK // 12)
     with bounded_memory():
         for chunk in garbage(flood):
-            slave.feed(heard if flood == "protocol 1" else chunk, NS_PER_S)
-            assert slave.pending < 260
-    assert slave.requests == 0
-    assert (slave.desync is None) == (flood in ("zeros", "protocol 1"))
-    assert slave.discarded > 0
+            server.feed(heard if flood == "protocol 1" else chunk, NS_PER_S)
+            assert server.pending < 260
+    assert server.requests == 0
+    assert (server.desync is None) == (flood in ("zeros", "protocol 1"))
+    assert server.discarded > 0

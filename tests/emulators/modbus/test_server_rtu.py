@@ -32,7 +32,7 @@ READ = crc("01 03 0000 0002")
 READ_REPLY = crc("01 03 04 00AA 00BB")
 
 
-def make_slave(*unit_ids: int) -> RtuServer:
+def make_server(*unit_ids: int) -> RtuServer:
     units = {}
     for unit_id in unit_ids or (1,):
         bank = MapBank([CellSpan("holding", 0, 300), CellSpan("coil", 0, 64)])
@@ -44,14 +44,14 @@ def make_slave(*unit_ids: int) -> RtuServer:
 class Line:
     """Feed a server as a line would: time passes with every byte."""
 
-    def __init__(self, slave: RtuServer) -> None:
-        self.slave = slave
+    def __init__(self, server: RtuServer) -> None:
+        self.server = server
         self.now_ns = 1
         self.replies: list[bytes] = []
 
     def whole(self, data: bytes) -> Line:
         self.now_ns += len(data) * BYTE_NS
-        self.replies += self.slave.feed(data, self.now_ns)
+        self.replies += self.server.feed(data, self.now_ns)
         return self
 
     def bytewise(self, data: bytes) -> Line:
@@ -61,7 +61,7 @@ class Line:
 
     def pause(self, ns: int = PAUSE_NS) -> Line:
         self.now_ns += ns
-        self.replies += self.slave.feed(b"", self.now_ns)
+        self.replies += self.server.feed(b"", self.now_ns)
         return self
 
 
@@ -120,7 +120,7 @@ ROWS = [
 @pytest.mark.parametrize(("heard", "expected"), ROWS)
 @pytest.mark.parametrize("way", ["whole", "bytewise"])
 def test_line(heard: bytes, expected: list[bytes], way: str) -> None:
-    line = Line(make_slave())
+    line = Line(make_server())
     getattr(line, way)(heard)
     assert line.replies == expected
     line.pause().whole(READ)
@@ -130,66 +130,66 @@ def test_line(heard: bytes, expected: list[bytes], way: str) -> None:
 @pytest.mark.parametrize(("heard", "expected"), ROWS)
 @pytest.mark.parametrize("before", ["A5", "05 03 20 11", "01 10 0000 0064 C8 00", "010300"])
 def test_line_after_garbage_and_a_pause(heard: bytes, expected: list[bytes], before: str) -> None:
-    line = Line(make_slave()).whole(bytes.fromhex(before)).pause().whole(heard)
+    line = Line(make_server()).whole(bytes.fromhex(before)).pause().whole(heard)
     assert line.replies == expected
 
 
 def test_mb_001_is_counted_on_the_line_and_by_every_unit() -> None:
-    slave = make_slave(1, 2)
-    line = Line(slave).whole(READ[:-1] + b"\x00").pause()
-    assert (slave.counters.crc_errors, slave.counters.noise_bytes, slave.counters.frames) == (1, 8, 0)
+    server = make_server(1, 2)
+    line = Line(server).whole(READ[:-1] + b"\x00").pause()
+    assert (server.counters.crc_errors, server.counters.noise_bytes, server.counters.frames) == (1, 8, 0)
     line.whole(READ).pause()
-    assert [u.counters.bus_errors for u in slave.units.values()] == [1, 1]
-    assert slave.counters.crc_errors == 1
-    assert slave.units[1].counters.requests == 1
+    assert [u.counters.bus_errors for u in server.units.values()] == [1, 1]
+    assert server.counters.crc_errors == 1
+    assert server.units[1].counters.requests == 1
 
 
 @pytest.mark.parametrize("cut", range(1, 17))
 def test_mb_004_half_a_request_a_pause_a_full_request(cut: int) -> None:
     long_request = crc("01 10 0000 0004 08 0001 0002 0003 0004")
-    slave = make_slave()
-    line = Line(slave).whole(long_request[:cut])
+    server = make_server()
+    line = Line(server).whole(long_request[:cut])
     line.now_ns += PAUSE_NS  # the pause is only detected with the next byte
     line.whole(READ)
     assert line.replies == [READ_REPLY]
-    assert slave.units[1].bank.read("holding", 0, 1, 0) == [0xAA]
+    assert server.units[1].bank.read("holding", 0, 1, 0) == [0xAA]
 
 
 def test_mb_004_a_pause_too_short_to_be_seen_costs_no_more_than_the_gap() -> None:
     """Half a long request and a complete one without a pause: answered after the line pauses."""
-    line = Line(make_slave()).whole(crc("01 10 0000 0064 C8" + "00" * 200)[:40]).whole(READ)
+    line = Line(make_server()).whole(crc("01 10 0000 0064 C8" + "00" * 200)[:40]).whole(READ)
     assert line.replies == []
     assert line.pause().replies == [READ_REPLY]
 
 
 def test_a_frame_with_a_pause_longer_than_the_gap_is_dropped() -> None:
-    line = Line(make_slave()).whole(READ[:4]).pause().whole(READ[4:]).pause()
+    line = Line(make_server()).whole(READ[:4]).pause().whole(READ[4:]).pause()
     assert line.replies == []
-    assert line.slave.counters.noise_bytes == 8
+    assert line.server.counters.noise_bytes == 8
 
 
 def test_mb_006_a_frame_that_pauses_16_ms_is_one() -> None:
-    assert Line(make_slave()).whole(READ[:4]).pause(16 * NS_PER_MS).whole(READ[4:]).replies == [READ_REPLY]
+    assert Line(make_server()).whole(READ[:4]).pause(16 * NS_PER_MS).whole(READ[4:]).replies == [READ_REPLY]
 
 
 def test_mb_026_all_execute_and_none_answers() -> None:
-    slave = make_slave(1, 2, 247)
-    line = Line(slave).whole(crc("00 10 0005 0001 02 0009"))
+    server = make_server(1, 2, 247)
+    line = Line(server).whole(crc("00 10 0005 0001 02 0009"))
     assert line.replies == []
-    assert [u.bank.read("holding", 5, 1, 0) for u in slave.units.values()] == [[9]] * 3
-    assert [u.counters.broadcasts for u in slave.units.values()] == [1] * 3
+    assert [u.bank.read("holding", 5, 1, 0) for u in server.units.values()] == [[9]] * 3
+    assert [u.counters.broadcasts for u in server.units.values()] == [1] * 3
 
 
 def test_units_answer_for_themselves() -> None:
-    slave = make_slave(1, 7)
-    slave.units[7].bank.write("holding", 0, [0x77], 0)
-    line = Line(slave).whole(crc("07 03 0000 0001") + READ)
+    server = make_server(1, 7)
+    server.units[7].bank.write("holding", 0, [0x77], 0)
+    line = Line(server).whole(crc("07 03 0000 0001") + READ)
     assert line.replies == [crc("07 03 02 0077"), READ_REPLY]
 
 
 def test_mb_047_counters_are_true_to_the_wire() -> None:
-    slave = make_slave(1, 2)
-    line = Line(slave)
+    server = make_server(1, 2)
+    line = Line(server)
     for data in (READ, crc("05 03 0000 0001"), crc("05 03 02 0000"), READ[:-1] + b"\x00", crc("00 06 0001 0001")):
         line.whole(data).pause()
     line.replies.clear()
@@ -197,28 +197,28 @@ def test_mb_047_counters_are_true_to_the_wire() -> None:
     assert line.whole(crc("02 08 000B 0000")).replies == [crc("02 08 000B 0006")]
     assert line.whole(crc("02 08 000C 0000")).replies[1:] == [crc("02 08 000C 0001")]
     assert line.whole(crc("02 08 000F 0000")).replies[2:] == [crc("02 08 000F 0001")]
-    one = slave.units[1].counters
+    one = server.units[1].counters
     assert (one.requests, one.replies, one.broadcasts) == (1, 1, 1)
     # four messages before that were not its own reply, three requests to 2 and their replies, and this one
     assert line.whole(crc("01 08 000B 0000")).replies[3:] == [crc("01 08 000B 000B")]
 
 
 def test_mb_008_a_stray_byte_is_noise_and_no_damaged_frame() -> None:
-    slave = make_slave()
-    Line(slave).whole(b"\x00" + READ).pause().whole(b"\xff\xff\xff").pause().whole(READ)
-    assert (slave.counters.crc_errors, slave.counters.noise_bytes, slave.counters.frames) == (0, 4, 2)
+    server = make_server()
+    Line(server).whole(b"\x00" + READ).pause().whole(b"\xff\xff\xff").pause().whole(READ)
+    assert (server.counters.crc_errors, server.counters.noise_bytes, server.counters.frames) == (0, 4, 2)
 
 
 def test_mb_032_a_frame_of_unknown_length_between_others_is_not_noise() -> None:
-    slave = make_slave()
-    Line(slave).bytewise(crc("05 64 010203") + READ)
-    assert (slave.counters.noise_bytes, slave.counters.frames) == (0, 2)
+    server = make_server()
+    Line(server).bytewise(crc("05 64 010203") + READ)
+    assert (server.counters.noise_bytes, server.counters.frames) == (0, 2)
 
 
 def test_unit_ids_of_a_line() -> None:
     for unit_id in (0, 248, -1):
         with pytest.raises(UsageError, match="1 to 247"):
-            make_slave(unit_id)
+            make_server(unit_id)
 
 
 CHUNKS = st.lists(st.tuples(st.binary(max_size=40), st.integers(0, 80 * NS_PER_MS)), max_size=12)
@@ -228,11 +228,11 @@ CHUNKS = st.lists(st.tuples(st.binary(max_size=40), st.integers(0, 80 * NS_PER_M
 @example([(bytes.fromhex("01 10 0000 0064 C8"), 0)])
 @example([(b"\x01\x17" * 20, 49 * NS_PER_MS)])
 def test_garbage_never_raises_and_a_frame_after_a_pause_is_answered(chunks: list[tuple[bytes, int]]) -> None:
-    line = Line(make_slave(1, 16))
+    line = Line(make_server(1, 16))
     for data, wait_ns in chunks:
         line.whole(data)
         line.now_ns += wait_ns
-        assert line.slave.pending <= 256
+        assert line.server.pending <= 256
     line.now_ns += PAUSE_NS
     assert READ_REPLY in line.whole(READ).replies
 

@@ -68,7 +68,7 @@ def run_check(
     tmp_path: Path, *args: str, program: str, probe: str = "output"
 ) -> tuple[int, dict[str, tuple[str, str]], str]:
     """Return the exit code, (verdict, reason) by id, and the console output."""
-    script = tmp_path / "master.py"
+    script = tmp_path / "client.py"
     script.write_text(program)
     done = subprocess.run(
         [

@@ -45,7 +45,7 @@ def test_event_counter_counts_executed_requests() -> None:
     unit.execute_broadcast(bytes.fromhex("06 FFFF 0007"), 0)
     assert ask(unit, "0B") == "0B 00 00 00 03"
     ask(unit, "08 000A 0000")
-    assert ask(unit, "0B") == "0B 00 00 00 00", "cleared by the master"
+    assert ask(unit, "0B") == "0B 00 00 00 00", "cleared by the client"
     assert unit.counters.completed == 3, "the evidence is not"
 
 

@@ -12,7 +12,7 @@ from fieldtwin.conformance.clients.canopen.hostile_node import HostileNode
 from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
 from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, traits, wire_for
 from fieldtwin.conformance.clients.probe import Classifier
-from fieldtwin.conformance.clients.run import ClientPlan, MasterRun
+from fieldtwin.conformance.clients.run import ClientPlan, ClientRun
 from fieldtwin.conformance.core.observation import Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
@@ -31,7 +31,7 @@ TIMEOUT_S = 0.2
 LAZY_S = 0.3
 """Pause of the clients between two polls."""
 Publish = Callable[[str], None]
-Master = Callable[[MemoryNet, Endpoint, VirtualClock, Publish], Coroutine[object, object, None]]
+Client = Callable[[MemoryNet, Endpoint, VirtualClock, Publish], Coroutine[object, object, None]]
 
 
 class Told:
@@ -70,7 +70,7 @@ async def ours(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish:
 
 
 def judge(
-    master: Master, url: str, *only: str, timeout_s: float = TIMEOUT_S, probed: bool = True
+    client: Client, url: str, *only: str, timeout_s: float = TIMEOUT_S, probed: bool = True
 ) -> dict[str, CaseResult]:
     """Return the result by case id for a client that connects to `url` in memory."""
     loop = VirtualLoop()
@@ -80,7 +80,7 @@ def judge(
         clock = VirtualClock(loop)
         stage = HostileServer(wire_for(plant.scheme), WORDS, {})
         plan = ClientPlan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
-        run = MasterRun(stage, CASES, SILENT, plan, traits(plant.scheme), told if probed else None)
+        run = ClientRun(stage, CASES, SILENT, plan, traits(plant.scheme), told if probed else None)
         async with Nursery() as nursery:
             if plant.is_serial:
                 end, _ = await net.serial(Path(plant.path), plant, plant.serial)
@@ -88,7 +88,7 @@ def judge(
             else:
                 listener = await net.listen(plant, stage.serve, 8)
                 plant = listener.bound
-            nursery.start(master(net, plant, clock, told.publish), "master")
+            nursery.start(client(net, plant, clock, told.publish), "client")
             results = await run.run()
         if not plant.is_serial:
             await listener.aclose()
@@ -119,7 +119,7 @@ async def our_canopen(
 
         canopen = CanopenMaster(connection, clock, sdo_timeout_s=TIMEOUT_S, on_event=heard)
         canopen.add_node(5, heartbeat_consumer_ms=2500)
-        nursery.start(canopen.run(), "master")
+        nursery.start(canopen.run(), "client")
         while True:
             if not boots.empty():
                 boots.get_nowait()
@@ -135,7 +135,7 @@ async def our_canopen(
             await asyncio.sleep(PERIOD_S)
 
 
-def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> dict[str, CaseResult]:
+def judge_canopen(client: Client, *only: str, timeout_s: float = TIMEOUT_S) -> dict[str, CaseResult]:
     """Return the result by case id for an NMT master on a bus in memory."""
     loop = VirtualLoop()
 
@@ -144,10 +144,10 @@ def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> d
         bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=True)
         stage = HostileNode(WORDS, nodes=(5,))
         plan = ClientPlan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
-        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can", "heartbeat"}), told)
+        run = ClientRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can", "heartbeat"}), told)
         async with Nursery() as nursery:
             nursery.start(stage.serve(await bus.join("nodes")), "nodes")
-            nursery.start(master(net, bus.bound, clock, told.publish), "master")
+            nursery.start(client(net, bus.bound, clock, told.publish), "client")
             results = await run.run()
         await bus.aclose()
         return results

@@ -1,4 +1,4 @@
-"""Third-party clients in separate programs, each with the same conversation: ``strange_masters.py NAME WIRE WHERE``.
+"""Third-party clients in separate programs, each with the same conversation: ``third_party_clients.py NAME WIRE WHERE``.
 
 WIRE is ``rtu``, ``ascii`` or ``tcp``; WHERE is a serial port or a local TCP port. The program prints only the result of
 each step, as JSON. It uses none of our code.

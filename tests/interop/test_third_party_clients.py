@@ -32,7 +32,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = pytest.mark.interop
-PROGRAM = Path(__file__).with_name("strange_masters.py")
+PROGRAM = Path(__file__).with_name("third_party_clients.py")
 INPUTS = [i * 257 & 0xFFFF for i in range(125)]
 DISCRETE = [int(i % 3 == 0) for i in range(16)]
 FUNCTIONS = Counter({"4": 1, "2": 1, "6": 1, "16": 1, "3": 3, "5": 1, "15": 1, "1": 1})
@@ -93,17 +93,17 @@ async def converse(name: str, wire: str, unit: ModbusUnit, path: Path) -> tuple[
         finally:
             await listener.aclose()
     end = await PtyEnd.open(path / "line", Endpoint.parse("pty:line"))
-    slave = AsciiServer({1: unit}) if wire == "ascii" else RtuServer({1: unit})
+    server = AsciiServer({1: unit}) if wire == "ascii" else RtuServer({1: unit})
     try:
         async with Nursery() as nursery:
-            nursery.start(serve_rtu(end, slave, clock, 0.0, note), "unit")
+            nursery.start(serve_rtu(end, server, clock, 0.0, note), "unit")
             return await talk(name, wire, str(end.link)), captured
     finally:
         await end.aclose()
 
 
 @pytest.mark.parametrize(("name", "wire"), SPOKEN)
-def test_a_strange_master_reads_and_writes(name: str, wire: str, tmp_path: Path) -> None:
+def test_a_third_party_client_reads_and_writes(name: str, wire: str, tmp_path: Path) -> None:
     have(name)
     unit = make_unit()
     said, captured = run(converse(name, wire, unit, tmp_path))

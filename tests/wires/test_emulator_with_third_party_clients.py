@@ -106,7 +106,7 @@ async def served(kind: str, unit: ModbusUnit, directory: Path) -> AsyncIterator[
 
 @pytest.mark.interop
 @pytest.mark.parametrize("kind", ["ascii", "udp"])
-def test_pymodbus_as_a_master(kind: str, tmp_path: Path) -> None:
+def test_pymodbus_as_a_client(kind: str, tmp_path: Path) -> None:
     async def main() -> None:
         unit = make_unit()
         async with served(kind, unit, tmp_path) as where:
@@ -169,11 +169,11 @@ def test_fieldtwin_emulate_puts_one_device_on_every_wire(tmp_path: Path) -> None
 async def read_meter(endpoint: Endpoint, *, echo: bool) -> None:
     """Read a voltage, and a table that the meter lacks, with our driver's client and none of the emulator's code."""
     connection = await OsConnector().open_bytes(endpoint)
-    master = ModbusClient.at(endpoint, connection, WallClock(), echo=echo)
+    client = ModbusClient.at(endpoint, connection, WallClock(), echo=echo)
     try:
-        reply = await master.read_registers(1, "input", 0, 2)
+        reply = await client.read_registers(1, "input", 0, 2)
         assert 0x4340 <= reply.registers[0] <= 0x4380, f"{endpoint}: no float32 between 192 and 256: {reply}"
         with pytest.raises(ModbusExceptionReply):
-            await master.read_bits(1, "coil", 0, 1)
+            await client.read_bits(1, "coil", 0, 1)
     finally:
-        await master.aclose()
+        await client.aclose()

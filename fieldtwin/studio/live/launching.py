@@ -54,6 +54,11 @@ def _system_of(prototype: Path) -> Path:
     return prototype.with_name(prototype.name.removesuffix(".prototype.yaml") + ".yaml")
 
 
+def instance_name(system: Path) -> str:
+    """Return a valid name of an instance for a system file, whatever the file is called."""
+    return re.sub(r"[^A-Za-z0-9._-]", "-", system.stem).lstrip("._-")[:40] or "system"
+
+
 class Launcher:
     """The runs that Studio has started. ``async with Launcher() as launcher``: leaving stops them all."""
 
@@ -76,7 +81,7 @@ class Launcher:
         Raises `EndpointBusy` if the instance runs already, `UsageError` for too many runs, and `Unreachable` with the run's own
         message if it does not start.
         """
-        instance = instance or re.sub(r"[^A-Za-z0-9._-]", "-", Path(system).stem)[:40]
+        instance = instance or instance_name(Path(system))
         running = [name for name, run in self._runs.items() if not run.has_ended]
         if len(running) >= MOST_RUNS:
             raise UsageError("too many runs at once", expected=f"at most {MOST_RUNS}", got=", ".join(running))

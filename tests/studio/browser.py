@@ -48,7 +48,7 @@ class Window:
         return [e for e in found if e.is_displayed() and text in e.text]
 
     def text(self, css: str) -> str:
-        """Return the visible text of all elements that match, or "" while there is none."""
+        """Return the visible text of all elements that match. Without such an element the text is empty."""
         try:
             return "\n".join(e.text for e in self.elements(css))
         except StaleElementReferenceException:

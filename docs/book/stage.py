@@ -24,6 +24,7 @@ from explain_page import explain_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
 from league import league_page  # noqa: E402
 from paper_page import paper_page  # noqa: E402
+from studio_page import studio_page  # noqa: E402
 from troubleshooting_page import troubleshooting_page  # noqa: E402
 
 PAPERS = {  # file of the repository: page of the book
@@ -45,7 +46,7 @@ FOLDERS |= {f"docs/{kind}": f"{kind}/README.md" for kind in KINDS}
 GENERATED = (
     *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
     *("reference/explanations.md", "reference/paper.md", "reference/league.md"),
-    *("reference/cases/README.md", "reference/troubleshooting.md"),
+    *("reference/cases/README.md", "reference/troubleshooting.md", "reference/studio-operations.md"),
 )
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
@@ -151,6 +152,7 @@ def generated() -> dict[str, str]:
         **form_pages(),
         "reference/explanations.md": explain_page(),
         "reference/paper.md": paper_page(),
+        "reference/studio-operations.md": studio_page(),
         "reference/league.md": league_page(),
         "reference/troubleshooting.md": troubleshooting_page(),
         **case_pages(),

@@ -41,14 +41,14 @@ export function Devices({ store, query }) {
     <div class="scroll">
       <table class="list">
         <thead>
-          <tr><th>Tag</th><th>Address</th><th class="number">Value</th><th>Unit</th><th>Quality</th><th class="number">Age</th><th>Last minute</th><th><span class="visually-hidden">Actions</span></th></tr>
+          <tr><th>Tag</th><th class="address">Address</th><th class="number">Value</th><th>Unit</th><th>Quality</th><th class="number">Age</th><th>Last minute</th><th><span class="visually-hidden">Actions</span></th></tr>
         </thead>
         <tbody>
           ${rows.slice(0, MOST_ROWS).map(({ full, about }) => {
             const seen = store.tags[full];
             return html`<tr key=${full} data-tag=${full}>
               <td><a href=${address(store.name, "trends", { tags: full })}>${full}</a></td>
-              <td class="mono soft">${about.at}</td>
+              <td class="mono soft address">${about.at}</td>
               <td class="number">${value(seen, about)}</td>
               <td>${about.unit}</td>
               <td>${seen && html`<${Quality} quality=${seen.quality} why=${seen.reason} />`} ${full in set && html`<span class="chip warn">set</span>`}</td>

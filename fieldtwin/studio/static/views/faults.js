@@ -6,7 +6,9 @@ import { number, yaml } from "../lib/format.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 
-const AIMS = ["device", "bus"];
+const AIMS = ["device", "register", "bus"]; // the usual ones; the others are conditions that few faults need
+const UNITS = { _ms: "ms", per_s: "per second" };
+const HINTS = { nth: "only this frame", every: "each n-th frame", probability: "0 to 1", direction: "request or reply" };
 
 export function Faults({ store, query }) {
   useStore(store);
@@ -81,32 +83,45 @@ function Form({ store, kinds, device }) {
     if (key === "register" && fields.device) return Object.keys(system.devices[fields.device]?.tags ?? {});
     return null;
   };
+  const aim = (key) => {
+    const values = choice(key);
+    return html`<label key=${key}><span>${titled(key)}</span>
+      ${values
+        ? html`<select value=${fields[key] ?? ""} onChange=${(e) => change(key, e.target.value)}><option value="">any</option>${values.map((v) => html`<option value=${v}>${v}</option>`)}</select>`
+        : html`<input size="12" placeholder=${HINTS[key] ?? ""} value=${fields[key] ?? ""} onInput=${(e) => change(key, typed(e.target.value))} />`}
+    </label>`;
+  };
+  const rare = aims.filter((key) => !AIMS.includes(key));
   return html`<form class="card" onSubmit=${inject}>
     <header><h2>Inject a fault</h2></header>
     <${Failure} text=${error} />
     <p><label>Fault <select value=${kind.name} onChange=${(e) => setName(e.target.value)}>${kinds.map((k) => html`<option value=${k.name}>${k.name}</option>`)}</select></label></p>
     <p class="soft">${kind.summary}</p>
-    <div style=${{ display: "grid", gap: "8px" }}>
-      ${[...aims].sort((a, b) => AIMS.indexOf(b) - AIMS.indexOf(a)).map((key) => {
-        const values = choice(key);
-        return html`<label>${key}
-          ${values
-            ? html`<select value=${fields[key] ?? ""} onChange=${(e) => change(key, e.target.value)}><option value="">any</option>${values.map((v) => html`<option value=${v}>${v}</option>`)}</select>`
-            : html`<input size="12" value=${fields[key] ?? ""} onInput=${(e) => change(key, typed(e.target.value))} />`}
-        </label>`;
-      })}
+    <div class="fields">
+      ${AIMS.filter((key) => aims.includes(key)).map(aim)}
       ${Object.entries(kind.parameters).map(
-        ([key, about]) => html`<label title=${about.description ?? ""}>${key}
+        ([key, about]) => html`<label title=${about.description ?? ""}><span>${titled(key)}</span>
           ${about.enum
             ? html`<select value=${fields[key] ?? about.default} onChange=${(e) => change(key, e.target.value)}>${about.enum.map((v) => html`<option value=${v}>${v}</option>`)}</select>`
             : html`<input size="12" placeholder=${about.default ?? ""} value=${fields[key] ?? ""} onInput=${(e) => change(key, typed(e.target.value))} />`}
         </label>`,
       )}
     </div>
+    ${rare.length > 0 &&
+    html`<details open=${rare.some((key) => fields[key])}>
+      <summary>More conditions</summary>
+      <div class="fields">${rare.map(aim)}</div>
+    </details>`}
     <h3 style=${{ marginTop: "12px" }}>As YAML</h3>
     <pre class="yaml">- ${yaml(fault)}</pre>
     <button class="primary" disabled=${busy}>Inject</button>
   </form>`;
+}
+
+/** The name of a field with the unit of its value: by_ms becomes "by_ms (ms)". */
+function titled(key) {
+  const unit = Object.entries(UNITS).find(([end]) => key.endsWith(end))?.[1];
+  return unit ? `${key} (${unit})` : key;
 }
 
 /** Numbers and truth values as such, everything else as text. */

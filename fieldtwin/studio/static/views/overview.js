@@ -3,14 +3,17 @@
 import { html } from "../vendor/preact.js";
 import { address } from "../lib/address.js";
 import { age, number, reason, value } from "../lib/format.js";
+import { Sparkline } from "../lib/parts.js";
 
 const LEFT = 250; // width of the controller, in units of the drawing
-const BOX = 236;
+const NARROW = 236; // width of a device
+const WIDE = 420; // from this width on, a device shows two columns of values with their last minute
 const TALL = 116;
-const MOST_VALUES = 3;
-const STEP = BOX + 16;
+const MOST_VALUES = 3; // in a column
+const GAP = 16;
 const WIDTH = 1240;
-const COLUMNS = Math.floor((WIDTH - LEFT - 40) / STEP);
+const SPACE = WIDTH - LEFT - 40;
+const COLUMNS = Math.floor(SPACE / (NARROW + GAP));
 
 export function Overview({ store }) {
   const { system } = store.about;
@@ -20,16 +23,19 @@ export function Overview({ store }) {
     ...bus,
     devices: Object.entries(system.devices).filter(([, d]) => d.bus === name),
   }));
+  // Buses with few devices leave room, so their devices are wider.
+  const columns = Math.min(COLUMNS, Math.max(1, ...buses.map((bus) => bus.devices.length)));
+  const box = Math.floor(SPACE / columns) - GAP;
   let y = 14;
   for (const bus of buses) {
     bus.y = y;
-    y += 60 + Math.max(1, Math.ceil(bus.devices.length / COLUMNS)) * (TALL + 22);
+    y += 60 + Math.max(1, Math.ceil(bus.devices.length / columns)) * (TALL + 22);
   }
   const height = Math.max(y, 240);
   return html`<h1 class="visually-hidden">Overview of ${store.name}</h1>
     <svg class="plan" viewBox="0 0 ${WIDTH} ${height}" role="group" aria-label="Buses and devices of ${system.name}">
       <${Controller} store=${store} height=${height - 14} />
-      ${buses.map((bus) => html`<${BusLine} store=${store} bus=${bus} seen=${gateway?.buses[bus.name]} />`)}
+      ${buses.map((bus) => html`<${BusLine} store=${store} bus=${bus} seen=${gateway?.buses[bus.name]} columns=${columns} box=${box} />`)}
     </svg>
     ${!gateway && html`<p class="soft">The gateway does not answer, so no state is shown.</p>`}`;
 }
@@ -48,7 +54,7 @@ function Controller({ store, height }) {
     : [["no PLC program", "soft"]];
   const served = [...Object.entries(gateway?.serve ?? {}), ...Object.entries(gateway?.bridge ?? {})];
   return html`<g>
-    <a href=${address(store.name, "plc")} aria-label="PLC">
+    <a href=${address(store.name, "plc")}>
       <rect class="box" x="1" y="14" width=${LEFT - 2} height=${height - 14} rx="10" />
       <text class="name" x="16" y="40">gateway</text>
       <text class=${gateway ? "soft" : "bad-text"} x="16" y="60">
@@ -69,15 +75,16 @@ function shownState(plc, program) {
   return state === undefined ? (plc?.waiting?.[program] ? "waits for its inputs" : "runs") : number(state);
 }
 
-function BusLine({ store, bus, seen }) {
+function BusLine({ store, bus, seen, columns, box }) {
+  const step = box + GAP;
   const rate = store.rates[bus.name];
   const errors = seen ? (seen.counters.timeouts ?? 0) + (seen.counters.crc_errors ?? 0) + (seen.counters.aborts ?? 0) : 0;
-  const rows = Math.max(1, Math.ceil(bus.devices.length / COLUMNS));
+  const rows = Math.max(1, Math.ceil(bus.devices.length / columns));
   const line = `line${store.isPrototype ? " emulated" : ""}${seen?.error ? " bad" : ""}`;
   const lineY = bus.y + 46;
-  const last = Math.min(bus.devices.length, COLUMNS);
+  const last = Math.min(bus.devices.length, columns);
   return html`<g>
-    <a href=${address(store.name, "bus", { bus: bus.name })} aria-label="Bus ${bus.name}">
+    <a href=${address(store.name, "bus", { bus: bus.name })}>
       <text class="name" x=${LEFT + 40} y=${bus.y + 14}>${bus.name}</text>
       <text class="soft" x=${LEFT + 40 + 9 * bus.name.length + 14} y=${bus.y + 14}>${bus.kind} ${bus.endpoint}</text>
       <text x=${LEFT + 40} y=${bus.y + 34} class=${seen?.error ? "bad-text" : ""}>
@@ -85,20 +92,22 @@ function BusLine({ store, bus, seen }) {
         <tspan class=${errors ? "warn-text" : "soft"}>${seen && !seen.error ? `   ${errors} timeouts and errors` : ""}</tspan>
       </text>
     </a>
-    <path class=${line} d="M${LEFT},${lineY} H${LEFT + 40 + Math.max(0.5, last - 0.5) * STEP}" />
+    <path class=${line} d="M${LEFT},${lineY} H${LEFT + 40 + Math.max(0, last - 1) * step + NARROW / 2}" />
     ${Array.from({ length: rows - 1 }, (_, r) => {
       const at = lineY + (r + 1) * (TALL + 22);
-      return html`<path class=${line} d="M${LEFT + 18},${lineY} V${at} H${LEFT + 40 + BOX / 2}" />`;
+      return html`<path class=${line} d="M${LEFT + 18},${lineY} V${at} H${LEFT + 40 + NARROW / 2}" />`;
     })}
     ${bus.devices.map(([name, device], n) => {
-      const x = LEFT + 40 + (n % COLUMNS) * STEP;
-      const y = lineY + Math.floor(n / COLUMNS) * (TALL + 22);
-      return html`<${Device} store=${store} name=${name} device=${device} x=${x} y=${y} line=${line} />`;
+      const x = LEFT + 40 + (n % columns) * step;
+      const y = lineY + Math.floor(n / columns) * (TALL + 22);
+      return html`<${Device} store=${store} name=${name} device=${device} x=${x} y=${y} width=${box} line=${line} />`;
     })}
   </g>`;
 }
 
-function Device({ store, name, device, x, y, line }) {
+function Device({ store, name, device, x, y, width, line }) {
+  const halves = width >= WIDE ? 2 : 1;
+  const half = width / halves;
   const seen = store.status?.gateway?.devices[name];
   const tags = Object.keys(device.tags).map((tag) => store.tags[`${name}.${tag}`]).filter(Boolean);
   const good = tags.filter((t) => t.quality === "good").length;
@@ -106,24 +115,30 @@ function Device({ store, name, device, x, y, line }) {
   const shown = Object.entries(device.tags)
     .map(([tag, about]) => [tag, about, store.tags[`${name}.${tag}`]])
     .filter(([, about, now]) => now && !about.secret)
-    .slice(0, MOST_VALUES);
+    .slice(0, halves * MOST_VALUES);
   const fault = store.status?.field?.faults?.find((f) => f.device === name);
   const lamp = !seen ? "" : !seen.online ? "bad" : good < tags.length ? "warn" : "good";
   const state = !seen ? "unknown" : seen.online ? "answers" : seen.error || "does not answer";
   return html`<g>
-    <path class=${line} d="M${x + BOX / 2},${y} v14" />
-    <a href=${address(store.name, "devices", { device: name })} aria-label="${name}: ${state}">
-      <rect class="box" x=${x} y=${y + 14} width=${BOX} height=${TALL - 10} rx="8" />
+    <path class=${line} d="M${x + NARROW / 2},${y} v14" />
+    <a href=${address(store.name, "devices", { device: name })}>
+      <rect class="box" x=${x} y=${y + 14} width=${width} height=${TALL - 10} rx="8" />
       <circle class="lamp ${lamp}" cx=${x + 16} cy=${y + 32} r="5" />
       <text class="name" x=${x + 28} y=${y + 37}>${name}</text>
-      <text class="soft" x=${x + BOX - 12} y=${y + 37} text-anchor="end">${device.protocol === "canopen" ? "node" : "unit"} ${device.address}</text>
+      <text class="soft" x=${x + width - 12} y=${y + 37} text-anchor="end">${device.protocol === "canopen" ? "node" : "unit"} ${device.address}</text>
       <text class=${fault ? "warn-text" : lamp === "bad" ? "bad-text" : "soft"} x=${x + 12} y=${y + 56}>
         ${cut(fault ? `fault: ${fault.name}` : lamp === "bad" ? state : tags.length ? `${good} of ${tags.length} good, oldest ${age(oldest)}` : "", 34)}
       </text>
       ${shown.map(([tag, about, now], n) => {
         const bad = now.quality !== "good";
-        return html`<text class=${bad ? "bad-text" : "soft"} x=${x + 12} y=${y + 76 + n * 17}>${cut(tag, 16)}</text>
-          <text class=${bad ? "bad-text" : ""} x=${x + BOX - 12} y=${y + 76 + n * 17} text-anchor="end">
+        const left = x + Math.floor(n / MOST_VALUES) * half;
+        const row = y + 76 + (n % MOST_VALUES) * 17;
+        return html`<text class=${bad ? "bad-text" : "soft"} x=${left + 12} y=${row}>${cut(tag, 16)}</text>
+          ${halves > 1 &&
+          html`<g transform="translate(${left + half / 2 - 60}, ${row - 12})">
+            <${Sparkline} points=${store.recent.get(`${name}.${tag}`)} now=${store.now()} width=${100} height=${14} />
+          </g>`}
+          <text class=${bad ? "bad-text" : ""} x=${left + half - 12} y=${row} text-anchor="end">
             ${cut(bad ? reason(now.reason) || now.quality : `${value(now, about)} ${about.unit}`, 20)}
           </text>`;
       })}

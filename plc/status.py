@@ -9,6 +9,8 @@ from typing import Any
 
 import msgspec
 
+Buckets = list[tuple[float, int]]
+"""The upper limit of each bucket in microseconds, and its count (`Histogram.buckets_us`)."""
 Spread = dict[str, int | float]
 """Count, minimum, percentiles and maximum of a duration in microseconds (`Histogram.summary_us`)."""
 
@@ -109,3 +111,6 @@ class WholePlcStatus(PlcStatus, frozen=True, kw_only=True):
     inputs: dict[str, Any] = {}
     outputs: dict[str, Any] = {}
     variables: dict[str, Any] = {}
+    duration_buckets: Buckets = []
+    """The durations of the first task's scans, likewise `lateness_buckets`."""
+    lateness_buckets: Buckets = []

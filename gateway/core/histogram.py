@@ -23,6 +23,9 @@ _FINE_NS = (
 )
 """32 buckets per power of two: a percentile is at most 1/32 above the true value."""
 
+_SHOWN_NS = tuple(digit * 10**power for power in range(2, 12) for digit in (1, 2, 5))
+"""The limits that `Histogram.buckets_us` shows, from 0.1 us to 500 s; the last one has all longer durations."""
+
 
 class Histogram:
     """A histogram of durations in nanoseconds. Each counts in the first bucket whose upper limit it does not exceed.
@@ -84,6 +87,20 @@ class Histogram:
             "above_1ms": self.share_above(NS_PER_MS),
             "max": self.max_ns / 1e3,
         }
+
+    def buckets_us(self) -> list[tuple[float, int]]:
+        """Return (upper limit in microseconds, count) for a display: limits of 1, 2 and 5 times a power of ten.
+
+        The list begins with the first bucket and ends with the last one that has a count, at most 30. A duration near a limit
+        may count in the next bucket, because the histogram's own limits differ.
+        """
+        counts: dict[int, int] = {}
+        for at, count in enumerate(self.counts):
+            if count:
+                limit_ns = self.limits_ns[at] if at < len(self.limits_ns) else self.max_ns
+                shown = bisect_left(_SHOWN_NS, limit_ns)
+                counts[min(shown, len(_SHOWN_NS) - 1)] = counts.get(min(shown, len(_SHOWN_NS) - 1), 0) + count
+        return [(_SHOWN_NS[n] / 1e3, counts.get(n, 0)) for n in range(min(counts), max(counts) + 1)] if counts else []
 
 
 def response_times() -> Histogram:

@@ -14,6 +14,7 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
     limits    {"tags": {name: [low, high] or null}}: limits in place of those in the image's layout, after a reload
     restart   create the programs anew: {"cold": true} without retained variables
     sources   the programs whose files changed since the PLC read them
+    about     of each program: variables, states with transitions, and the text of its source; this changes at a restart only
     stop      make the outputs safe, then end the process
 
 The actions of users (force to restart) are recorded before they are carried out; each of these commands takes "by".
@@ -39,6 +40,7 @@ from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.plc.cycle.task import StopReason
+from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.plc.runtime.acts import Acts
 from fieldtwin.plc.runtime.config import PlcConfig
 from fieldtwin.plc.runtime.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
@@ -76,6 +78,7 @@ class PlcProcess:
                 "limits": self._limits,
                 "restart": self._restart,
                 "sources": self._sources,
+                "about": self._about,
             }
         )
         self._realtime = RealtimeReport((), ())
@@ -136,11 +139,14 @@ class PlcProcess:
         if args.get("brief") is True:
             return brief
         outputs = runner.outputs.last()
+        first = runner.entries[0].task
         return WholePlcStatus(
             **structs.asdict(brief),
             retained=runner.retained.values(),
             inputs={tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
             outputs=outputs,
+            duration_buckets=first.duration.buckets_us(),
+            lateness_buckets=first.lateness.buckets_us(),
             variables={f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         )
 
@@ -216,6 +222,9 @@ class PlcProcess:
 
     async def _sources(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"changed": [source.describe() for source in changed(self._runner.sources)]}
+
+    async def _about(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"programs": describe_programs(self._runner.programs, self._runner.sources)}
 
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
         cold = args.get("cold") is True

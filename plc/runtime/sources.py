@@ -34,6 +34,10 @@ class ProgramSource:
         cure = "fieldtwin plc restart" if self.compiled else "stop the system and run it again"
         return {"program": self.program, "path": self.path, "cure": cure}
 
+    def holds(self, content: bytes) -> bool:
+        """Return whether `content` is the content of the file that the PLC read."""
+        return sha256(content).hexdigest() == self.digest
+
 
 def sources(programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = ()) -> list[ProgramSource]:
     """Return the files of `programs`, which were just created. `before`: the sources of the programs that they

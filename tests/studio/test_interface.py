@@ -117,6 +117,43 @@ def test_a_force_is_seen_recorded_and_removed(observatory: Studio) -> None:
     assert "studio" in audit
 
 
+def test_programs_are_described_with_the_names_of_their_states(observatory: Studio) -> None:
+    with observatory.client(VIEW) as client:
+        relay = until(lambda: client.get(f"{NAME}/plc/programs").json().get("relay"), "the programs are described")
+    assert relay["machine"]["states"] == ["STANDBY", "ACTIVE", "OFF"]
+    assert relay["variables"]["state"]["words"]["1"] == "ACTIVE"
+    assert relay["source"]["file"] == "relay.py"
+
+
+def test_a_transition_is_recorded_with_its_time_and_its_scan(observatory: Studio) -> None:
+    def after(client: httpx.Client) -> list[Any]:
+        changes: list[Any] = client.get(f"{NAME}/plc/transitions").json().get("relay", [])
+        return changes
+
+    with observatory.client() as client:
+        until(lambda: after(client), "the first state is recorded")
+        known = after(client)
+        force = {"tag": "relay.state", "value": 2}
+        client.post(f"{NAME}/plc/forces", json=force).raise_for_status()
+        changed = until(lambda: (a := after(client))[-1]["after"] == 2 and a, "the transition is recorded")
+        client.delete(f"{NAME}/plc/forces").raise_for_status()
+        back = until(lambda: (a := after(client))[-1]["after"] != 2 and a, "the way back is recorded")
+        now_ns = client.get(NAME).json()["now_ns"]
+        newest = client.get(f"{NAME}/status").json()["transitions"]["relay"]
+    assert changed[: len(known)] == known
+    assert changed[len(known)]["forced"]
+    assert [c["before"] for c in back[1:]] == [c["after"] for c in back[:-1]]
+    assert [c["scan"] for c in back] == sorted({c["scan"] for c in back})
+    assert known[-1]["t_ns"] < changed[-1]["t_ns"] < back[-1]["t_ns"] <= now_ns
+    assert newest == back[-1]["t_ns"]
+
+
+def test_the_status_has_buckets_of_cycle_times(observatory: Studio) -> None:
+    with observatory.client(VIEW) as client:
+        plc = client.get(f"{NAME}/plc").json()
+    assert sum(count for _, count in plc["duration_buckets"]) == plc["duration_us"]["count"]
+
+
 def test_changes_arrive_over_the_websocket(observatory: Studio) -> None:
     async def main() -> set[str]:
         url = f"{observatory.api}{NAME}/stream".replace("http", "ws", 1)

@@ -9,6 +9,7 @@ from starlette.requests import Request
 
 from fieldtwin.studio.api.common import INSTANCE, attached, by_studio
 from fieldtwin.studio.api.operation import Operation, body_of
+from fieldtwin.studio.live.state_history import StateChange
 
 
 class Force(msgspec.Struct, forbid_unknown_fields=True):
@@ -28,6 +29,16 @@ async def get_plc(request: Request) -> Any:
     """Return the status of the PLC with all inputs, outputs and variables."""
     attachment = await attached(request)
     return await attachment.plc_channel.call("get")
+
+
+async def get_programs(request: Request) -> dict[str, Any]:
+    """Return of each program its variables, its states and transitions, and the text of its source."""
+    return (await attached(request)).programs
+
+
+async def get_transitions(request: Request) -> dict[str, list[StateChange]]:
+    """Return the last transitions of each program, the oldest first."""
+    return {name: list(changes) for name, changes in (await attached(request)).state_history.changes.items()}
 
 
 async def get_why(request: Request) -> Any:
@@ -75,6 +86,8 @@ async def step_plc(request: Request) -> Any:
 PLC = f"{INSTANCE}/plc"
 OPERATIONS = (
     Operation("GET", PLC, get_plc, "Read the PLC's status and variables"),
+    Operation("GET", f"{PLC}/programs", get_programs, "Describe the programs: variables, states, transitions, source"),
+    Operation("GET", f"{PLC}/transitions", get_transitions, "Read the last transitions of the programs"),
     Operation("GET", PLC + "/why/{tag}", get_why, "Explain the value of a tag"),
     Operation("POST", f"{PLC}/forces", force_tag, "Force a tag", body=Force, changes=True),
     Operation("DELETE", f"{PLC}/forces", unforce_all, "Remove all forces", changes=True),

@@ -15,14 +15,17 @@ import msgspec
 
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.plc.status import WholePlcStatus
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord
 from fieldtwin.studio.live.channel import Channel
 from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
 from fieldtwin.studio.live.observed import describe_system
+from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.studio.live.subscription import Publisher
 from fieldtwin.studio.live.tag_history import Point, TagHistory
 from fieldtwin.twin.prototype.field_status import FieldStatus
@@ -61,6 +64,9 @@ class Attachment:
         self.plc: WholePlcStatus | None = None
         self.field: FieldStatus | None = None
         self.troubles: dict[str, str] = {}
+        self.programs: dict[str, Any] = {}
+        """The description of the PLC's programs (the command `about`): empty until the PLC has answered."""
+        self.state_history = StateHistory()
         self.updates = Publisher()
         self.gateway_channel = Channel(found.dir / GATEWAY_SOCKET, "gateway")
         self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
@@ -79,6 +85,8 @@ class Attachment:
         )
         self._seen_change: int | None = None
         """The number of the latest change that was read, None before the first answer."""
+        self._described: tuple[int, int] | None = None
+        """Process ID and restarts of the PLC that `programs` describes."""
         self._nursery = Nursery()
 
     async def __aenter__(self) -> Attachment:
@@ -124,6 +132,7 @@ class Attachment:
             "now_ns": self.now_ns(),
             "gateway": gateway,
             "plc": msgspec.to_builtins(self.plc) if self.plc is not None else None,
+            "transitions": self.state_history.newest,
             "field": msgspec.to_builtins(self.field) if self.field is not None else None,
             "troubles": dict(self.troubles),
             "frames": None
@@ -162,7 +171,25 @@ class Attachment:
         self.updates.publish({"type": "status", "status": self.status()})
 
     async def _read_plc(self) -> None:
-        self.plc = await self.plc_channel.ask("get", WholePlcStatus)
+        plc = await self.plc_channel.ask("get", WholePlcStatus)
+        if self._described != (plc.pid, plc.restarts):  # a restart reads Structured Text again
+            self.programs = await self._read_programs()
+            self._described = (plc.pid, plc.restarts)
+        state_tags = {
+            name: program["variables"][STATE]["tag"]
+            for name, program in self.programs.items()
+            if STATE in program["variables"]
+        }
+        await self.state_history.look(plc, state_tags, self.plc_channel, self.now_ns())
+        self.plc = plc
+
+    async def _read_programs(self) -> dict[str, Any]:
+        try:
+            answer = await self.plc_channel.call("about")
+        except RemoteError:  # a PLC of an older version, whose programs are shown without names of states
+            return {}
+        programs: dict[str, Any] = answer["programs"]
+        return programs
 
     async def _read_field(self) -> None:
         self.field = await self.field_channel.ask("get", FieldStatus)

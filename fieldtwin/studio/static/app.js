@@ -81,12 +81,13 @@ function Count({ store, view }) {
 function Top({ store }) {
   const mode = store.about?.mode;
   const writes = mode === "plant" && (store.about.allow_writes ? "writes allowed" : "read-only");
-  const program = Object.entries(store.status?.plc?.variables ?? {}).filter(([name]) => name.endsWith(".state"));
+  const states = Object.keys(store.programs).filter((name) => store.programs[name].machine);
   return html`<header class="top">
     <a class="brand" href="#/">fieldtwin Studio</a>
     <strong>${store.name}</strong>
     ${mode && html`<span class="chip ${mode === "plant" ? "warn" : "accent"}">${mode}${writes ? `, ${writes}` : ""}</span>`}
-    ${program.map(([name, value]) => html`<span class="chip">${name.replace(/\.state$/, "")}: ${stateName(store, value)}</span>`)}
+    ${store.status?.plc &&
+    states.map((name) => html`<span class="chip">${name}: ${store.word(name, "state", store.variable(name, "state"))}</span>`)}
     <span class="grow"></span>
     ${store.about?.role === "view" && html`<span class="chip">view only</span>`}
     ${store.dropped > 0 && html`<span class="chip warn" title="This page was too slow to take them">${store.dropped} updates lost</span>`}
@@ -94,9 +95,6 @@ function Top({ store }) {
     <${Theme} />
   </header>`;
 }
-
-const STATES = { 0: "STANDBY", 1: "ACTIVE", 2: "OFF" };
-const stateName = (store, value) => (typeof value === "number" ? (STATES[value] ?? number(value)) : number(value));
 
 function Theme() {
   const [theme, setTheme] = useState(document.documentElement.dataset.theme ?? "");

@@ -2,6 +2,7 @@
 
 import { useEffect, useState } from "../vendor/preact.js";
 import { follow, get, of } from "./api.js";
+import { number } from "./format.js";
 
 const RECENT_MS = 60_000;
 const MOST_RECENT = 600;
@@ -11,6 +12,8 @@ export class Store {
     this.name = name;
     this.about = null; // what GET /instances/NAME says
     this.status = null;
+    this.programs = {}; // what GET /instances/NAME/plc/programs says
+    this.programsOf = ""; // the PLC's process and restart that `programs` describes
     this.error = "";
     this.connected = false;
     this.dropped = 0;
@@ -67,6 +70,31 @@ export class Store {
     this.status = status;
     this.at = performance.now();
     if (status.frames) this.frames = status.frames;
+    if (status.plc) this.describePrograms(`${status.plc.pid} ${status.plc.restarts}`);
+  }
+
+  async describePrograms(run) {
+    if (run === this.programsOf) return;
+    this.programsOf = run;
+    try {
+      this.programs = await get(`${this.path}/plc/programs`);
+    } catch {
+      this.programsOf = ""; // tried again with the next status
+    }
+    this.tell();
+  }
+
+  /** A value of a program's variable: by its name, if the program gives names to its values. */
+  word(program, variable, value) {
+    return this.programs[program]?.variables[variable]?.words[String(value)] ?? number(value);
+  }
+
+  /** The present value of a program's variable; undefined if the PLC does not answer. */
+  variable(program, variable) {
+    const plc = this.status?.plc;
+    const about = this.programs[program]?.variables[variable];
+    if (about?.role === "input") return plc?.forces[about.tag]?.value ?? plc?.inputs[about.tag]?.value ?? plc?.outputs[about.tag];
+    return plc?.variables[`${program}.${variable}`];
   }
 
   takeTags(changes) {

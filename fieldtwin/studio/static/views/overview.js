@@ -49,7 +49,7 @@ function Controller({ store, height }) {
         ["PLC", "name"],
         [plc ? `${plc.state}, scan ${number(plc.cycle_ms)} ms` : "no answer", plc?.state === "running" ? "good-text" : "bad-text"],
         [plc ? `${plc.scans} scans, late p99 ${late === undefined ? "–" : (late / 1000).toFixed(2)} ms` : "", "soft"],
-        ...programs.map((name) => [`${name}: ${shownState(plc, name)}`, ""]),
+        ...programs.map((name) => [`${name}: ${shownState(store, name)}`, ""]),
       ]
     : [["no PLC program", "soft"]];
   const served = [...Object.entries(gateway?.serve ?? {}), ...Object.entries(gateway?.bridge ?? {})];
@@ -70,9 +70,11 @@ function Controller({ store, height }) {
   </g>`;
 }
 
-function shownState(plc, program) {
-  const state = plc?.variables?.[`${program}.state`];
-  return state === undefined ? (plc?.waiting?.[program] ? "waits for its inputs" : "runs") : number(state);
+function shownState(store, program) {
+  const plc = store.status?.plc;
+  if (plc?.waiting?.[program]) return "waits for its inputs";
+  const state = store.variable(program, "state");
+  return state === undefined ? (plc ? "runs" : "") : store.word(program, "state", state);
 }
 
 function BusLine({ store, bus, seen, columns, box }) {

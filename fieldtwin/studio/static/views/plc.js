@@ -1,24 +1,24 @@
-// The PLC: state, cycle time, variables, forces and the reasons of values.
+// The PLC: states, cycle time, variables, forces, and the source of its programs with live values.
 
 import { html, useState } from "../vendor/preact.js";
-import { get, post, remove } from "../lib/api.js";
+import { get, post } from "../lib/api.js";
 import { number } from "../lib/format.js";
-import { Dialog, Failure, Quality, useAction, useFetched } from "../lib/parts.js";
+import { Failure, Quality, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
+import { ForceDialog, ReleaseDialog, Why } from "./plc_dialogs.js";
+import { Source } from "./plc_source.js";
+import { States, Transitions } from "./plc_states.js";
 
 export function Plc({ store }) {
   useStore(store);
   const plc = store.status?.plc;
   const [run, error] = useAction();
-  const [forcing, setForcing] = useState(null);
-  const [why, setWhy] = useState(null);
+  const [open, setOpen] = useState(null); // the open dialog: [component, its properties]
+  const [transitions] = useFetched(() => get(`${store.path}/plc/transitions`), [JSON.stringify(store.status?.transitions ?? {})]);
   if (!plc) return html`<p class="empty">The PLC does not answer.</p>`;
   const act = (path, body) => () => run(() => post(`${store.path}/plc/${path}`, body));
-  const rows = [
-    ...Object.entries(plc.inputs).map(([name, v]) => ["input", name, v]),
-    ...Object.entries(plc.outputs).map(([name, v]) => ["output", name, { value: v }]),
-  ];
   const programs = Object.keys(store.about.system.programs);
+  const [Opened, properties] = open ?? [];
   return html`<h1 class="visually-hidden">PLC</h1>
     <${Failure} text=${error} />
     <div class="bar">
@@ -30,95 +30,108 @@ export function Plc({ store }) {
       <span class="grow"></span>
       <span class="soft">scan every ${number(plc.cycle_ms)} ms · ${plc.scans} scans · ${plc.missed_periods} missed periods · ${plc.overruns} overruns</span>
     </div>
-    <div class="columns">
-      <div>
-        ${programs.map((name) => html`<${Program} store=${store} name=${name} plc=${plc} />`)}
-        <div class="scroll" style=${{ marginTop: "14px" }}>
-          <table class="list">
-            <thead><tr><th>Tag</th><th>Kind</th><th class="number">Value</th><th>Quality</th><th><span class="visually-hidden">Actions</span></th></tr></thead>
-            <tbody>
-              ${rows.map(([kind, name, v]) => {
-                const force = plc.forces[name];
-                return html`<tr key=${kind + name} data-tag=${name}>
-                  <td>${name}</td><td class="soft">${kind}</td><td class="number">${number(force ? force.value : v.value)}</td>
-                  <td>${v.quality && html`<${Quality} quality=${v.quality} why=${v.reason} />`} ${force && html`<span class="chip warn">forced</span>`}</td>
-                  <td>
-                    <button class="quiet" onClick=${() => setWhy(name)}>Why?</button>
-                    ${store.mayOperate &&
-                    (force
-                      ? html`<button class="quiet" onClick=${() => run(() => remove(`${store.path}/plc/forces/${name}`))}>Release</button>`
-                      : html`<button class="quiet" onClick=${() => setForcing({ name, now: v.value })}>Force …</button>`)}
-                  </td>
-                </tr>`;
-              })}
-            </tbody>
-          </table>
-        </div>
+    <div class="columns plc">
+      <div class="stack">
+        ${programs.map((name) => html`<${Program} key=${name} store=${store} name=${name} plc=${plc} changes=${transitions?.[name] ?? []} />`)}
+        <${Tags} store=${store} plc=${plc} onOpen=${(...dialog) => setOpen(dialog)} />
       </div>
-      <div>
-        <${Durations} title="Lateness of scans" spread=${plc.lateness_us} />
-        <${Durations} title="Duration of scans" spread=${plc.duration_us} />
-        ${why && html`<${Why} store=${store} tag=${why} onClose=${() => setWhy(null)} />`}
+      <div class="stack">
+        <${Durations} title="Duration of scans" spread=${plc.duration_us} buckets=${plc.duration_buckets} most=${plc.cycle_ms} of="the cycle time" />
+        <${Durations} title="Lateness of scans" spread=${plc.lateness_us} buckets=${plc.lateness_buckets} most=${plc.late_ms} of="the permitted delay" />
       </div>
     </div>
-    ${forcing && html`<${ForceDialog} store=${store} ...${forcing} onClose=${() => setForcing(null)} />`}`;
+    <div class="stack sources">${programs.map((name) => html`<${Source} key=${name} store=${store} name=${name} />`)}</div>
+    ${Opened && html`<${Opened} store=${store} ...${properties} onClose=${() => setOpen(null)} />`}`;
 }
 
-function Program({ store, name, plc }) {
-  const about = store.about.system.programs[name];
-  const variables = Object.entries(plc.variables).filter(([full]) => full.startsWith(`${name}.`));
+function Program({ store, name, plc, changes }) {
+  const about = store.programs[name];
   const waiting = plc.waiting[name];
-  return html`<section class="card" style=${{ marginBottom: "12px" }}>
-    <header><h2>${name}</h2><span class="soft mono">${about.source}</span></header>
-    ${waiting && html`<p class="error">has not started; missing ${waiting.reason}</p>`}
-    <dl class="facts">${variables.map(([full, v]) => html`<dt>${full.slice(name.length + 1)}</dt><dd class="mono">${number(v)}</dd>`)}</dl>
+  if (!waiting && !about?.machine) return null;
+  return html`<section class="card" aria-label="Program ${name}">
+    <header>
+      <h2>${name}${about?.machine && html`: <span class="now-state">${store.word(name, "state", store.variable(name, "state"))}</span>`}</h2>
+      <span class="soft mono">${store.about.system.programs[name].source}</span>
+    </header>
+    ${waiting && html`<p class="error">It has not started; missing ${waiting.reason}</p>`}
+    ${about?.machine && html`<${States} store=${store} name=${name} changes=${changes} /><${Transitions} store=${store} name=${name} changes=${changes} />`}
   </section>`;
 }
 
-function Durations({ title, spread }) {
+const COUNTER = /\.(taken|consumed)$/; // counts the messages of a mailbox
+const ORDER = ["output", "local", "input", "messages", "watched", "counter"];
+
+/** The tags in the PLC: [kind, name, present value, names of its values, unit], those that programs use first. */
+function tagsOf(store, plc) {
+  const known = new Map();
+  const read = new Set();
+  for (const { variables } of Object.values(store.programs)) {
+    for (const v of Object.values(variables)) {
+      if (v.role === "input") read.add(v.tag);
+      else known.set(v.tag, v);
+    }
+  }
+  const inputs = Object.entries(plc.inputs).map(([name, v]) => {
+    return [COUNTER.test(name) ? "counter" : read.has(name) ? "input" : "watched", name, v, {}, ""];
+  });
+  const outputs = Object.entries(plc.outputs).map(([name, value]) => {
+    const v = known.get(name);
+    const kind = COUNTER.test(name) ? "counter" : v?.kind === "message" ? "messages" : (v?.role ?? "output");
+    return [kind, name, { value }, v?.words ?? {}, v?.unit ?? ""];
+  });
+  return [...outputs, ...inputs].sort(([a], [b]) => ORDER.indexOf(a) - ORDER.indexOf(b));
+}
+
+function Tags({ store, plc, onOpen }) {
+  return html`<div class="scroll">
+    <table class="list one-line">
+      <thead><tr><th>Tag</th><th>Kind</th><th class="number">Value</th><th>Quality</th><th><span class="visually-hidden">Actions</span></th></tr></thead>
+      <tbody>
+        ${tagsOf(store, plc).map(([kind, name, v, words, unit]) => {
+          const force = plc.forces[name];
+          const word = (value) => words[String(value)] ?? number(value);
+          return html`<tr key=${kind + name} data-tag=${name}>
+            <td title=${name}>${name}</td><td class="soft">${kind}</td>
+            <td class="number">${word(force ? force.value : v.value)}${unit && html` <span class="soft">${unit}</span>`}</td>
+            <td>${force ? html`<span class="chip warn">forced</span>` : v.quality && html`<${Quality} quality=${v.quality} why=${v.reason} />`}</td>
+            <td>
+              <button class="quiet" onClick=${() => onOpen(Why, { tag: name, input: "quality" in v, word })}>Why?</button>
+              ${store.mayOperate &&
+              (force
+                ? html`<button class="quiet" onClick=${() => onOpen(ReleaseDialog, { name, words })}>Release …</button>`
+                : html`<button class="quiet" onClick=${() => onOpen(ForceDialog, { name, words, now: v.value })}>Force …</button>`)}
+            </td>
+          </tr>`;
+        })}
+      </tbody>
+    </table>
+  </div>`;
+}
+
+const PERCENTILES = { p50: "median", p99: "99 % within", p999: "99.9 % within", max: "longest" };
+const milliseconds = (us) => `${(us / 1000).toFixed(us < 1000 ? 3 : 1)} ms`;
+const limit = (us) => (us < 1000 ? `${number(us)} µs` : us < 1e6 ? `${number(us / 1000)} ms` : `${number(us / 1e6)} s`);
+
+/** A histogram with bars of logarithmic height, so that a single long scan among millions is visible. `most` in ms. */
+function Durations({ title, spread, buckets, most, of }) {
   if (!spread?.count) return null;
-  const ms = (us) => `${(us / 1000).toFixed(us < 1000 ? 3 : 1)} ms`;
-  return html`<section class="card" style=${{ marginBottom: "12px" }}>
+  const tallest = Math.log10(1 + Math.max(...(buckets ?? []).map(([, count]) => count)));
+  const text = (us, count) => `${count} scans, up to ${limit(us)}`;
+  return html`<section class="card" aria-label=${title}>
     <header><h2>${title}</h2><span class="soft">${spread.count} scans</span></header>
+    ${buckets?.length > 0 &&
+    html`<div class="bars" role="img" aria-label="${title}: ${buckets.filter(([, n]) => n).map(([us, n]) => text(us, n)).join("; ")}">
+        ${buckets.map(
+          ([us, count]) => html`<div key=${us} title=${text(us, count)}>
+            <span class="bar-count">${count || ""}</span>
+            <i class=${us > most * 1000 ? "beyond" : ""} style=${{ height: `${count ? Math.max(2, (Math.log10(1 + count) / tallest) * 78) : 0}px` }}></i>
+            <small>${limit(us)}</small>
+          </div>`,
+        )}
+      </div>
+      <p class="soft note">Up to each time, logarithmic. Orange: longer than ${of}, ${number(most)} ms.</p>`}
     <dl class="facts">
-      ${["p50", "p99", "p999", "max"].map((key) => spread[key] !== undefined && html`<dt>${key}</dt><dd class="mono">${ms(spread[key])}</dd>`)}
+      ${Object.entries(PERCENTILES).map(([key, name]) => spread[key] !== undefined && html`<dt>${name}</dt><dd class="mono">${milliseconds(spread[key])}</dd>`)}
     </dl>
   </section>`;
-}
-
-function Why({ store, tag, onClose }) {
-  const [found, error] = useFetched(() => get(`${store.path}/plc/why/${tag}`), [tag]);
-  return html`<section class="card" aria-label="Why">
-    <header><h2>Why ${tag}?</h2><button class="quiet" onClick=${onClose}>Close</button></header>
-    <${Failure} text=${error} />
-    ${found?.changes?.map(
-      (c) => html`<dl class="facts" style=${{ marginBottom: "10px" }}>
-        ${Object.entries(c).map(([k, v]) => html`<dt>${k}</dt><dd class="mono">${typeof v === "object" ? JSON.stringify(v) : number(v)}</dd>`)}
-      </dl>`,
-    )}
-    ${found && !found.changes?.length && html`<p class="soft">No program has changed it yet.</p>`}
-  </section>`;
-}
-
-function ForceDialog({ store, name, now, onClose }) {
-  const [text, setText] = useState(now === null || now === undefined ? "" : String(now));
-  const [run, error, busy] = useAction();
-  const plant = !store.isPrototype;
-  const wanted = text === "true" ? true : text === "false" ? false : Number(text);
-  const valid = text.trim() !== "" && (typeof wanted === "boolean" || Number.isFinite(wanted));
-  const send = async (e) => {
-    e.preventDefault();
-    if (await run(() => post(`${store.path}/plc/forces`, { tag: name, value: wanted }))) onClose();
-  };
-  return html`<${Dialog} title="Force ${name}" onClose=${onClose}>
-    <form onSubmit=${send}>
-      ${plant && html`<p class="error">This is a plant: the force acts on real devices until you remove it.</p>`}
-      <${Failure} text=${error} />
-      <p>now ${number(now)} → <input autofocus aria-label="New value" value=${text} onInput=${(e) => setText(e.target.value)} /></p>
-      <footer>
-        <button type="button" onClick=${onClose}>Cancel</button>
-        <button class=${plant ? "danger" : "primary"} disabled=${!valid || busy}>Force</button>
-      </footer>
-    </form>
-  <//>`;
 }

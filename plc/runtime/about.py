@@ -10,7 +10,6 @@ from pathlib import Path
 from sysconfig import get_paths
 from typing import Any
 
-import fieldtwin
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.runtime.sources import ProgramSource
 from fieldtwin.plc.states import ANY, StateTable
@@ -93,7 +92,7 @@ def _text(source: ProgramSource | None, most: int) -> dict[str, Any]:
 
 def _is_library(path: Path) -> bool:
     libraries = (get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-    folders = [Path(fieldtwin.__file__).parent, *map(Path, libraries)]
+    folders = [Path(__file__).parents[2], *map(Path, libraries)]
     return any(
         path.absolute().is_relative_to(folder.absolute()) or path.resolve().is_relative_to(folder.resolve())
         for folder in folders

@@ -140,12 +140,15 @@ def test_a_transition_is_recorded_with_its_time_and_its_scan(observatory: Studio
         back = until(lambda: (a := after(client))[-1]["after"] != 2 and a, "the way back is recorded")
         now_ns = client.get(NAME).json()["now_ns"]
         newest = client.get(f"{NAME}/status").json()["transitions"]["relay"]
+        why = client.get(f"{NAME}/plc/why/relay.state").json()
     assert changed[: len(known)] == known
     assert changed[len(known)]["forced"]
     assert [c["before"] for c in back[1:]] == [c["after"] for c in back[:-1]]
     assert [c["scan"] for c in back] == sorted({c["scan"] for c in back})
     assert known[-1]["t_ns"] < changed[-1]["t_ns"] < back[-1]["t_ns"] <= now_ns
     assert newest == back[-1]["t_ns"]
+    explained_ns = why["now_ns"] - why["changes"][0]["age_ms"] * 1e6
+    assert abs(explained_ns - newest) < 1e9, "both times of the transition are the same"
 
 
 def test_the_status_has_buckets_of_cycle_times(observatory: Studio) -> None:

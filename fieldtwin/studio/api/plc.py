@@ -42,9 +42,10 @@ async def get_transitions(request: Request) -> dict[str, list[StateChange]]:
 
 
 async def get_why(request: Request) -> Any:
-    """Return which program last changed a tag, when, and what it had read."""
+    """Return which program last changed a tag, when, and what it had read. `now_ns` is the time to which the ages refer."""
     attachment = await attached(request)
-    return await attachment.plc_channel.call("why", tag=request.path_params["tag"])
+    answer: dict[str, Any] = await attachment.plc_channel.call("why", tag=request.path_params["tag"])
+    return answer | {"now_ns": attachment.now_ns()}
 
 
 async def force_tag(request: Request) -> Any:

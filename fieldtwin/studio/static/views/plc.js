@@ -110,6 +110,7 @@ function Tags({ store, plc, onOpen }) {
 
 const PERCENTILES = { p50: "median", p99: "99 % within", p999: "99.9 % within", max: "longest" };
 const milliseconds = (us) => `${(us / 1000).toFixed(us < 1000 ? 3 : 1)} ms`;
+const short = (count) => (count < 1000 ? String(count) : count < 1e6 ? `${Math.floor(count / 1000)}k` : `${Math.floor(count / 1e6)}M`);
 const limit = (us) => (us < 1000 ? `${number(us)} µs` : us < 1e6 ? `${number(us / 1000)} ms` : `${number(us / 1e6)} s`);
 
 /** A histogram with bars of logarithmic height, so that a single long scan among millions is visible. `most` in ms. */
@@ -123,7 +124,7 @@ function Durations({ title, spread, buckets, most, of }) {
     html`<div class="bars" role="img" aria-label="${title}: ${buckets.filter(([, n]) => n).map(([us, n]) => text(us, n)).join("; ")}">
         ${buckets.map(
           ([us, count]) => html`<div key=${us} title=${text(us, count)}>
-            <span class="bar-count">${count || ""}</span>
+            <span class="bar-count">${count ? short(count) : ""}</span>
             <i class=${us > most * 1000 ? "beyond" : ""} style=${{ height: `${count ? Math.max(2, (Math.log10(1 + count) / tallest) * 78) : 0}px` }}></i>
             <small>${limit(us)}</small>
           </div>`,

@@ -26,13 +26,12 @@ function FromGateway({ store, tag }) {
 
 function FromProgram({ store, tag, word }) {
   const [found, error] = useFetched(() => get(`${store.path}/plc/why/${tag}`), [tag]);
-  const [at] = useState(() => store.now());
   if (error) return html`<${Failure} text=${error} />`;
   if (!found) return html`<p class="soft">Asking the PLC …</p>`;
   if (found.waits_for) return html`<p>The program that sets it has not started. Missing: ${found.waits_for}.</p>`;
   const [last, ...earlier] = found.changes;
   if (!last) return html`<p>It has not changed since the programs began, so it has its initial value.</p>`;
-  const time = (change) => clock(at - change.age_ms * 1e6 - store.about.started_ns);
+  const time = (change) => clock(found.now_ns - change.age_ms * 1e6 - store.about.started_ns);
   const inputs = Object.entries(last.inputs);
   return html`<p>
       ${last.forced ? "A force, applied in program " : "Program "}<strong>${last.program}</strong>${last.forced ? "," : ""} changed it from
@@ -46,7 +45,7 @@ function FromProgram({ store, tag, word }) {
         <tbody>${inputs.map(([name, v]) => html`<tr key=${name}><td>${name}</td><td class="number">${shown(v)}</td></tr>`)}</tbody>
       </table>`}
     ${earlier.length > 0 &&
-    html`<h3>Earlier changes</h3>
+    html`<h3 class="earlier">Earlier changes</h3>
       <div class="scroll transitions">
         <table class="list">
           <thead><tr><th>Time in the run</th><th class="number">Scan</th><th class="number">From</th><th class="number">To</th><th>Line</th></tr></thead>

@@ -115,12 +115,12 @@ function place({ points, lines }, taken, boxCount, others) {
   const h = lines.length * LINE_H + 4;
   let best = null;
   for (const t of [0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8]) {
-    for (const [ox, oy] of [[0, 0], [0, -h / 2], [0, h / 2], [-w / 2 - 4, 0], [w / 2 + 4, 0], [0, -h - 8], [0, h + 8], [w / 2 + 4, h], [-w / 2 - 4, h]]) {
+    for (const [ox, oy] of [[0, 0], [0, -h / 2], [0, h / 2], [-w / 2 - 4, 0], [w / 2 + 4, 0], [0, -h - 8], [0, h + 8], [w / 2 + 4, h], [-w / 2 - 4, h], [w / 2 + 4, -h], [-w / 2 - 4, -h], [0, -1.5 * h - 12], [0, 1.5 * h + 12], [w, 0], [-w, 0]]) {
       const [x, y] = at(points, t).map((place, n) => place + [ox, oy][n]);
       const frame = [x - w / 2, y - h / 2, x + w / 2, y + h / 2];
       const cost =
         others.filter(([px, py]) => px > frame[0] && px < frame[2] && py > frame[1] && py < frame[3]).length * 60 +
-        taken.reduce((sum, other, k) => sum + overlap(frame, other) * (k < boxCount ? 10 : 1), 0) + Math.hypot(ox, oy) * 0.5 + Math.abs(t - 0.5) * 20;
+        taken.reduce((sum, other, k) => sum + overlap(frame, other) * (k < boxCount ? 200 : 2), 0) + Math.hypot(ox, oy) * 0.5 + Math.abs(t - 0.5) * 20;
       if (!best || cost < best.cost) best = { cost, frame, x, y, w, h };
     }
   }

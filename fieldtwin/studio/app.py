@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
 from fieldtwin.studio.access import Access, AccessMiddleware
-from fieldtwin.studio.api import faults, frames, instances, plc, tags
+from fieldtwin.studio.api import faults, frames, instances, plc, scenarios, tags
 from fieldtwin.studio.api.common import INSTANCE
 from fieldtwin.studio.api.errors import on_error
 from fieldtwin.studio.api.openapi import describe
@@ -25,6 +25,8 @@ from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api.stream import stream
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.live.launching import Launcher
+from fieldtwin.studio.live.recordings import Recordings
+from fieldtwin.studio.live.scenario_run import ScenarioRunner
 
 STATIC = Path(__file__).parent / "static"
 OPERATIONS: tuple[Operation, ...] = (
@@ -33,6 +35,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *frames.OPERATIONS,
     *plc.OPERATIONS,
     *faults.OPERATIONS,
+    *scenarios.OPERATIONS,
 )
 
 
@@ -41,8 +44,14 @@ def application(access: Access, clock: Clock, folder: Path) -> Starlette:
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        async with Launcher() as launcher, Gallery(clock) as gallery:
+        async with (
+            Launcher() as launcher,
+            Gallery(clock) as gallery,
+            Recordings() as recordings,
+            ScenarioRunner() as runner,
+        ):
             app.state.launcher, app.state.gallery, app.state.folder = launcher, gallery, folder
+            app.state.recordings, app.state.runner = recordings, runner
             yield
 
     return Starlette(

@@ -8,6 +8,7 @@ from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.live.gallery import Gallery
+from fieldtwin.studio.live.recordings import Recordings
 
 INSTANCE = "/instances/{instance}"
 
@@ -17,6 +18,13 @@ def gallery_of(request: HTTPConnection) -> Gallery:
     gallery = request.app.state.gallery
     assert isinstance(gallery, Gallery)
     return gallery
+
+
+def recordings_of(request: HTTPConnection) -> Recordings:
+    """Return the scenario recordings of the server, in which handlers note what clients do."""
+    recordings = request.app.state.recordings
+    assert isinstance(recordings, Recordings)
+    return recordings
 
 
 async def attached(request: HTTPConnection) -> Attachment:

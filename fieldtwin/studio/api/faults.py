@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, prototype
+from fieldtwin.studio.api.common import INSTANCE, prototype, recordings_of
 from fieldtwin.studio.api.operation import Operation, body_of
 
 
@@ -45,14 +45,18 @@ async def inject_fault(request: Request) -> dict[str, Any]:
     """Inject a fault and return its id."""
     attachment = await prototype(request)
     form = await body_of(request, InjectFault)
-    found = await attachment.field_channel.call("fault", fault=form.fault, start_ns=attachment.now_ns())
+    now_ns = attachment.now_ns()
+    found = await attachment.field_channel.call("fault", fault=form.fault, start_ns=now_ns)
+    recordings_of(request).note(attachment, now_ns, {"fault": {"id": found["id"], **form.fault}})
     return {"id": found["id"], "active": found["faults"]}
 
 
 async def clear_fault(request: Request) -> dict[str, Any]:
     """Clear one fault."""
     attachment = await prototype(request)
+    now_ns = attachment.now_ns()
     found = await attachment.field_channel.call("clear", id=request.path_params["fault"])
+    recordings_of(request).note(attachment, now_ns, {"clear": request.path_params["fault"]})
     return {"active": found["faults"]}
 
 
@@ -60,7 +64,9 @@ async def clear_faults(request: Request) -> dict[str, Any]:
     """Clear all faults."""
     attachment = await prototype(request)
     for fault in list(attachment.field.faults if attachment.field is not None else []):
+        now_ns = attachment.now_ns()
         await attachment.field_channel.call("clear", id=fault.id)
+        recordings_of(request).note(attachment, now_ns, {"clear": fault.id})
     return {"active": []}
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, attached, by_studio
+from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, recordings_of
 from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.live.state_history import StateChange
 
@@ -52,19 +52,26 @@ async def force_tag(request: Request) -> Any:
     """Force a tag."""
     attachment = await attached(request)
     form = await body_of(request, Force)
-    return await attachment.plc_channel.call("force", tag=form.tag, value=form.value, by=by_studio(request))
+    result = await attachment.plc_channel.call("force", tag=form.tag, value=form.value, by=by_studio(request))
+    recordings_of(request).note(attachment, attachment.now_ns(), None, f"force {form.tag} to {form.value}")
+    return result
 
 
 async def unforce_tag(request: Request) -> Any:
     """Remove the force on a tag."""
     attachment = await attached(request)
-    return await attachment.plc_channel.call("unforce", tag=request.path_params["tag"], by=by_studio(request))
+    tag = request.path_params["tag"]
+    result = await attachment.plc_channel.call("unforce", tag=tag, by=by_studio(request))
+    recordings_of(request).note(attachment, attachment.now_ns(), None, f"remove the force on {tag}")
+    return result
 
 
 async def unforce_all(request: Request) -> Any:
     """Remove all forces."""
     attachment = await attached(request)
-    return await attachment.plc_channel.call("unforce", all=True, by=by_studio(request))
+    result = await attachment.plc_channel.call("unforce", all=True, by=by_studio(request))
+    recordings_of(request).note(attachment, attachment.now_ns(), None, "remove all forces")
+    return result
 
 
 async def pause_plc(request: Request) -> Any:

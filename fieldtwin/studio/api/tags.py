@@ -8,7 +8,7 @@ import msgspec
 from starlette.requests import Request
 
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.studio.api.common import INSTANCE, attached, prototype, tag_of
+from fieldtwin.studio.api.common import INSTANCE, attached, prototype, recordings_of, tag_of
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
 from fieldtwin.studio.live.tag_history import MOST_POINTS
 
@@ -48,7 +48,10 @@ async def set_value(request: Request) -> dict[str, Any]:
     number = float(form.value)
     if number != number or number in (float("inf"), float("-inf")):
         raise UsageError("the value", expected="a finite number")
+    now_ns = attachment.now_ns()
     await attachment.field_channel.call("set", device=device, tag=name, value=number)
+    value = int(number) if number.is_integer() and not isinstance(form.value, bool) else form.value
+    recordings_of(request).note(attachment, now_ns, {"set": {"tag": f"{device}.{name}", "value": value}})
     return {"tag": f"{device}.{name}", "value": number}
 
 
@@ -56,7 +59,9 @@ async def release_value(request: Request) -> dict[str, Any]:
     """Give a simulated device its own value back."""
     attachment = await prototype(request)
     device, name = tag_of(request, attachment)
+    now_ns = attachment.now_ns()
     await attachment.field_channel.call("set", device=device, tag=name, value=None)
+    recordings_of(request).note(attachment, now_ns, {"set": {"tag": f"{device}.{name}", "value": None}})
     return {"tag": f"{device}.{name}", "value": None}
 
 

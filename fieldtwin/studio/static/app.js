@@ -13,6 +13,7 @@ import { Bus } from "./views/bus.js";
 import { Plc } from "./views/plc.js";
 import { Trends } from "./views/trends.js";
 import { Faults } from "./views/faults.js";
+import { Scenario } from "./views/scenario.js";
 
 const VIEWS = {
   overview: { title: "Overview", view: Overview },
@@ -21,6 +22,7 @@ const VIEWS = {
   plc: { title: "PLC", view: Plc },
   trends: { title: "Trends", view: Trends },
   faults: { title: "Faults", view: Faults, prototype: true },
+  scenario: { title: "Scenario", view: Scenario },
 };
 
 function readAddress() {

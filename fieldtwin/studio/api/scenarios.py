@@ -1,0 +1,108 @@
+"""Scenarios: record what is done to a prototype as one, and run those of the instance's system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+
+from fieldtwin.studio.api.common import INSTANCE, attached, prototype, recordings_of
+from fieldtwin.studio.api.errors import NotFound
+from fieldtwin.studio.api.operation import Operation, body_of
+from fieldtwin.studio.live.scenario_run import ScenarioRunner, known_scenarios
+
+
+class RunScenario(msgspec.Struct, forbid_unknown_fields=True):
+    """The file to run, as `GET .../scenarios` lists it, and the target: virtual time, or processes of this computer."""
+
+    path: str
+    target: str = "virtual"
+
+
+class SaveScenario(msgspec.Struct, forbid_unknown_fields=True):
+    """The name of the new file in Studio's working directory, without ``.scenario.yaml``."""
+
+    name: str
+
+
+async def list_scenarios(request: Request) -> dict[str, Any]:
+    """Return the scenario files of the system, and the present or latest run with its result."""
+    attachment = await attached(request)
+    files = known_scenarios(Path(attachment.record.path), _folder(request))
+    return {"files": [msgspec.to_builtins(file) for file in files], "run": _runner(request).state()}
+
+
+async def run_scenario(request: Request) -> dict[str, Any]:
+    """Start a scenario. One runs at a time; it has its own gateway, PLC and devices."""
+    attachment = await attached(request)
+    form = await body_of(request, RunScenario)
+    known = [file.path for file in known_scenarios(Path(attachment.record.path), _folder(request))]
+    if form.path not in known:  # a page must not run arbitrary files
+        raise NotFound(f"no scenario {form.path[:80]!r}", expected=", ".join(known) or "a scenario; there is none")
+    await _runner(request).start(form.path, form.target)
+    return {"run": _runner(request).state()}
+
+
+async def get_run(request: Request) -> dict[str, Any]:
+    """Return the present or latest run."""
+    await attached(request)
+    return {"run": _runner(request).state()}
+
+
+async def stop_scenario(request: Request) -> dict[str, Any]:
+    """Stop the scenario that is running."""
+    await attached(request)
+    await _runner(request).stop()
+    return {"run": _runner(request).state()}
+
+
+async def get_recording(request: Request) -> dict[str, Any]:
+    """Return whether the instance is recorded, the actions so far, and the latest proposed scenario."""
+    return recordings_of(request).state(await attached(request))
+
+
+async def begin_recording(request: Request) -> dict[str, Any]:
+    """Begin to record."""
+    attachment = await prototype(request)
+    await recordings_of(request).begin(attachment)
+    return recordings_of(request).state(attachment)
+
+
+async def finish_recording(request: Request) -> dict[str, Any]:
+    """End the recording and return the proposed scenario as YAML."""
+    attachment = await prototype(request)
+    return {"draft": await recordings_of(request).finish(attachment, _folder(request))}
+
+
+async def save_scenario(request: Request) -> dict[str, Any]:
+    """Write the latest proposed scenario to a new file."""
+    attachment = await prototype(request)
+    form = await body_of(request, SaveScenario)
+    return {"path": str(recordings_of(request).save(attachment, _folder(request).resolve(), form.name))}
+
+
+def _runner(request: Request) -> ScenarioRunner:
+    runner = request.app.state.runner
+    assert isinstance(runner, ScenarioRunner)
+    return runner
+
+
+def _folder(request: Request) -> Path:
+    folder = request.app.state.folder
+    assert isinstance(folder, Path)
+    return folder
+
+
+SCENARIOS = f"{INSTANCE}/scenarios"
+OPERATIONS = (
+    Operation("GET", SCENARIOS, list_scenarios, "List the scenario files of the system"),
+    Operation("POST", SCENARIOS, save_scenario, "Save the recorded scenario", body=SaveScenario, changes=True),
+    Operation("GET", f"{SCENARIOS}/run", get_run, "Read the run of a scenario and its result"),
+    Operation("POST", f"{SCENARIOS}/run", run_scenario, "Run a scenario", body=RunScenario, changes=True),
+    Operation("DELETE", f"{SCENARIOS}/run", stop_scenario, "Stop the running scenario", changes=True),
+    Operation("GET", f"{SCENARIOS}/recording", get_recording, "Read the recording of a scenario"),
+    Operation("POST", f"{SCENARIOS}/recording", begin_recording, "Begin to record a scenario", changes=True),
+    Operation("DELETE", f"{SCENARIOS}/recording", finish_recording, "Finish the recording", changes=True),
+)

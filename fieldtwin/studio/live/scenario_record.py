@@ -1,0 +1,178 @@
+"""Record what clients do to a prototype, and what its tags and programs then do, as a scenario.
+
+A `Recorder` notes actions and changes of one instance; `fieldtwin.studio.live.scenario_proposal` turns its `Recording` into a
+scenario file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.studio.live.attachment import Attachment
+from fieldtwin.twin.plant.physical import bound_programs
+from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.site.system import System
+
+LOOK_EVERY_S = 0.25
+MOST_ACTIONS = 500
+MOST_CHANGES = 50_000
+LONGEST_S = 3600.0
+
+Words = Mapping[str, Mapping[int, str]]
+"""PROGRAM.state, and the word of each of its values."""
+
+
+class Action(NamedTuple):
+    """What a client did. `step` is a step of a scenario; without one, `note` says what a scenario cannot express."""
+
+    t_ns: int
+    step: dict[str, Any] | None
+    note: str = ""
+
+    @property
+    def said(self) -> str:
+        """Return the action for a reader."""
+        if self.step is None:
+            return self.note
+        [(word, what)] = self.step.items()
+        if word == "set":
+            return f"release {what['tag']}" if what["value"] is None else f"set {what['tag']} to {what['value']}"
+        if word == "clear":
+            return f"clear {what}"
+        return f"inject {what['name']}" + "".join(f", {key} {what[key]}" for key in what if key not in ("name", "id"))
+
+
+class Seen(NamedTuple):
+    """A tag from `t_ns` on. The value is noted for tags that were set, and only then is a change of the value noted."""
+
+    t_ns: int
+    value: Any
+    quality: str
+    reason: str
+
+
+class State(NamedTuple):
+    """A state of a program from `t_ns` on."""
+
+    t_ns: int
+    word: str
+
+
+@dataclass
+class Recording:
+    """What was done and observed between two instants on the run's monotonic clock."""
+
+    begin_ns: int
+    end_ns: int = 0
+    actions: list[Action] = field(default_factory=list)
+    tags: dict[str, list[Seen]] = field(default_factory=dict)
+    states: dict[str, list[State]] = field(default_factory=dict)
+    is_full: bool = False
+    """Whether observations are missing because there were too many."""
+
+
+class Recorder:
+    """Records one instance from `begin` to `end`. It looks four times a second: a shorter change is not noted."""
+
+    def __init__(self, attachment: Attachment) -> None:
+        self.attachment = attachment
+        self.recording = Recording(attachment.now_ns())
+        self._words = words_of(attachment.system)
+        self._set: set[str] = set()
+        self._changes = 0
+        self._nursery = Nursery()
+
+    async def begin(self) -> None:
+        """Begin. Raises `UsageError` if faults or forces are active: the scenario would not have them."""
+        field_now = await self.attachment.field_channel.ask("get", FieldStatus)
+        plc = self.attachment.plc
+        active = [*(fault.id for fault in field_now.faults), *(f"set {tag}" for tag in field_now.set)]
+        active += [f"force on {tag}" for tag in (plc.forces if plc is not None else {})]
+        if active:
+            raise UsageError(
+                "a recording begins without faults, set values and forces, because the scenario would not have them",
+                got=", ".join(active)[:200],
+                hint="clear them first",
+            )
+        self._look()
+        self._nursery.start(self._watch(), "scenario recorder")
+
+    async def end(self) -> Recording:
+        """End, and return what was recorded."""
+        self.recording.end_ns = self.recording.end_ns or self.attachment.now_ns()
+        await self._nursery.__aexit__(None, None, None)
+        return self.recording
+
+    @property
+    def has_ended(self) -> bool:
+        """Return whether the recording has ended by itself, after `LONGEST_S` or `MOST_ACTIONS`."""
+        return self.recording.end_ns > 0
+
+    def note(self, t_ns: int, step: dict[str, Any] | None, note: str = "") -> None:
+        """Note an action of a client. After `MOST_ACTIONS` the recording ends."""
+        if self.has_ended:
+            return
+        if step is not None and "clear" in step and step["clear"] not in self._faults():
+            note = f"clear {step['clear']}, which another program had injected"
+            step = None
+        self.recording.actions.append(Action(t_ns, step, note))
+        if step is not None and "set" in step:
+            self._set.add(step["set"]["tag"])
+            self._look()  # the value before the gateway reads the set one
+        if len(self.recording.actions) >= MOST_ACTIONS:
+            self.recording.end_ns = self.attachment.now_ns()
+
+    def _faults(self) -> set[str]:
+        steps = (action.step or {} for action in self.recording.actions)
+        return {step["fault"]["id"] for step in steps if "fault" in step}
+
+    async def _watch(self) -> None:
+        while not self.has_ended:
+            self._look()
+            if self.attachment.now_ns() - self.recording.begin_ns > LONGEST_S * 1e9:
+                self.recording.end_ns = self.attachment.now_ns()
+            await asyncio.sleep(LOOK_EVERY_S)
+
+    def _look(self) -> None:
+        now_ns = self.attachment.now_ns()
+        for name in self.attachment.history.names():
+            point = self.attachment.history.at(name, now_ns)
+            if point is not None:
+                value = point.value if name in self._set else None
+                self._add_tag(name, Seen(point.t_ns, value, point.quality, point.reason))
+        variables = self.attachment.plc.variables if self.attachment.plc is not None else {}
+        for name, words in self._words.items():
+            word = words.get(variables.get(name, -1))
+            states = self.recording.states.setdefault(name, [])
+            if word is not None and (not states or states[-1].word != word) and self._has_room():
+                states.append(State(now_ns, word))
+
+    def _add_tag(self, name: str, seen: Seen) -> None:
+        changes = self.recording.tags.setdefault(name, [])
+        if (not changes or changes[-1][1:] != seen[1:]) and self._has_room():
+            changes.append(seen)
+
+    def _has_room(self) -> bool:
+        self._changes += 1
+        self.recording.is_full = self._changes > MOST_CHANGES
+        return not self.recording.is_full
+
+
+def words_of(system: System) -> Words:
+    """Return the words of the programs' states. A program that cannot be loaded here has none."""
+    try:
+        programs = bound_programs(system, ErrorCollector())
+    except FieldtwinError:
+        return {}
+    return {
+        tag: {int(value): word for value, word in variable.words}
+        for program in programs
+        for variable, tag in program.published()
+        if tag == f"{program.name}.state" and variable.words
+    }

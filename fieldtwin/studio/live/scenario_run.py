@@ -1,0 +1,189 @@
+"""Find the scenario files of a system, and run one of them as a child process: ``fieldtwin test FILE --json``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
+from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.twin.plant.child import command
+
+SUFFIX = ".scenario.yaml"
+MOST_FILES = 200
+MOST_FILE_BYTES = 1 << 20
+MOST_OUTPUT_BYTES = 8 << 20
+MOST_MESSAGE_BYTES = 16_384
+LONGEST_S = 1800.0
+STOPS_WITHIN_S = 10.0
+TARGETS = ("virtual", "local")
+
+
+@dataclass(frozen=True)
+class KnownScenario:
+    """A scenario file. `path` names it in requests; `steps` is its number of steps."""
+
+    path: str
+    title: str
+    steps: int
+
+
+def known_scenarios(system: Path, folder: Path) -> list[KnownScenario]:
+    """Return the scenarios of a system: those in its folder and in `folder` that name it, at most `MOST_FILES`."""
+    places = list(dict.fromkeys([folder.resolve(), system.resolve().parent]))
+    files = [file for place in places for file in sorted(place.glob(f"*{SUFFIX}"))]
+    return [known for file in files[:MOST_FILES] if (known := _known(file, system)) is not None]
+
+
+def _known(file: Path, system: Path) -> KnownScenario | None:
+    try:
+        if not file.is_file() or file.stat().st_size > MOST_FILE_BYTES:
+            return None
+        data = load(file).data
+    except (OSError, FieldtwinError):
+        return None  # `fieldtwin test` reports what is wrong with such a file
+    if not isinstance(data, dict) or not _names(str(data.get("system", "")), file, system):
+        return None
+    steps = data.get("steps")
+    return KnownScenario(str(file), str(data.get("scenario", "")), len(steps) if isinstance(steps, list) else 0)
+
+
+def _names(named: str, file: Path, system: Path) -> bool:
+    """Return whether the key `system` of a file names this system file: by its path, or by the name of a shipped system."""
+    beside = file.parent / named
+    if beside.is_file():
+        return beside.resolve() == system.resolve()
+    return named.removesuffix(".yaml") == system.name.removesuffix(".yaml")
+
+
+class ScenarioRunner:
+    """Runs one scenario at a time. ``async with ScenarioRunner() as runner``: leaving stops the run."""
+
+    def __init__(self) -> None:
+        self._run: _Run | None = None
+
+    async def __aenter__(self) -> ScenarioRunner:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.stop()
+
+    def state(self) -> dict[str, Any] | None:
+        """Return the present or the latest run, None if there was none."""
+        return self._run.state() if self._run is not None else None
+
+    async def start(self, path: str, target: str) -> None:
+        """Start a scenario. Raises `EndpointBusy` while another one runs."""
+        if target not in TARGETS:
+            raise UsageError("the target", expected=" or ".join(TARGETS), got=repr(target[:40]))
+        if self._run is not None and self._run.is_running:
+            raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
+        process = await asyncio.create_subprocess_exec(
+            *command("fieldtwin", "test", path, "--target", target, "--json"),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,
+        )
+        self._run = _Run(path, target, process)
+
+    async def stop(self) -> None:
+        """Stop the run, if one is running."""
+        if self._run is not None:
+            await self._run.stop()
+
+
+class _Run:
+    def __init__(self, path: str, target: str, process: asyncio.subprocess.Process) -> None:
+        self.path = path
+        self._target = target
+        self._process = process
+        self._began_s = time.monotonic()
+        self._took_s = 0.0
+        self._trouble = ""
+        self._result: dict[str, Any] | None = None
+        self._following = asyncio.ensure_future(self._follow())
+
+    @property
+    def is_running(self) -> bool:
+        return not self._following.done()
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "path": self.path,
+            "target": self._target,
+            "running": self.is_running,
+            "elapsed_s": time.monotonic() - self._began_s if self.is_running else self._took_s,
+            "trouble": self._trouble,
+            "result": self._result,
+        }
+
+    async def _follow(self) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        messages = asyncio.ensure_future(_tail(self._process.stderr))
+        try:
+            async with asyncio.timeout(LONGEST_S):
+                output = await _whole(self._process.stdout)
+                await self._process.wait()
+        except TimeoutError:
+            self._trouble = self._trouble or f"stopped after {LONGEST_S:g} s"
+        except _TooLongError:
+            self._trouble = f"stopped: the result is longer than {MOST_OUTPUT_BYTES} bytes"
+        else:
+            self._take(output, await messages)
+        finally:
+            self._took_s = time.monotonic() - self._began_s
+            self._kill()
+            await self._process.wait()
+            messages.cancel()
+
+    def _take(self, output: bytes, messages: bytes) -> None:
+        try:
+            [self._result] = msgspec.json.decode(output, type=list[dict[str, Any]])
+        except (msgspec.MsgspecError, ValueError):
+            said = messages.decode(errors="replace").strip()[-800:]
+            self._trouble = self._trouble or said or "the run ended without a result"
+
+    async def stop(self) -> None:
+        """Interrupt the run, and kill it with its processes if it does not end."""
+        if self.is_running:
+            self._trouble = "stopped"
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGINT)
+            await asyncio.wait([self._following], timeout=STOPS_WITHIN_S)
+            self._kill()
+        await asyncio.gather(self._following, return_exceptions=True)
+
+    def _kill(self) -> None:
+        """Kill what is left of the process group; the processes of a finished run are gone already."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+
+class _TooLongError(Exception):
+    pass
+
+
+async def _whole(stream: asyncio.StreamReader) -> bytes:
+    output = bytearray()
+    while chunk := await stream.read(65_536):
+        output += chunk
+        if len(output) > MOST_OUTPUT_BYTES:
+            raise _TooLongError
+    return bytes(output)
+
+
+async def _tail(stream: asyncio.StreamReader) -> bytes:
+    tail = b""
+    while chunk := await stream.read(4096):
+        tail = (tail + chunk)[-MOST_MESSAGE_BYTES:]
+    return tail

@@ -135,7 +135,7 @@ function Verdict({ run }) {
   const whole = Math.max(result.simulated_s, ...result.checks.map((c) => c.t_s), 0.001);
   return html`<p role="status">
       <span class="chip ${TONE[result.verdict] ?? "warn"}">${result.verdict}</span> <strong>${result.name}</strong>${" "}
-      <span class="soft">${result.simulated_s.toFixed(1)} s on target ${result.target}, which took ${run.elapsed_s.toFixed(1)} s</span>
+      <span class="soft">${result.simulated_s.toFixed(1)} s of the system, target ${result.target}; the run took ${run.elapsed_s.toFixed(1)} s</span>
     </p>
     ${result.reason && html`<p>${result.reason}</p>`}
     ${result.faults.length > 0 &&

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,7 +105,7 @@ class _Run:
         self.path = path
         self._target = target
         self._process = process
-        self._began_s = time.monotonic()
+        self._began_s = asyncio.get_running_loop().time()
         self._took_s = 0.0
         self._trouble = ""
         self._result: dict[str, Any] | None = None
@@ -121,7 +120,7 @@ class _Run:
             "path": self.path,
             "target": self._target,
             "running": self.is_running,
-            "elapsed_s": time.monotonic() - self._began_s if self.is_running else self._took_s,
+            "elapsed_s": asyncio.get_running_loop().time() - self._began_s if self.is_running else self._took_s,
             "trouble": self._trouble,
             "result": self._result,
         }
@@ -141,7 +140,7 @@ class _Run:
         else:
             self._take(output, await messages)
         finally:
-            self._took_s = time.monotonic() - self._began_s
+            self._took_s = asyncio.get_running_loop().time() - self._began_s
             self._kill()
             await self._process.wait()
             messages.cancel()

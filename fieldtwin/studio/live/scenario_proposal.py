@@ -1,7 +1,7 @@
 """Turn a recording of Studio into a scenario file with proposed expectations. Pure: data in, text out.
 
 The actions become steps, with the pauses between them. After each action the file expects what was observed until the next
-one: tags that turned bad, with the reason, tags that became good again, values that a device was told to hold, and states that
+one: tags that turned bad, with the reason, tags that became good again, values that were set in a device, and states that
 programs reached.
 """
 
@@ -103,7 +103,7 @@ def _expected(recording: Recording, n: int) -> Iterator[_Expected]:
 
 
 def _changed(recording: Recording, name: str, n: int) -> _Expected | None:
-    """Return the expectation for a tag that turned bad or good in a period, or that the device was told to hold."""
+    """Return the expectation for a tag that turned bad or good in a period, or whose value was set."""
     begin_ns, end_ns = _period(recording, n)
     changes = recording.tags[name]
     before, after = _at(changes, begin_ns), _at(changes, end_ns)

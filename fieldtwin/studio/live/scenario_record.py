@@ -29,7 +29,7 @@ Words = Mapping[str, Mapping[int, str]]
 
 
 class Action(NamedTuple):
-    """What a client did. `step` is a step of a scenario; without one, `note` says what a scenario cannot express."""
+    """An action of a client. `step` is a step of a scenario; without one, `note` says what a scenario cannot express."""
 
     t_ns: int
     step: dict[str, Any] | None
@@ -66,7 +66,7 @@ class State(NamedTuple):
 
 @dataclass
 class Recording:
-    """What was done and observed between two instants on the run's monotonic clock."""
+    """The actions and observations between two instants on the run's monotonic clock."""
 
     begin_ns: int
     end_ns: int = 0

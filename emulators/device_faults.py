@@ -1,6 +1,6 @@
 """The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
 
-The aim of such a fault may not name buses or devices; it may name a register if the device has a profile. Value faults need a
+Such a fault may not name a bus or device as its target; it may name a register if the device has a profile. Value faults need a
 profile.
 """
 

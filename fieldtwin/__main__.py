@@ -2,7 +2,7 @@
 
 import sys
 
-if sys.hexversion < 0x030B0000:  # a checkout has no installer that says so
+if sys.hexversion < 0x030B0000:  # no installer has checked the Python version of a checkout
     sys.exit("fieldtwin needs Python 3.11 or newer; this is " + sys.version.split()[0])
 
 from fieldtwin.cli.main import main

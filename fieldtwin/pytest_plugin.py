@@ -157,7 +157,9 @@ def _or_fail(make: Callable[[], Any]) -> Any:
         return make()
     except (FieldtwinRefused, FieldtwinUnavailable) as e:
         why = str(e)
-    pytest.fail(f"fieldtwin: {why}", pytrace=False)  # out here: nothing "during handling of" is shown
+    pytest.fail(
+        f"fieldtwin: {why}", pytrace=False
+    )  # outside of the handler, so that pytest shows no "during handling of"
 
 
 @pytest.fixture

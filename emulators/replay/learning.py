@@ -58,8 +58,10 @@ class LearntUnit:
         self.least_refused: dict[int, int] = {}  # function -> fewest cells ever refused with 03
         self.latency: dict[int, tuple[int, float]] = {}  # function -> number, sum
         self.by_situation: dict[int, dict[bytes, OutcomeColumn]] = {0: {}}  # while learning
-        self.columns = self.by_situation[0]  # of the situation that is being recorded
-        self.addresses: dict[Table, list[int]] | None = None  # recorded ones, computed when a gap between them is read
+        self.columns = self.by_situation[0]  # the columns of the present situation
+        self.addresses: dict[Table, list[int]] | None = (
+            None  # recorded addresses, computed when a gap between them is read
+        )
 
     def copy(self) -> LearntUnit:
         """Return a unit that shares the learned data, in its initial state."""

@@ -218,7 +218,7 @@ class RecordedObjects:
         if key not in self._written and key[0] not in _NEVER_INITIAL:
             self.initial.setdefault(key, raw)
         if key[0] in _PDO_PARAMETERS:
-            self._data.put(*key, raw)  # changes the contents of TPDOs from here on
+            self._data.put(*key, raw)  # TPDOs have the new value from now on
         values = self._values.setdefault(key, [])
         if values and values[-1] == raw:
             return

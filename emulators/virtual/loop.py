@@ -143,7 +143,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def create_future(self) -> asyncio.Future[Any]:
         return asyncio.Future(loop=self)
 
-    def create_task(  # 3.14 passes more by keyword, all of it for Task
+    def create_task(  # Python 3.14 passes more keyword arguments, all for Task
         self, coro: Generator[Any, None, T] | Coroutine[Any, Any, T], *, name: object = None, **more: Any
     ) -> asyncio.Task[T]:
         self._tasks += 1

@@ -45,7 +45,7 @@ def write_site(folder: Path, files: Mapping[str, str]) -> None:
             path = folder / name
             for parent in [*reversed(path.parents)]:
                 if not parent.exists():
-                    made.append(parent)  # first, so that an interruption in between leaves nothing
+                    made.append(parent)  # noted first, so that an interruption leaves no folder behind
                     parent.mkdir()
             made.append(path)
             path.write_bytes(text.encode("utf-8", "surrogateescape"))

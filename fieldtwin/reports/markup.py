@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable
 from html import escape
 
-from markupsafe import Markup as Markup  # for those who make or annotate markup with this module
+from markupsafe import Markup as Markup  # re-exported for modules that make or annotate markup
 
 Child = str | Iterable["Child"] | None
 

@@ -100,7 +100,12 @@ class Trace:
 
     def note(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         """Add an event. `data` must be JSON data that is not changed afterwards."""
-        noted = t_ns, kind, where, data  # a tuple: an `TraceEvent` is made only for listeners, as there are millions
+        noted = (
+            t_ns,
+            kind,
+            where,
+            data,
+        )  # a tuple, because there are millions: a `TraceEvent` is made only for listeners
         self._kept.append(noted)
         self._pending.append(noted)
         if len(self._pending) >= _AT_ONCE:

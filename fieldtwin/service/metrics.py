@@ -83,7 +83,7 @@ def families(seen: RunState) -> list[Family]:
         answers = {"gateway": seen.gateway is not None, "plc": seen.plc is not None}.get(name, True)
         up.add(int(lives and answers), process=name)
     if seen.gateway is not None:
-        for part in (_buses, _devices, _tags, _writes, _mailboxes, _masters, _watchers):
+        for part in (_buses, _devices, _tags, _writes, _mailboxes, _clients, _watchers):
             part(page, seen.gateway)
     if seen.plc is not None:
         _plc(page, seen.plc)
@@ -184,7 +184,7 @@ def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
             counted.add(getattr(box, what), device=name, what=what)
 
 
-def _masters(page: Page, gateway: GatewayStatus) -> None:
+def _clients(page: Page, gateway: GatewayStatus) -> None:
     """Add the clients' requests: servers and bridges."""
     counted = page.counter("server_events", "Counters of a server or bridge, by event.")
     fronts: list[tuple[str, Mapping[str, FrontStatus]]] = [("serve", gateway.serve), ("bridge", gateway.bridge)]

@@ -122,7 +122,7 @@ class WorkerProcess:
         last = "".join(deque(self._said, maxlen=5)).strip()
         ended = "no longer answers" if code is None else f"ended with status {code}"
         hint = ""
-        if "No module named" in last:  # this environment has the plugin alone
+        if "No module named" in last:  # only the plugin is installed in this environment
             last, hint = last.splitlines()[-1], f"; --fieldtwin-command or {COMMAND_VARIABLE} sets the command"
         return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
 
@@ -154,5 +154,5 @@ def _pump(process: subprocess.Popen[str], answers: Queue[str | None]) -> None:
         for line in process.stdout:
             answers.put(line)
     except (OSError, ValueError):
-        pass  # closed under our hands: the end
+        pass  # another thread closed the pipe: no further answer can come
     answers.put(None)

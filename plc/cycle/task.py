@@ -192,7 +192,7 @@ class CyclicTask:
             finally:
                 guard.disarm()
         except ScanStuck as e:  # between two programs
-            guard.disarm()  # the alarm may have expired while it was being disarmed
+            guard.disarm()  # the timer may have expired while it was being disarmed
             raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
 
     def stop(self) -> None:

@@ -79,7 +79,7 @@ def emulated_node(
         played = PlayedObjects(tags, dictionary, recording)
         unfed = [
             tag for tag in tags if tag.name not in recording.names
-        ]  # the other tags are distorted when they are played
+        ]  # the faults of the other tags are applied when their recorded values are set
         distorted = DistortedObjects(unfed, dictionary, played, has_model=model is not None, named=True)
         distorted.share(played.distortions, played.names)
     else:

@@ -44,7 +44,7 @@ class CanLogSink(Tap):
         """Ignore bytes: a CAN bus has none."""
 
     def check(self) -> None:
-        """Raises `FileInvalid` when a frame could not be written."""
+        """Check that all frames were written. Raises `FileInvalid` otherwise."""
         if self._error is not None:
             raise self._error
 

@@ -120,7 +120,7 @@ class ModbusAsker:
                 raw, t_ns = await once()
             except ModbusExceptionReply as e:
                 if e.code in (NO_PATH, NO_TARGET):
-                    raise  # a gateway speaks, and not the device
+                    raise  # the exception is that of a gateway, not of the device
                 if e.code not in (ACKNOWLEDGE, BUSY) or busy >= MOST_BUSY:
                     return AskResult(RefusedRead(e.code), self._us(asked_ns), lost + busy + 1)
                 busy += 1

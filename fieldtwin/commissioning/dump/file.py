@@ -165,7 +165,7 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
             if dump is None:
                 dump = Dump(str(path), _header(line))
                 if dump.protocol == "modbus":
-                    dump.scope("holding")  # the ranges must be ranges
+                    dump.scope("holding")  # raises if a range is malformed
             else:
                 cells += _take(dump, line)
                 if keep_lines:

@@ -35,7 +35,7 @@ class ObjectKey:
 
     @classmethod
     def parse(cls, text: str) -> ObjectKey:
-        """Raises ValueError."""
+        """Return the object that `text` names, such as ``1018h:01``. Raises `ValueError`."""
         index, colon, sub = text.partition(":")
         if not colon:
             raise ValueError(text)

@@ -201,7 +201,7 @@ class Sweep:
             self._pair_trials -= 1
             if (yield from self.ask(at, 2)):
                 good = 2
-                if not self.singles:  # a device that has pairs only
+                if not self.singles:  # the device only accepts reads of register pairs
                     self.found.grain = grain = 2
                     self._most -= self._most % 2
         if not good:

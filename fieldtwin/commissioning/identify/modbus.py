@@ -97,7 +97,9 @@ async def identify_modbus(
         on_progress("function 2Bh/0Eh, device identification")
         await asker.identification()
         if "no answer" in result.clues.silence.values() or not result.answers:
-            on_progress("register 0")  # also for servers that lose the request after an unknown function
+            on_progress(
+                "register 0"
+            )  # a pause, also for servers that lose the request after one with an unknown function
             await asker.ask("03", ReadRegisters("holding", 0, 1))
         if result.answers:
             for profile in profiles:

@@ -261,7 +261,7 @@ def _reading(
 
 
 def _twin(tile: _Tile, values: Sequence[float | str]) -> str:
-    """Return the integer type of the other sign, if both read all values alike; "" if a value distinguishes them."""
+    """Return the integer type of the other sign, if both give the same numbers; "" if a value distinguishes them."""
     if "int" not in tile.type:
         return ""
     most = 1 << (16 * tile.size - 1)

@@ -287,7 +287,9 @@ class CanScanner:
             self._tell(PhaseProgress("LSS fastscan", done_s, total_s, "", len(result.nodes)))
             try:
                 while not self._stop() and len(result.unconfigured) < MOST_UNCONFIGURED:
-                    found = await lss.fastscan(verify=not result.unconfigured)  # a node that was found keeps silent now
+                    found = await lss.fastscan(
+                        verify=not result.unconfigured
+                    )  # a node that was found does not answer further scans
                     if found is None:
                         break
                     result.unconfigured.append(found)

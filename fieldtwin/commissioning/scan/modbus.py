@@ -227,7 +227,7 @@ class ModbusScanner:
                 waiting = kin
             result.auditions.append(await self._audition(waiting.pop(0), 0.0))
         found = judge(result.auditions)
-        if found is not None and found.settings != first and not self._stop():  # look for other units
+        if found is not None and found.settings != first and not self._stop():  # listen for longer, to hear other units
             longer = await self._audition(found.settings, options.listen_s, whole=True)
             result.auditions = [longer if a.settings == longer.settings else a for a in result.auditions]
         result.verdict = judge(result.auditions)
@@ -347,7 +347,7 @@ class ModbusScanner:
             if data:
                 sweep.feed(data, clock.monotonic_ns())
             if sweep.other_requests and not self._options.share_bus:
-                self._met_master = True  # silent while we listened: we stop as if it had been heard then
+                self._met_master = True  # the client was silent while the scan listened: stop as if it had been heard
                 self.result.notes.append(
                     "another client started to send, so the scan stopped; --share-bus continues between its exchanges"
                 )
@@ -379,7 +379,7 @@ class ModbusScanner:
     # -- a host ---------------------------------------------------------------------------------------------------
 
     async def _scan_socket(self) -> None:
-        """Ask a few units spread over all IDs first: if all of them answer alike there is one device behind all."""
+        """Ask a few units spread over all IDs first: if all answer with the same bytes, one device serves all IDs."""
         first = spread_over(self._units)
         if len(first) < SPREAD:
             await self._steps([self._pace.step(None, self._units)], "every unit")

@@ -1,7 +1,7 @@
 """Detect one device behind many unit IDs: a device on TCP often answers any unit ID. Pure.
 
-Units are alike if they answer the same question with the same bytes. For a few units that proves little (new meters all
-read 0), for all of them it is conclusive: no installation has 32 devices at 32 IDs spread over the whole range.
+Units may be one device if they answer the same request with the same bytes. For a few units that proves little (new meters
+all read 0), for all of them it is conclusive: no installation has 32 devices at 32 IDs spread over the whole range.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from fieldtwin.commissioning.scan.sweep import UnitAnswer
 
 SPREAD = 32
-"""Number of IDs, spread over the whole range, that must answer alike before they are taken for one device."""
+"""Number of IDs, spread over the whole range, that must give the same answer before they are taken for one device."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """Units that answer alike: `units`. `one_device`: they are one device; otherwise that is only possible."""
+    """`units` that give the same answer. `one_device`: they certainly are one device; otherwise they may be."""
 
     units: tuple[int, ...]
     one_device: bool
@@ -37,11 +37,15 @@ def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnsw
         text = next(iter(contents)).hex(" ")
         if asked >= SPREAD:
             return Alike(units, True, f"all {asked} unit ids that were asked answered with the same bytes ({text})")
-        return Alike(units, False, f"{asked} units answer with the same bytes ({text}): one device, or new ones alike")
+        return Alike(
+            units,
+            False,
+            f"{asked} units answer with the same bytes ({text}): one device, or several new devices with equal values",
+        )
     before = {a.unit: a.reply for a in answers}
     changed = sum(1 for a in again if before.get(a.unit) not in (None, a.reply))
     if asked >= SPREAD and changed > len(answers) // 2:
-        return Alike(units, False, f"all {asked} unit ids answer, and each with something else a moment later")
+        return Alike(units, False, f"all {asked} unit ids answer, and each gives a different answer a moment later")
     return None
 
 

@@ -261,7 +261,7 @@ class UnitSweep:
         for frame in self._splitter.flush():
             self._judge(frame, now_ns)
         if self._now is None:
-            return  # the flush had the answer
+            return  # the answer arrived while the input was flushed
         if asked.noise:
             if self._second_round:
                 self.damaged[asked.unit] = asked.odd

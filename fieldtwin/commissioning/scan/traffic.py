@@ -116,7 +116,7 @@ class LineListener:
         unit.functions.add(function & 0x7F)
         asked, self._open = self._open, None
         if asked is not None and asked.raw == frame.raw and _request_shape(frame.pdu) == "request":
-            heard.repeated += 1  # a write is answered by itself: that is its reply
+            heard.repeated += 1  # the reply to a write repeats the request
             self._open = asked
         elif function & 0x80:
             unit.exceptions += 1

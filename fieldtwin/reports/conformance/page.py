@@ -1,4 +1,4 @@
-"""The conformance report as one HTML file, for devices and clients alike: no network, no script, readable on paper.
+"""The conformance report as one HTML file, for devices and clients: no network, no script, readable on paper.
 
 Failed and open cases come first, with their frames. All cases follow in a table; the frames of the others are folded away
 there. The page's text is in templates/conformance.html.j2.

@@ -427,7 +427,9 @@ class ControlBench(AsyncResource):
         for entry in answer["refusals"]:
             self._refused = entry["number"]
             t_ns = entry["t_ns"] - self._start_ns
-            if t_ns >= 0 or self.target == "local" or entry["standing"]:  # before: of this run, or refused now as well
+            if (
+                t_ns >= 0 or self.target == "local" or entry["standing"]
+            ):  # refused earlier in this run, or refused now as well
                 events.append(TraceEvent(max(0, t_ns), TraceKind.REFUSED, entry["tag"], refusal_data(entry)))
         for number, t_ns, tag, value, quality, reason in answer["changes"]:
             self._since = number
@@ -485,7 +487,7 @@ class ControlBench(AsyncResource):
             return Stopped("plc", what, told.error_at, late_s if watchdog else 0.0)
         if state == "paused" or (state == "ready" and not starting):
             return Stopped("plc", "the PLC is paused" if state == "paused" else "the PLC was not started")
-        if state == "waiting" and told.error:  # its time is over
+        if state == "waiting" and told.error:  # it has waited for its inputs for too long
             return Stopped("plc", told.error)
         self._gateway_seen |= told.gateway_alive
         if told.gateway_alive or (starting and not self._gateway_seen):

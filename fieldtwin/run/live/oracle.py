@@ -39,7 +39,7 @@ class Oracle:
 
         Both come in pieces.
         """
-        while len(self._unjudged) < KEPT:  # the rest next time
+        while len(self._unjudged) < KEPT:  # the rest is checked with the next call
             piece = (await gateway.call("published", since=self._published))["entries"]
             if not piece:
                 break

@@ -128,7 +128,7 @@ class RunSession(AsyncResource):
         self.thread_status: PlantThreadStatus | None = None
         self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
-        self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
+        self.answered_ns: dict[str, int] = {}  # when gateway and PLC last answered
         self._looked_ns = 0
         """The time of this process's last check of the others."""
         self._still_ns = -(1 << 62)

@@ -159,10 +159,10 @@ class Shadowing:
         await to_receivers(self.receiving)(origin, events)
 
     async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
-        """Run additional tasks for the lifetime of the shadow. A shadow has none."""
+        """Run a subclass's additional tasks for the lifetime of the shadow. A plain shadow has no such tasks."""
 
     def _give_up(self) -> None:
-        """Stop without waiting for unfinished work. A shadow has none."""
+        """Stop a subclass's tasks without waiting for unfinished work. A plain shadow has no such tasks."""
 
     async def _flush(self) -> None:
         """Write the remaining data other than the knowledge, after the last event. A shadow has none."""

@@ -96,7 +96,7 @@ def _attempt(scenario: Scenario, target: ScenarioTarget, trace_file: Path | None
     trace = Trace(sink=sink)
     trace.listen(collector.feed)
     try:
-        if refused:  # then the plant is left alone
+        if refused:  # nothing is sent to the plant
             result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
         else:
             result = asyncio.run(_run(scenario, target, trace))

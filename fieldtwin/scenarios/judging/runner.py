@@ -90,7 +90,7 @@ def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _B
 
 
 def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
-    """Return the check that a part of the system broke by failing with `error`, `t_ns` after the run's start."""
+    """Return the result ERROR for a part of the system that failed with `error`, `t_ns` after the run's start."""
     text, where = "every part of the system runs", getattr(error, "place", "")
     return CheckResult("running", text, Verdict.ERROR, t_ns, t_ns, text, str(error), where=where)
 

@@ -38,7 +38,7 @@ async def stream(socket: WebSocket) -> None:
         await socket.send_json({"type": "hello", "status": attachment.status()})
         await _serve(socket, subscription)
     except (WebSocketDisconnect, TimeoutError, RuntimeError):
-        pass  # the client is gone, or takes nothing
+        pass  # the client is gone, or does not read
     finally:
         attachment.updates.unsubscribe(subscription)
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):

@@ -126,7 +126,7 @@ class FrameLog:
         self._filtered: OrderedDict[FrameFilter, tuple[array[int], int]] = OrderedDict()
 
     def close(self) -> None:
-        """Close both files; the temporary one disappears."""
+        """Close both files; the temporary file is deleted."""
         self._capture.close()
         self._rows.close()
 

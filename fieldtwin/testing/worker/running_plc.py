@@ -93,7 +93,7 @@ class PlcProcesses:
         await self._stack.aclose()
 
     def alive(self) -> None:
-        """Raises `ChildFailed` for one that ended by itself."""
+        """Raise `ChildFailed` if a process of the PLC ended by itself."""
         for child in self._children:
             failed = child.failure()
             if failed is not None:

@@ -107,7 +107,10 @@ class AdapterConnection(CanConnection):
         self._sender.shutdown()
         try:
             self._bus.shutdown()
-        except (OSError, can.CanError):  # unplugged: slcan writes to the port, which is gone, and leaves it open
+        except (
+            OSError,
+            can.CanError,
+        ):  # The adapter was unplugged: slcan writes to the missing port, fails, and leaves it open.
             port = getattr(self._bus, "serialPortOrig", None)
             if port is not None:
                 port.close()

@@ -156,7 +156,7 @@ class CanopenBus:
             if not status.reading:
                 self._take_over(status)
                 if status.polling is not None and self._nursery is not None:
-                    status.polling.cancel()  # it may sleep until a poll that is no more
+                    status.polling.cancel()  # it may sleep until a poll that no longer exists
                     status.polling = self._nursery.start(self._poll(status), f"{status.driver.config.name} polls")
         self._taken_over()
 
@@ -552,7 +552,7 @@ class CanopenBus:
             self._offline(status, Unreachable("heartbeat lost"))
             status.wanted.set()
         elif event.kind == "state" and event.state is not NmtState.OPERATIONAL:
-            self._on_offline(status.driver)  # what it does with its outputs then is its own affair
+            self._on_offline(status.driver)  # the node alone decides about its outputs then
             if event.state is NmtState.PRE_OPERATIONAL and status.online and status.driver.config.start:
                 self._start_again(status)
         elif event.kind == "conflict":

@@ -257,7 +257,7 @@ class ModbusBus:
                 async with asyncio.timeout(timeout_s):
                     await self._idle.wait()
             except TimeoutError:
-                pass  # a slow device; the process ends all the same
+                pass  # a slow device must not prevent the end of the process
 
     # -- running --------------------------------------------------------------------------------------------------------
 

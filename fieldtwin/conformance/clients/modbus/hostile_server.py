@@ -185,7 +185,7 @@ class _Client:
                 left -= 1
                 self._stage.pending -= 1
         except ConnectionLost:
-            pass  # the client hung up before it was answered
+            pass  # the client closed the connection before it was answered
         finally:
             self._stage.pending -= left
             self._stage.on_event()

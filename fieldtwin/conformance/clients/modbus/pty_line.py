@@ -32,7 +32,7 @@ class PtyLine:
 
     @classmethod
     async def open(cls, listen: Endpoint, stage: HostileServer) -> PtyLine:
-        """Raises as `PtyEnd.open`."""
+        """Create the port at `listen`. Raises the errors of `PtyEnd.open`."""
         return cls(listen, stage, *await _open(listen))
 
     @staticmethod

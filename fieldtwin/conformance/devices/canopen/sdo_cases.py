@@ -149,7 +149,7 @@ async def _begin_block(wire: NodeConnection, key: Key, size: int, switch: int = 
 
 
 async def _must_have_blocks(wire: NodeConnection, key: Key) -> None:
-    """Raises `NotHere` where a block upload is not done as one."""
+    """Check that the node uploads `key` as a block, and abandon the transfer. Raises `NotHere` otherwise."""
     reply = await _begin_block(wire, key, 127)
     if reply.specifier == 6:
         await wire.abandon(key)

@@ -182,7 +182,7 @@ class DeviceConnection:
             if chunk:
                 data += self._without_echo(chunk)
                 self._quiet_since_ns = self.clock.monotonic_ns()
-                if count:  # something is coming: its rest has the time of a frame
+                if count:  # a reply has begun: its rest may take the time of a frame
                     end_ns = max(end_ns, self._quiet_since_ns + round((self.pause_s + 0.05) * NS_PER_S))
         return data, self._closed
 
@@ -203,7 +203,7 @@ class DeviceConnection:
         heard = await self.hear(within_s=self.timeout_s * (PATIENCE if due else 1))
         if self.framing in ("mbap", "udp"):
             late = [a for a in heard.answers if a.transaction != number]
-            if late and len(late) == len(heard.answers):  # of an earlier request: the reply may follow
+            if late and len(late) == len(heard.answers):  # a reply to an earlier request: ours may follow
                 more = await self.hear()
                 ours = tuple(a for a in more.answers if a.transaction == number)
                 return Received(ours or heard.answers, heard.rest + more.rest, more.closed)

@@ -22,7 +22,7 @@ async def unknown_function(wire: DeviceConnection) -> Finding:
 
 
 async def unknown_bare_function(wire: DeviceConnection) -> Finding:
-    """MB-033: function 41h, without any."""
+    """MB-033: function 41h, without data."""
     return await must_refuse(wire, b"\x41", 0x01)
 
 
@@ -202,7 +202,7 @@ async def counters(wire: DeviceConnection) -> Finding:
         if after := await wire.still_good():
             return failed(f"a request meanwhile: {after}")
     counted = (await _counter(wire, 0x0E) - before) & 0xFFFF
-    if counted in (3, 4):  # the one that asks may count, or not yet
+    if counted in (3, 4):  # the request that reads the counter may be counted or not
         return passed()
     return failed(f"counted {counted} requests instead of 4")
 
@@ -223,7 +223,7 @@ async def listen_only(wire: DeviceConnection) -> Finding:
     try:
         entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
         meanwhile = await wire.ask(wire.good, due=False)
-    finally:  # in any case: the device may be in that mode
+    finally:  # also after a failure, because the device may be in listen-only mode
         left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)
     after = await wire.still_good()
     if entered.first is not None and entered.first.refusal and not after:

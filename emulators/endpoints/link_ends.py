@@ -10,6 +10,7 @@ import asyncio
 import errno
 import os
 import socket
+from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_locally
@@ -22,6 +23,7 @@ from fieldtwin.gateway.core.errors import (
     UsageError,
     os_reason,
 )
+from fieldtwin.gateway.core.files.port_marker import refuse_dead_port
 
 try:
     import fcntl
@@ -241,6 +243,7 @@ class TtyEnd(ByteConnection):
         where = str(endpoint)
         if not TTYS:
             raise Unreachable("this system has no serial devices as files", where=where, hint="a tcp end works")
+        refuse_dead_port(Path(endpoint.path), where)
         try:
             fd = os.open(endpoint.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         except OSError as e:

@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.gateway.core.files.port_marker import mark_port, remove_dead_port, remove_port
 
 try:
     import termios
@@ -50,6 +51,7 @@ class PtyEnd(ByteConnection):
         self.device = os.ttyname(spare)
         self._master = master
         self._spare = spare
+        self._marker = -1
         self._loop = asyncio.get_running_loop()
         self._inward = SerialPacer(pace) if pace else None
         self._outward = SerialPacer(pace) if pace else None
@@ -82,7 +84,7 @@ class PtyEnd(ByteConnection):
             os.set_blocking(master, False)
             _make_raw(spare, pace)
             end = cls(link, endpoint, pace, master, spare)
-            _replace_link(link, end.device, endpoint)
+            end._marker = _replace_link(link, end.device, endpoint)
         except termios.error as e:
             os.close(master)
             os.close(spare)
@@ -230,14 +232,10 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()
-        try:  # before the port is closed: another program may get its number at once
-            if os.readlink(self.link) == self.device:
-                self.link.unlink()
-        except OSError:
-            pass  # already removed, or no longer a link: not ours to remove
-        os.close(self._master)
-        os.close(self._spare)
-        self._master = self._spare = -1
+        remove_port(self.link, self.device)  # before the port is closed: another program may get its number at once
+        for descriptor in (self._master, self._spare, self._marker):
+            os.close(descriptor)
+        self._master = self._spare = self._marker = -1
         self._reading = False
 
 
@@ -257,14 +255,25 @@ def _raise_idle_flags(descriptor: int) -> None:
         termios.tcsetattr(descriptor, termios.TCSANOW, settings)
 
 
-def _replace_link(link: Path, device: str, endpoint: Endpoint) -> None:
-    """Create the link atomically: a program that opens it meanwhile gets either the old port or the new one."""
+def _replace_link(link: Path, device: str, endpoint: Endpoint) -> int:
+    """Create the link and return the descriptor of its marker.
+
+    A program that opens the link meanwhile gets either the old port or the new one. The link of a program that was killed is
+    removed first, because the new marker would make it look like a live one.
+    """
     if os.path.lexists(link) and not link.is_symlink():
         raise EndpointBusy("a file already exists at the path of the virtual serial port", where=f"{endpoint}: {link}")
     beside = link.with_name(f".{link.name}.{os.getpid()}")
+    marker = -1
     try:
+        remove_dead_port(link)
+        marker = mark_port(link, device)
         beside.unlink(missing_ok=True)
         beside.symlink_to(device)
         beside.replace(link)
     except OSError as e:
+        if marker >= 0:
+            remove_port(link, device)
+            os.close(marker)
         raise Unreachable(f"cannot make the link {link}: {e.strerror}", where=str(endpoint)) from e
+    return marker

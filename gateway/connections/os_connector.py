@@ -6,10 +6,12 @@ This module must not know that a simulation exists. A wrapper around the connect
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.port_marker import refuse_dead_port
 
 BYTE_SCHEMES = "rtu:, ascii:, tcp:, rtu+tcp:, udp: or tls:"
 
@@ -22,7 +24,10 @@ class OsConnector(Connector):
     """
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open one of `BYTE_SCHEMES`. Raises the errors of `Connector`."""
+        """Open one of `BYTE_SCHEMES`. Raises the errors of `Connector`.
+
+        The link of a virtual serial port whose program was killed is not followed: it may lead to a foreign terminal.
+        """
         match endpoint.scheme:
             case "rtu" | "ascii":
                 if sys.platform == "win32":  # COM ports have no descriptors
@@ -31,6 +36,7 @@ class OsConnector(Connector):
                     return await ThreadedSerialConnection.open(endpoint)
                 from fieldtwin.gateway.connections.serial.line import SerialConnection
 
+                refuse_dead_port(Path(endpoint.path), str(endpoint))
                 return await SerialConnection.open(endpoint)
             case "tcp" | "rtu+tcp":
                 from fieldtwin.gateway.connections.sockets.tcp import TcpConnection

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import TextIO
 
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.files.port_marker import remove_dead_ports
 
 try:
     import fcntl
@@ -104,6 +105,7 @@ class Instance:
             raise EndpointBusy(
                 f"the instance {self.name!r} is running already", where=str(self.dir), hint="choose another --instance"
             ) from e
+        remove_dead_ports(self.dir)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:

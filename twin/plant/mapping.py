@@ -5,11 +5,9 @@ Emulators are unknown here: this is a Connector that wraps a Connector (DESIGN.m
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 
 class MappedConnector:
@@ -33,35 +31,10 @@ class MappedConnector:
         return target
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open the endpoint that replaces `endpoint`. Also raises `Unreachable` if its virtual serial port no longer exists."""
-        target = self._target(endpoint)
-        if target.is_serial and target != endpoint:
-            _refuse_stale_link(target)
-        return await self._inner.open_bytes(target)
+        return await self._inner.open_bytes(self._target(endpoint))
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
         return await self._inner.open_can(self._target(endpoint), bitrate)
-
-
-def _refuse_stale_link(target: Endpoint) -> None:
-    """Raise `Unreachable` if `target` is a link to a pseudo-terminal that is newer than the link.
-
-    The kernel reuses the numbers of pseudo-terminals. The link of an emulator that was killed may therefore lead to the terminal
-    of another program, and the gateway must not send requests to that. The change time of a pseudo-terminal is the time of its
-    creation, and an emulator makes its link later.
-    """
-    link = Path(target.path)
-    try:
-        device = link.resolve()
-        stale = (
-            link.is_symlink() and device.match("/dev/pts/*") and device.stat().st_ctime_ns > link.lstat().st_mtime_ns
-        )
-    except OSError:
-        return  # opening it gives the reason
-    if stale:
-        raise Unreachable(
-            "the virtual serial port is gone, and its link points to a newer pseudo-terminal", where=str(target)
-        )
 
 
 def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:

@@ -27,6 +27,8 @@ from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.scenarios.judging.waiving import ids_of
 from fieldtwin.scenarios.language.form import invariants_of, load_scenario
+from fieldtwin.site.compose.check import CommandLines, ComposeCheck
+from fieldtwin.site.compose.service import is_compose
 from fieldtwin.twin.plant.physical import image_layout
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.file import load_prototype
@@ -51,28 +53,33 @@ class SiteCheck:
     warnings: list[str] = field(default_factory=list)
 
 
-def check_site(folder: Path, profiles: tuple[Path, ...] = ()) -> SiteCheck:
+def check_site(folder: Path, profiles: tuple[Path, ...] = (), command_lines: CommandLines | None = None) -> SiteCheck:
     """Check every file of a site. `profiles` are folders searched for profiles before the usual ones.
 
-    YAML files of other programs (compose, CI) are left out. Raises `UsageError` if the folder holds no file of fieldtwin.
+    Of compose files, the services that run fieldtwin are checked; `command_lines` checks their command lines. YAML files of
+    other programs are left out. Raises `UsageError` if the folder holds no file of fieldtwin.
     """
     found = SiteCheck(folder)
     collector = ErrorCollector()
     by_kind: dict[str, list[Path]] = {}
     for path in _yaml_files(folder):
         with collector.collect():
-            kind = _kind(path, load(path).data)
+            file = load(path)
+            kind = _kind(path, file.data) or ("compose" if is_compose(file.data) else "")
             if kind:
                 by_kind.setdefault(kind, []).append(path)
                 found.files[str(path.relative_to(folder))] = kind
-    if not by_kind and not collector.errors:
+    if not by_kind.keys() - {"compose"} and not collector.errors:
         raise UsageError(
             "no file of fieldtwin in this folder",
             where=str(folder),
             expected="a system file, and its prototype and scenarios",
             hint="`fieldtwin new DIR` writes a site",
         )
-    _Site(by_kind, profiles, collector, found).check()
+    site = _Site(by_kind, profiles, collector, found)
+    site.check()
+    if command_lines is not None:
+        site.check_compose(command_lines)
     found.errors = sorted(collector.errors, key=lambda e: (e.path, e.line, e.column))
     return found
 
@@ -142,6 +149,16 @@ class _Site:
             with self._errors_of(path):
                 if only is not None:
                     load_planner(str(path), only)
+
+    def check_compose(self, command_lines: CommandLines) -> None:
+        """Check the compose files, after the systems that their services name."""
+        for path in self._of("compose"):
+            with self._errors.collect():
+                check = ComposeCheck(
+                    load(path, merges=True), self._profiles, self._systems, self._of("system"), command_lines
+                )
+                for error in check.errors():
+                    self._errors.add(error)
 
     def _of(self, kind: str) -> list[Path]:
         return self._by_kind.get(kind, [])

@@ -29,16 +29,17 @@ if TYPE_CHECKING:
 @json_option
 def site(folder: Path, profiles: tuple[Path, ...], as_json: bool) -> int:
     """Check all files in DIR (default: the working directory) without running anything: systems, prototypes, scenarios,
-    profiles, networks, faults, rules and waivers.
+    profiles, networks, faults, rules and waivers, and the services of compose files that run fieldtwin.
 
     Every error is reported in one run, one per line, with file, line and column: for example each reference to a device,
-    a bus, a tag or a program that was renamed or removed. Files of other programs, such as compose files, are left out.
+    a bus, a tag or a program that was renamed or removed. Files of other programs, such as CI files, are left out.
 
     Exit code 0 without errors, else 1.
     """
+    from fieldtwin.cli import command_lines
     from fieldtwin.site.check import check_site
 
-    found = check_site(folder, profiles)
+    found = check_site(folder, profiles, command_lines)
     if as_json:
         click.echo(json.dumps(_as_json(found), indent=2))
     else:

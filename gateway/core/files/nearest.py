@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 ALIKE = 0.5
@@ -10,9 +11,16 @@ ALIKE = 0.5
 
 
 def nearest(name: str, known: Iterable[str], most: int = 1) -> list[str]:
-    """Return the `known` names that are similar to `name`, at most `most`, the most similar first. Case does not matter."""
+    """Return the `known` names that are similar to `name`, at most `most`, the most similar first. Case does not matter.
+
+    A name that contains `name` as a whole word comes first: `supply_fan` for `fan`.
+    """
     names = {k.lower(): k for k in known}
-    return [names[near] for near in difflib.get_close_matches(name.lower(), names, n=most, cutoff=ALIKE)]
+    whole = re.compile(rf"(?:^|.*[^a-z0-9]){re.escape(name.lower())}(?:[^a-z0-9].*|$)") if name else None
+    longer = [k for k in names if whole is not None and whole.fullmatch(k)]
+    alike = difflib.get_close_matches(name.lower(), longer, n=most, cutoff=0)
+    alike += difflib.get_close_matches(name.lower(), [k for k in names if k not in longer], n=most, cutoff=ALIKE)
+    return [names[near] for near in alike[:most]]
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:

@@ -41,6 +41,8 @@ M = TypeVar("M", bound=BaseModel)
 class _Loader(yaml.SafeLoader):
     """A SafeLoader with the scalars of YAML 1.2's core schema."""
 
+    merges = False
+
 
 _Loader.yaml_implicit_resolvers = {}
 for _tag, _pattern, _first in (
@@ -76,6 +78,15 @@ def _number(loader: _Loader, node: yaml.ScalarNode) -> float:
 _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 _Loader.add_constructor("tag:yaml.org,2002:float", _number)
 
+
+class _MergingLoader(_Loader):
+    """A loader that resolves `<<`, which compose files use. In files of fieldtwin `<<` is an unknown key."""
+
+    merges = True
+
+
+_MergingLoader.add_implicit_resolver("tag:yaml.org,2002:merge", re.compile("^<<$"), ["<"])
+
 _OTHER_FILES = (
     (b"PK\x03\x04", "a zip; if it is a template: fieldtwin template unpack"),
     (b"\xff\xfe", "it looks like UTF-16: save it as UTF-8"),
@@ -109,8 +120,8 @@ class YamlFile:
         return FileInvalid(message, path=self.path, line=line, column=column, expected=expected, got=got, hint=hint)
 
 
-def load(path: Path) -> YamlFile:
-    """Read and parse `path`. The top level must be a mapping."""
+def load(path: Path, *, merges: bool = False) -> YamlFile:
+    """Read and parse `path`. The top level must be a mapping. With `merges`, `<<` adds the keys of another mapping."""
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8")
     except OSError as e:
@@ -119,14 +130,14 @@ def load(path: Path) -> YamlFile:
         hint = next((told for begins, told in _OTHER_FILES if e.object.startswith(begins)), "")
         got = f"byte {e.object[e.start]:02X}h"
         raise FileInvalid("the file is not UTF-8 text", path=str(path), got=got, hint=hint) from e
-    return parse(text, str(path))
+    return parse(text, str(path), merges=merges)
 
 
-def parse(text: str, path: str) -> YamlFile:
+def parse(text: str, path: str, *, merges: bool = False) -> YamlFile:
     """Parse YAML text; `path` is for messages."""
     loader: _Loader | None = None
     try:
-        loader = _Loader(text)
+        loader = _MergingLoader(text) if merges else _Loader(text)
         node = loader.get_single_node()
         positions: dict[tuple[Key, ...], Position] = {}
         if not isinstance(node, yaml.MappingNode):
@@ -161,12 +172,14 @@ def _note_positions(
             _note_positions(loader, child, (*loc, i), out, path)
     elif isinstance(node, yaml.MappingNode):
         seen: dict[Any, int] = {}
+        if loader.merges:
+            loader.flatten_mapping(node)  # merged keys come first, and a key of the mapping itself replaces them
         for key_node, value_node in node.value:
             line, column = key_node.start_mark.line + 1, key_node.start_mark.column + 1
             if not isinstance(key_node, yaml.ScalarNode):
                 raise FileInvalid("a key must be a plain word", path=path, line=line, column=column)
             key = loader.construct_object(key_node)
-            if key in seen:
+            if key in seen and not loader.merges:
                 raise FileInvalid(
                     f"the key {key!r} is defined twice",
                     path=path,

@@ -24,3 +24,10 @@ def test_suggestions_are_known_names_and_a_known_name_in_another_case_is_the_fir
 def test_a_hint_quotes_the_name_as_it_is_written() -> None:
     assert did_you_mean("SETPINT", ["Setpoint", "other"]) == "did you mean 'Setpoint'?"
     assert did_you_mean("x", ["Setpoint"], "see the manual") == "see the manual"
+
+
+def test_a_longer_name_with_the_whole_name_comes_before_a_similar_one() -> None:
+    assert did_you_mean("fan", ["supply_fan", "panel"]) == "did you mean 'supply_fan'?"
+    assert did_you_mean("fan.frequency", ["panel.frequency", "supply_fan.frequency"]) == (
+        "did you mean 'supply_fan.frequency'?"
+    )

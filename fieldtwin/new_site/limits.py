@@ -42,9 +42,10 @@ def supervised(profile: DeviceProfile) -> Tag | None:
     """Return the tag that the program and the scenarios of a new site watch; None if the profile has no number to watch.
 
     Values for which the profile states a plausible range come first, then measured values with a unit, then other read-only
-    numbers, and setpoints last.
+    numbers, then setpoints, and the scale factors of other tags last.
     """
     sampled = profile.sampled
+    factors = {tag.scale_by for tag in profile.tags.values()}
     plausible = {rule.tag for rule in profile.form.identify if rule.between is not None}
     candidates = [
         tag
@@ -53,7 +54,7 @@ def supervised(profile: DeviceProfile) -> Tag | None:
         and not (tag.is_text or tag.counter or tag.secret)
         and (sampled is None or (tag.poll == sampled.poll and tag.name not in (sampled.count, sampled.period)))
     ]
-    return min(candidates, key=lambda tag: (tag.name not in plausible, *_rank(tag)), default=None)
+    return min(candidates, key=lambda tag: (tag.name not in plausible, tag.name in factors, *_rank(tag)), default=None)
 
 
 def _rank(tag: Tag) -> tuple[bool, ...]:

@@ -301,3 +301,8 @@ def test_a_dangerous_or_permanent_setting_is_never_an_output(tmp_path: Path) -> 
         "tank.pump_speed",
         *(f"{name}.sample_period_s" for name in ("ctd_reference", "current_meter", "oxygen_optode")),
     }
+
+
+def test_a_scale_factor_is_not_the_supervised_value(tmp_path: Path) -> None:
+    new(tmp_path / "solar", "--device", "sunspec-inverter-103", "--control", "st")
+    assert "_sf :" not in (tmp_path / "solar" / "solar.st").read_text()

@@ -11,6 +11,14 @@ from procs import CHECKOUT, every_device_online, fieldtwin, free_port, no_traceb
 RUN = ("run", "observatory", "--prototype", "--json", "--instance", "r")
 
 
+def test_the_printed_command_finds_a_system_of_the_user(tmp_path: Path) -> None:
+    """The bare name of a system finds only shipped ones and those in ./profiles."""
+    site = tmp_path / "hall"
+    assert run_to_end(tmp_path, "new", str(site), "--yes", "--control", "none", name="new").process.returncode == 0
+    with fieldtwin(tmp_path, "emulate", str(site / "hall.yaml"), name="field") as side:
+        wait_for(lambda: f"now: fieldtwin run {site}/hall.yaml --prototype" in side.err, 20, "its advice")
+
+
 @pytest.mark.long
 def test_one_field_simulator_serves_several_runs(tmp_path: Path) -> None:
     port = free_port()

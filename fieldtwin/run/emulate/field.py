@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from fieldtwin.console import stderr
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.plant.child import allow_open_files
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.field_process import FieldConfig, FieldProcess, resolve
+from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.system import load_system
 
 
@@ -64,4 +67,15 @@ def _say(side: FieldSimulator, process: FieldProcess, options: FieldOptions) -> 
         "" if host in ("", "127.0.0.1", "localhost") and process.control_port == 7420 else f":{process.control_port}"
     )
     here = "localhost" if host in ("", "127.0.0.1", "localhost") else "THIS-HOST"
-    stderr.print(f"  now: fieldtwin run {side.system.name} --prototype --field {here}{where}", soft_wrap=True)
+    system = _word(side.system.name, options)
+    stderr.print(f"  now: fieldtwin run {system} --prototype --field {here}{where}", soft_wrap=True, markup=False)
+
+
+def _word(name: str, options: FieldOptions) -> str:
+    """Return the system as the user can give it to another command: a bare name if it finds this file, else the path."""
+    try:
+        if find("systems", name, extra=options.profiles).resolve() == options.system.resolve():
+            return name
+    except UsageError:
+        pass
+    return shlex.quote(str(options.system))

@@ -73,7 +73,7 @@ def _index_of(words: Sequence[str], at: int, error: click.UsageError, value: str
 
 
 def variables_of(command: str) -> list[str]:
-    """Return the environment variables of a command's options, or an empty list if there is no such command."""
+    """Return the environment variables of a command's options; an unknown command has none."""
     inner = cli.get_command(click.Context(cli), command) if command in COMMANDS else None
     if inner is None:
         return []

@@ -29,7 +29,7 @@ class CommandLines(Protocol):
         """Return the wrong words of a command line."""
 
     def variables_of(self, command: str, /) -> Sequence[str]:
-        """Return the environment variables of a command; none if there is no such command."""
+        """Return the environment variables of a command; an unknown command has none."""
 
 
 class ComposeCheck:
@@ -129,7 +129,7 @@ class ComposeCheck:
         except UsageError as e:
             return FileInvalid(e.message, path=self._file.path, expected=e.expected, hint=e.hint)
         except FileInvalid:
-            return None  # a network, a fleet or a device: it has no buses of its own
+            return None  # a network, a fleet or a device: it defines no buses
 
     def _bus_errors(self, service: Service, system: System) -> Iterator[FileInvalid]:
         if service.words[0] != "emulate":

@@ -32,7 +32,8 @@ class CanopenBusDecoder:
 
     def __init__(self, bus: str, devices: Iterable[DeviceConfig]) -> None:
         self.bus = bus
-        self._nodes = {d.address: NodeMap(d) for d in devices}
+        self.nodes = {d.address: NodeMap(d) for d in devices}
+        """The known nodes, with what was learnt about their PDOs so far."""
         self._sdo: dict[int, SdoWatch] = {}
         self._lss = LssWatch(bus)
         self._pdos: dict[int, Pdo] = {}
@@ -105,10 +106,10 @@ class CanopenBusDecoder:
         ]  # fmt: skip
 
     def _device(self, node: int) -> str:
-        return self._nodes[node].name if node in self._nodes else ""
+        return self.nodes[node].name if node in self.nodes else ""
 
     def _secrets(self, node: int, spans: tuple[TouchedSpan, ...]) -> frozenset[str]:
-        return self._nodes[node].tags.secrets(spans) if node in self._nodes else frozenset()
+        return self.nodes[node].tags.secrets(spans) if node in self.nodes else frozenset()
 
     def _called(self, node: int) -> str:
         return self._device(node) or f"node {node}"
@@ -138,7 +139,7 @@ class CanopenBusDecoder:
         return self._message(t_ns, node, "boot-up" if booted else "heartbeat", text, data, value=_STATES[state])
 
     def _pdo(self, pdo: Pdo, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
-        head, node = f"{self._called(pdo.node)}: {pdo.name}", self._nodes.get(pdo.node)
+        head, node = f"{self._called(pdo.node)}: {pdo.name}", self.nodes.get(pdo.node)
         if pdo.mapping is None or node is None:
             return self._message(t_ns, pdo.node, pdo.name, f"{head} {data.hex(' ')}", data)
         try:
@@ -183,7 +184,7 @@ class CanopenBusDecoder:
         return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
 
     def _stray(self, node: int, text: str, data: bytes, t_ns: int) -> DecodedExchange:
-        hidden = node in self._nodes and self._nodes[node].tags.has_secrets
+        hidden = node in self.nodes and self.nodes[node].tags.has_secrets
         text = f"{self._called(node)}: {text}: " + (
             f"{SECRET}: the device has secret tags" if hidden else data.hex(" ")
         )
@@ -194,13 +195,13 @@ class CanopenBusDecoder:
 
     def _asked(self, node: int, transfer: Transfer) -> str:
         """Return the request of a transfer, with the name of the object and the value of an expedited write."""
-        known = self._nodes.get(node)
+        known = self.nodes.get(node)
         name = known.named(transfer.index, transfer.subindex) if known else transfer.name
         text = f"{self._called(node)}: {transfer.service} {name}" + (" in blocks" if transfer.block else "")
         return text if transfer.upload or not transfer.data else f"{text} = {self._said(node, transfer)}"
 
     def _said(self, node: int, transfer: Transfer) -> str:
-        data, known = bytes(transfer.data), self._nodes.get(node)
+        data, known = bytes(transfer.data), self.nodes.get(node)
         if not data:
             return "nothing"
         return known.said(transfer.index, transfer.subindex, data, transfer.t_ns) if known else data.hex(" ")
@@ -210,10 +211,10 @@ class CanopenBusDecoder:
         text = self._asked(node, transfer)
         failed = transfer.abort is not None or bool(problem)
         ended = problem not in ("no reply", "pending")
-        known_node = None if failed else self._nodes.get(node)
+        known_node = None if failed else self.nodes.get(node)
         if known_node is not None and known_node.learn(transfer.index, transfer.subindex, bytes(transfer.data)):
             self._find_pdos()
-        named = self._nodes[node].named(transfer.index, transfer.subindex) if node in self._nodes else transfer.name
+        named = self.nodes[node].named(transfer.index, transfer.subindex) if node in self.nodes else transfer.name
         if transfer.abort is not None:
             reply_text = f"{named}: abort {transfer.abort:08X}h {meaning(transfer.abort)}"
             reply_text += " (by the master)" if transfer.aborted_by == "client" else ""
@@ -233,7 +234,7 @@ class CanopenBusDecoder:
 
     def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None]:
         """Return the tags and the value that a transfer has moved so far; the tags' names alone if it moved no data."""
-        data, known = bytes(transfer.data), self._nodes.get(node)
+        data, known = bytes(transfer.data), self.nodes.get(node)
         if known is None:
             return {}, data.hex()
         if not data:
@@ -242,7 +243,7 @@ class CanopenBusDecoder:
         return known.value(transfer.index, transfer.subindex, data, t_ns)
 
     def _find_pdos(self) -> None:
-        self._pdos = {cob: pdo for node in self._nodes.values() for cob, pdo in node.pdos.items()}
+        self._pdos = {cob: pdo for node in self.nodes.values() for cob, pdo in node.pdos.items()}
 
 
 def _span(transfer: Transfer) -> TouchedSpan:

@@ -14,8 +14,11 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.canopen_fields import canopen_fields
 from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
+from fieldtwin.capture.decoding.fields import FieldSpan
 from fieldtwin.capture.decoding.modbus_connection import KnownUnit, ModbusConnectionDecoder
+from fieldtwin.capture.decoding.modbus_fields import modbus_fields
 from fieldtwin.capture.decoding.tags import TagMap, show_value
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -71,16 +74,30 @@ class Decoder:
         wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.pending()), key=lambda e: e.t_ns)
 
+    def fields(self, event: TraceEvent, request: bytes = b"") -> list[FieldSpan]:
+        """Explain the bytes of a frame field by field, with the present knowledge about its bus.
+
+        `request` is the whole frame that a reply answers. Nothing is returned for a frame that cannot be read.
+        """
+        data = event.data
+        try:
+            raw = bytes.fromhex(data.get("bytes", ""))
+            if "id" in data:
+                return canopen_fields(_can_frame(data, raw), self._can(event.where).nodes)
+        except (ValueError, TypeError, FieldtwinError):
+            return []
+        wire = self._line(event.where)
+        if wire is None:
+            return [FieldSpan(0, len(raw), "bytes", raw.hex(" "), "The protocol of this bus is not known.")]
+        is_request = (data.get("dir") == "sent") != wire.served
+        return modbus_fields(wire.framing, is_request, raw, request, wire.tags)
+
     def _frame(self, event: TraceEvent) -> tuple[str, list[DecodedExchange]]:
         data = event.data
         try:
             raw = bytes.fromhex(data.get("bytes", ""))
             if "id" in data:
-                frame = CanFrame(
-                    data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")),
-                    error=bool(data.get("err")),
-                )  # fmt: skip
-                return self._can(event.where).feed(frame, event.t_ns)
+                return self._can(event.where).feed(_can_frame(data, raw), event.t_ns)
         except (ValueError, TypeError, FieldtwinError):
             return f"unreadable: {data}", []
         wire = self._line(event.where)
@@ -137,6 +154,12 @@ class Decoder:
         if device not in self._maps:
             self._maps[device] = TagMap(config.profile)
         return self._maps[device].show({name: value}).removeprefix(f"{name} ")
+
+
+def _can_frame(data: Mapping[str, Any], raw: bytes) -> CanFrame:
+    return CanFrame(
+        data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")), error=bool(data.get("err"))
+    )
 
 
 def exchanges(system: System, events: Iterable[TraceEvent], served: Collection[str] = ()) -> list[DecodedExchange]:

@@ -50,20 +50,26 @@ class ModbusConnectionDecoder:
         self, bus: str, framing: str, units: dict[int, KnownUnit], *, echo: bool = False, served: bool = False
     ) -> None:
         self.bus = bus
+        self.framing = framing
+        self.served = served
         self._units = units
         self._serial = framing in ("rtu", "ascii")
         self._requests, self._replies = splitter(framing), splitter(framing)
         self._datagrams = framing == "udp"
         self._echo = echo and self._serial
         self._echo_due = b""
-        self._served = served
         self._open: dict[int, _Open] = {}  # by transaction ID; a serial line has one entry, with ID -1
         self._given_up: deque[int] = deque(maxlen=MAX_OPEN)
         self._cut_off = False
 
+    @property
+    def tags(self) -> dict[int, TagMap]:
+        """Return the tags of the known devices by unit ID."""
+        return {unit: known.tags for unit, known in self._units.items()}
+
     def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[DecodedExchange]]:
         """Add a chunk, in the order of the trace. Each text describes a whole or partial frame."""
-        return self._take_requests(data, t_ns) if sent != self._served else self._take_replies(data, t_ns)
+        return self._take_requests(data, t_ns) if sent != self.served else self._take_replies(data, t_ns)
 
     def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: requests that still wait have no answer."""
@@ -86,7 +92,7 @@ class ModbusConnectionDecoder:
         texts: list[str] = []
         done: list[DecodedExchange] = []
         frames = self._requests.feed(data, t_ns)
-        if not self._served:
+        if not self.served:
             frames += self._requests.flush()  # each chunk that is sent is one whole frame
             self._echo_due = data if self._echo else b""
         for frame in frames:
@@ -176,7 +182,7 @@ class ModbusConnectionDecoder:
                 texts.append(self._stray(frame, done))
                 continue
             del self._open[frame.transaction]
-            if not self._serial and not self._served:
+            if not self._serial and not self.served:
                 done += self._older(opened)
             if frame.bad:
                 done.append(self._exchange(opened, frame, frame.bad, "damaged: the check sum is wrong"))

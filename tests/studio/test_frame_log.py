@@ -76,7 +76,10 @@ def test_frames_are_found_by_time_and_exported_as_they_were_captured(capture: Pa
     frames = read(FrameLog(capture, load_system("observatory")))
     assert frames.position_at(500_000_000) == 2
     assert frames.position_at(10**12) == 4
-    assert [c.item.hex() for c in frames.captured(0, 1) if isinstance(c.item, bytes)] == [REQUEST, REPLY]
+    assert [c.item.hex() for c in frames.captured(frames.numbers(0, 1)) if isinstance(c.item, bytes)] == [
+        REQUEST,
+        REPLY,
+    ]
     assert len(read(frames)) == 4
     frames.close()
 
@@ -93,3 +96,26 @@ def test_invalid_lines_are_counted_and_do_not_end_the_reading(capture: Path) -> 
 def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot read the capture"):
         FrameLog(tmp_path / "none", load_system("observatory"))
+
+
+def test_the_last_piece_of_a_reply_is_explained_with_the_pieces_before_it(tmp_path: Path) -> None:
+    path = tmp_path / "capture.jsonl"
+    written(path, (0, "sent", REQUEST), (12, "received", REPLY[:6]), (14, "received", REPLY[6:]))
+    frames = read(FrameLog(path, load_system("observatory")))
+    assert frames.row(2).whole == REPLY
+    spans = {s.name: s.value for s in frames.fields(2)}
+    assert spans["sample_period_s"].startswith("5 s")
+    assert spans["CRC"] == "right"
+    assert sum(s.length for s in frames.fields(2)) == len(REPLY) // 2
+    assert sum(s.length for s in frames.fields(1)) == 3
+    assert frames.row(1).whole == ""
+    frames.close()
+
+
+def test_numbers_are_those_of_accepted_frames_in_the_range(capture: Path) -> None:
+    frames = read(FrameLog(capture, load_system("observatory")))
+    problems = FrameFilter(problems=True)
+    assert list(frames.numbers(0, 99, problems)) == [2]
+    assert list(frames.numbers(0, 1, problems)) == []
+    assert list(frames.numbers(1, 99)) == [1, 2, 3]
+    frames.close()

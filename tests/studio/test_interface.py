@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,6 +13,7 @@ import websockets
 from studio_rig import OPERATE, VIEW, Studio, until
 
 from fieldtwin.capture.formats.pcap import MAGIC_NS
+from fieldtwin.gateway.core.files.recording import RecordingReader
 
 NAME = "/instances/observatory"
 
@@ -101,6 +103,43 @@ def test_frames_are_exported_as_pcap_and_candump(observatory: Studio) -> None:
         mixed = client.get(f"{NAME}/frames/export", params={"format": "pcap"})
         assert mixed.status_code == 400
         assert "one bus" in mixed.json()["error"]["message"]
+        assert "can0" in mixed.json()["error"]["message"]
+
+
+def test_a_selection_is_exported_as_a_recording_that_can_be_read(observatory: Studio, tmp_path: Path) -> None:
+    with observatory.client(VIEW) as client:
+        params = {"device": "ctd", "format": "recording"}
+        until(lambda: len(latest(client, device="ctd")) > 10, "frames of the sensor")
+        file = tmp_path / "ctd.jsonl"
+        file.write_bytes(client.get(f"{NAME}/frames/export", params=params).raise_for_status().content)
+        can = client.get(f"{NAME}/frames/export", params={"bus": "can0", "format": "recording"})
+        assert can.status_code == 400
+        assert "candump" in can.json()["error"]["message"]
+        unknown = client.get(f"{NAME}/frames/export", params={"format": "xls"})
+        assert "pcap, candump, recording" in unknown.json()["error"]["message"]
+    with RecordingReader(file) as recording:
+        assert recording.header.prototype
+        assert [e for e in recording.exchanges() if e.reply is not None]
+
+
+def test_a_frame_has_its_fields_and_the_changes_of_tags_after_it(observatory: Studio) -> None:
+    with observatory.client() as client:
+        client.put(f"{NAME}/tags/ctd.sample_period_s/set", json={"value": 9}).raise_for_status()
+        reply = until(
+            lambda: next((r for r in latest(client, device="ctd") if r["tags"].get("sample_period_s") == 9), None),
+            "the value is read",
+        )
+        shown = until(
+            lambda: (d := client.get(f"{NAME}/frames/{reply['number']}").json())["effects"] and d,
+            "the change is recorded",
+        )
+        client.delete(f"{NAME}/tags/ctd.sample_period_s/set").raise_for_status()
+    fields = {f["name"]: f for f in shown["fields"]}
+    assert fields["sample_period_s"]["value"].startswith("9 s")
+    assert sum(f["length"] for f in shown["fields"]) == len(shown["whole"] or shown["bytes"]) // 2
+    [effect] = [e for e in shown["effects"] if e["tag"] == "ctd.sample_period_s"]
+    assert (effect["value"], effect["quality"], effect["program"]) == (9, "good", "")
+    assert effect["before"] != 9
 
 
 def test_a_force_is_seen_recorded_and_removed(observatory: Studio) -> None:

@@ -57,3 +57,14 @@ def test_memory_is_bounded_and_the_oldest_changes_are_dropped() -> None:
     assert len(found) == LEAST_OF_A_TAG
     assert found[0].t_ns == 5
     assert LEAST_OF_A_TAG < MOST_OF_A_TAG
+
+
+def test_changes_of_an_interval_have_the_point_before_each() -> None:
+    history = TagHistory(["a.b"])
+    points = [Point(t, v, "good", "none") for t, v in ((10, 1), (20, 2), (30, 3), (40, 4))]
+    for point in points:
+        history.add("a.b", point)
+    assert history.changes("a.b", 20, 35) == [(points[0], points[1]), (points[1], points[2])]
+    assert history.changes("a.b", 0, 10) == [(None, points[0])]
+    assert history.changes("a.b", 41, 99) == []
+    assert history.changes("no.tag", 0, 99) == []

@@ -352,7 +352,8 @@ def _groups(tags: TagMap | None, whole: TouchedSpan, values: Mapping[str, object
         return {}
     profile = tags.profile
     places = [(t.at, t.name) for t in profile.tags.values() if t.at is not None and t.name in values]
-    places += [(m.at, m.name) for m in profile.messages.values() if m.name in values]
+    blocks = [m for m in profile.messages.values() if m.name in values]
+    places += [(m.at, m.name) for m in blocks if not any(at.overlaps(m.at) for at, _ in places)]
     groups: list[tuple[int, int, list[str]]] = []
     for at, name in sorted(places, key=lambda p: (p[0].address, p[0].end)):
         if groups and at.address < groups[-1][1]:

@@ -12,16 +12,25 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from fieldtwin.capture.formats.pcap import write_pcap
+from fieldtwin.capture.recordings.importing import import_capture
+from fieldtwin.gateway.connections.tap import Captured, TapFile
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.recording import RecordingHeader
 from fieldtwin.studio.api.common import INSTANCE, attached
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, Parameter, whole, yes
 from fieldtwin.studio.live.attachment import Attachment
+from fieldtwin.studio.live.effects import effects_of
 from fieldtwin.studio.live.frame_log import FrameFilter, FrameLog, FrameRow
+from fieldtwin.twin.site.system import System
 
 MOST_ROWS = 500
 MOST_EXPORTED = 200_000
+AT_ONCE = 2_000
+"""Frames that an export reads before it lets other requests be answered."""
+FORMATS = ("pcap", "candump", "recording")
 FILTERS = (
     Parameter("bus", "string", "only frames of this bus"),
     Parameter("device", "string", "only frames of this device"),
@@ -59,15 +68,20 @@ async def list_frames(request: Request) -> dict[str, Any]:
 
 
 async def get_frame(request: Request) -> dict[str, Any]:
-    """Return one frame, with the frames that it belongs to."""
-    frames, text = _frames(await attached(request)), request.path_params["number"]
+    """Return one frame with its fields, the frames that it belongs to, and the changes of tags after it."""
+    attachment = await attached(request)
+    frames, text = _frames(attachment), request.path_params["number"]
     number = int(text) if text.isdigit() else -1
     try:
         row = frames.row(number)
     except IndexError as e:
         raise NotFound(f"no frame {text[:20]!r}", expected=f"0 to {len(frames) - 1}") from e
     linked = [n for n in (row.request, frames.reply_to(number)) if n is not None]
-    return shown(frames, number, row) | {"linked": [shown(frames, n, frames.row(n)) for n in linked]}
+    return shown(frames, number, row) | {
+        "linked": [shown(frames, n, frames.row(n)) for n in linked],
+        "fields": frames.fields(number),
+        "effects": [effect._asdict() for effect in effects_of(attachment, frames, number)],
+    }
 
 
 async def list_services(request: Request) -> list[str]:
@@ -76,38 +90,88 @@ async def list_services(request: Request) -> list[str]:
 
 
 async def export_frames(request: Request) -> Response:
-    """Return a selection of frames as a file: pcap (one bus) or candump (CAN buses)."""
+    """Return a selection of frames as a file: pcap or recording (one bus), or candump (CAN buses)."""
     attachment = await attached(request)
     frames, wanted = _frames(attachment), _wanted(request)
-    first, last = whole(request, "first", 0), whole(request, "last", len(frames) - 1)
-    if last - first >= MOST_EXPORTED:
-        raise UsageError("too many frames for one file", expected=f"at most {MOST_EXPORTED}", got=str(last - first + 1))
     kind = request.query_params.get("format", "pcap")
+    if kind not in FORMATS:
+        raise UsageError("the format", expected=", ".join(FORMATS), got=repr(kind[:20]))
+    numbers = frames.numbers(whole(request, "first", 0), whole(request, "last", len(frames) - 1), wanted)
+    if len(numbers) > MOST_EXPORTED:
+        raise UsageError(
+            "too many frames for one file",
+            expected=f"at most {MOST_EXPORTED}",
+            got=str(len(numbers)),
+            hint="choose a bus, a device or a function, or a part of the run with first and last",
+        )
+    captured: list[Captured] = []
+    for start in range(0, len(numbers), AT_ONCE):
+        captured += frames.captured(numbers[start : start + AT_ONCE])
+        await asyncio.sleep(0)  # other requests are answered in between
     offset_ns = attachment.record.started_utc_ns - attachment.record.started_ns
-    captured = frames.captured(first, last, wanted)
     if kind == "candump":
-        lines = [
-            f"({(c.t_ns + offset_ns) / 1e9:.6f}) {_interface(str(c.endpoint))} {c.item}\n"
-            for c in captured
-            if isinstance(c.item, CanFrame)
-        ]
-        if not lines:
-            raise UsageError("there are no CAN frames in the selection", hint="format=pcap takes other buses")
-        return _file("".join(lines).encode("ascii"), "frames.log", "text/plain")
-    if kind != "pcap":
-        raise UsageError("the format", expected="pcap or candump", got=repr(kind[:20]))
+        content = await asyncio.to_thread(_candump, captured, offset_ns)
+        return _file(content, "frames.log", "text/plain")
+    endpoint = _only_endpoint(captured, attachment.system)
+    if kind == "recording":
+        content = await asyncio.to_thread(_recording, captured, endpoint, attachment.record.prototype)
+        return _file(content, "frames.jsonl", "application/jsonl")
+    content = await asyncio.to_thread(_pcap, captured, endpoint, offset_ns)
+    return _file(content, "frames.pcap", "application/vnd.tcpdump.pcap")
+
+
+def _only_endpoint(captured: list[Captured], system: System) -> Endpoint:
+    """Return the endpoint of all frames. Raises `UsageError` if there are several or none."""
+    if not captured:
+        raise UsageError("the selection has no frames to export", hint="choose other filters")
     endpoints = {str(c.endpoint): c.endpoint for c in captured}
     if len(endpoints) != 1:
+        buses = [name for name, bus in system.buses.items() if str(bus.endpoint) in endpoints]
         raise UsageError(
-            "a pcap file has the frames of one bus",
-            expected="the parameter bus",
-            got=", ".join(endpoints) or "no frame",
+            "a pcap file or a recording has the frames of one bus",
+            expected="the choice of one bus",
+            got=f"frames of {', '.join(buses)}",
         )
-    endpoint = next(iter(endpoints.values()))
+    return next(iter(endpoints.values()))
+
+
+def _candump(captured: list[Captured], offset_ns: int) -> bytes:
+    lines = [
+        f"({(c.t_ns + offset_ns) / 1e9:.6f}) {_interface(str(c.endpoint))} {c.item}\n"
+        for c in captured
+        if isinstance(c.item, CanFrame)
+    ]
+    if not lines:
+        raise UsageError("there are no CAN frames in the selection", hint="export other buses as pcap or recording")
+    return "".join(lines).encode("ascii")
+
+
+def _pcap(captured: list[Captured], endpoint: Endpoint, offset_ns: int) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames.pcap"
-        await asyncio.to_thread(write_pcap, path, captured, endpoint, offset_ns)
-        return _file(path.read_bytes(), "frames.pcap", "application/vnd.tcpdump.pcap")
+        write_pcap(path, captured, endpoint, offset_ns)
+        return path.read_bytes()
+
+
+def _recording(captured: list[Captured], endpoint: Endpoint, prototype: bool) -> bytes:
+    """Return the exchanges as a recording, converted as `fieldtwin import` converts a capture."""
+    if endpoint.is_can:
+        raise UsageError(
+            "a recording of exchanges has no CAN frames", hint="export a CAN bus as candump: this is its recording"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        capture, out = Path(folder) / "capture.jsonl", Path(folder) / "frames.jsonl"
+        tap = TapFile(capture)
+        for c in captured:
+            if isinstance(c.item, bytes):
+                tap.on_bytes(c.endpoint, c.direction, c.t_ns, c.item)
+        tap.close()
+        header = RecordingHeader(
+            version=1, device="imported/frames", kind="exchanges", source="imported", endpoint=str(endpoint),
+            made_by="fieldtwin studio", prototype=prototype,
+        )  # fmt: skip
+        import_capture(capture, out, url=str(endpoint), header=header)
+        return out.read_bytes()
 
 
 def shown(frames: FrameLog, number: int, row: FrameRow) -> dict[str, Any]:
@@ -144,7 +208,7 @@ OPERATIONS = (
         export_frames,
         "Export frames",
         (
-            Parameter("format", "string", "pcap or candump"),
+            Parameter("format", "string", "pcap, candump or recording"),
             Parameter("first", "integer", "number of the first frame"),
             Parameter("last", "integer", "number of the last frame"),
             *FILTERS,

@@ -12,8 +12,9 @@ from __future__ import annotations
 import json
 import tempfile
 from array import array
-from bisect import insort
+from bisect import bisect_left, bisect_right, insort
 from collections import OrderedDict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import msgspec
 
 from fieldtwin.capture.decoding.decoder import Decoder, frame_events
 from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
+from fieldtwin.capture.decoding.fields import FieldSpan
 from fieldtwin.capture.formats.pcap import captured_of
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
@@ -56,6 +58,8 @@ class FrameRow(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """The number of the frame that this one answers."""
     tags: dict[str, Any]
     """The values that it carried, in engineering units."""
+    whole: str = ""
+    """The whole reply in hex if this frame is its last piece, else ""."""
 
 
 @dataclass(frozen=True)
@@ -193,22 +197,35 @@ class FrameLog:
 
     def position_at(self, t_ns: int, wanted: FrameFilter = _EVERYTHING) -> int:
         """Return the position of the first accepted frame at or after an instant."""
-        from bisect import bisect_left
-
         if wanted.is_empty:
             return bisect_left(self._times, t_ns)
         return bisect_left(self._matching(wanted), t_ns, key=lambda number: self._times[number])
 
-    def captured(self, first: int, last: int, wanted: FrameFilter = _EVERYTHING) -> list[Captured]:
-        """Return the traffic of the accepted frames with numbers from `first` to `last`, as the tap received it."""
-        numbers = range(first, last + 1) if wanted.is_empty else self._matching(wanted)
+    def numbers(self, first: int, last: int, wanted: FrameFilter = _EVERYTHING) -> Sequence[int]:
+        """Return the numbers of the accepted frames from number `first` to number `last`."""
+        first, last = max(0, first), min(last, len(self) - 1)
+        if wanted.is_empty:
+            return range(first, last + 1)
+        matching = self._matching(wanted)
+        return matching[bisect_left(matching, first) : bisect_right(matching, last)]
+
+    def captured(self, numbers: Iterable[int]) -> list[Captured]:
+        """Return the traffic of these frames, as the tap received it."""
         found = []
         for number in numbers:
-            if first <= number <= last:
-                self._capture.seek(self._raw_at[number])
-                found.append(captured_of(json.loads(self._capture.readline())))
+            self._capture.seek(self._raw_at[number])
+            found.append(captured_of(json.loads(self._capture.readline())))
         self._capture.seek(self._read_to)
         return found
+
+    def fields(self, number: int) -> list[FieldSpan]:
+        """Explain a frame field by field; the last piece of a reply is explained with the pieces before it."""
+        row = self.row(number)
+        [event] = frame_events(self.captured([number]), self._system)
+        if row.whole:
+            event = TraceEvent(event.t_ns, event.kind, event.where, event.data | {"bytes": row.whole})
+        request = bytes.fromhex(self.row(row.request).bytes) if row.request is not None else b""
+        return self._decoder.fields(event, request)
 
     def services(self) -> list[str]:
         """Return the services that have occurred, for a choice of filters."""
@@ -296,6 +313,7 @@ class FrameLog:
             latency_ns=answered.latency_ns if answered else None,
             request=request,
             tags=tags,
+            whole=_whole(event, answered),
         )
         encoded = msgspec.json.encode(row)
         self._rows.seek(self._written)
@@ -331,6 +349,14 @@ class FrameLog:
             and wanted.device in ("", names[self._devices[row]])
             and wanted.service in ("", names[self._services[row]])
         )
+
+
+def _whole(event: TraceEvent, answered: DecodedExchange | None) -> str:
+    """Return the reply that ended with this piece, "" if the frame has all of it."""
+    if answered is None or "id" in event.data or event.data.get("dir") == "sent":
+        return ""
+    reply = answered.reply.hex()
+    return reply if len(reply) > len(event.data["bytes"]) else ""
 
 
 def _plain(value: object) -> object:

@@ -47,6 +47,22 @@ class TagHistory:
         """Return the point that was valid at an instant, None before the first one."""
         return next((point for point in reversed(self._points[name]) if point.t_ns <= t_ns), None)
 
+    def changes(self, name: str, from_ns: int, to_ns: int) -> list[tuple[Point | None, Point]]:
+        """Return the changes of a tag in an interval, each with the point before it. A tag that is not in the system has none."""
+        found: list[tuple[Point | None, Point]] = []
+        later: Point | None = None
+        for point in reversed(self._points.get(name, ())):
+            if later is not None:
+                found.append((point, later))
+                later = None
+            if point.t_ns < from_ns:
+                break
+            if point.t_ns <= to_ns:
+                later = point
+        if later is not None:
+            found.append((None, later))
+        return found[::-1]
+
     def between(self, name: str, from_ns: int, to_ns: int, points: int = MOST_POINTS) -> tuple[list[Point], bool]:
         """Return the points of a tag in an interval, at most `points`, and whether they were thinned out.
 

@@ -18,6 +18,19 @@ export async function call(method, path, body) {
   return content;
 }
 
+/** Fetch a file: [its name, its content]. */
+export async function getFile(path) {
+  const response = await fetch(BASE + path).catch(() => {
+    throw new Error("Studio's server does not answer. Is `fieldtwin studio` still running?");
+  });
+  if (!response.ok) {
+    const content = await response.json().catch(() => ({}));
+    throw new Error(content.error?.message ?? `the server answered ${response.status}`);
+  }
+  const name = /filename="([^"]+)"/.exec(response.headers.get("Content-Disposition"))?.[1] ?? "frames";
+  return [name, await response.blob()];
+}
+
 export const get = (path) => call("GET", path);
 export const post = (path, body) => call("POST", path, body ?? {});
 export const put = (path, body) => call("PUT", path, body);

@@ -1,9 +1,10 @@
 // The frames of the buses. Only the rows in view are fetched and drawn, so a million frames scroll like a hundred.
 
 import { html, useCallback, useEffect, useRef, useState } from "../vendor/preact.js";
-import { get, url } from "../lib/api.js";
+import { address } from "../lib/address.js";
+import { get, getFile } from "../lib/api.js";
 import { clock, hex, milliseconds, number } from "../lib/format.js";
-import { Failure, useFetched } from "../lib/parts.js";
+import { Failure, Quality, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 
 const ROW = 24;
@@ -41,7 +42,7 @@ export function Bus({ store, query }) {
       <span class="grow"></span>
       ${store.frames.behind_bytes > 100_000 && html`<span class="chip warn">reading earlier frames …</span>`}
       <span class="soft">${store.frames.total.toLocaleString("en")} frames</span>
-      ${["pcap", "candump"].map((kind) => html`<a href=${url(`${store.path}/frames/export?format=${kind}&${selection}`)} download>${kind}</a>`)}
+      <${Exports} path=${store.path} selection=${selection} key=${String(selection)} />
     </div>
     <${Frames} store=${store} filter=${filter} live=${live} setLive=${setLive} selected=${selected} setSelected=${setSelected} at=${query.get("at")} />
     ${selected !== null && html`<${Detail} store=${store} number=${selected} onClose=${() => setSelected(null)} onSelect=${setSelected} />`}`;
@@ -174,18 +175,113 @@ function Detail({ store, number: n, onClose, onSelect }) {
     <header><h2>Frame ${n}</h2><button class="quiet" onClick=${onClose}>Close</button></header>
     <${Failure} text=${error} />
     ${frame &&
-    html`<dl class="facts">
-      <dt>Time</dt><dd>${clock(frame.t_ns - started)} after the start, ${frame.sent ? "sent" : "received"} by the gateway on ${frame.bus}</dd>
-      <dt>Meaning</dt><dd>${frame.device && `${frame.device}: `}${frame.text}</dd>
-      ${frame.can_id !== null && html`<dt>COB-ID</dt><dd class="mono">${frame.can_id.toString(16).toUpperCase()}h</dd>`}
-      <dt>Bytes</dt><dd class="mono">${hex(frame.bytes)}</dd>
-      ${Object.entries(frame.tags).length > 0 &&
-      html`<dt>Values</dt><dd>${Object.entries(frame.tags).map(([tag, v]) => `${tag} = ${number(v)}`).join(", ")}</dd>`}
-      ${frame.linked.map(
-        (other) => html`<dt>${other.number < n ? "Request" : "Reply"}</dt>
-          <dd><button class="quiet" onClick=${() => onSelect(other.number)}>frame ${other.number}</button> ${other.text} ${milliseconds(other.latency_ns)}</dd>`,
-      )}
-      <dt>Verdict</dt><dd>${frame.verdict || "pending"}</dd>
-    </dl>`}
+    html`<div class="columns">
+      <${Fields} frame=${frame} key=${n} />
+      <div>
+        <dl class="facts">
+          <dt>Time</dt><dd>${clock(frame.t_ns - started)} after the start, ${frame.sent ? "sent" : "received"} by the gateway on ${frame.bus}</dd>
+          <dt>Meaning</dt><dd>${frame.device && `${frame.device}: `}${frame.text}</dd>
+          ${frame.linked.map(
+            (other) => html`<dt>${other.number < n ? "Request" : "Reply"}</dt>
+              <dd><button class="quiet" onClick=${() => onSelect(other.number)}>frame ${other.number}</button> ${other.text} ${milliseconds(other.latency_ns)}</dd>`,
+          )}
+          <dt>Verdict</dt><dd>${frame.verdict || "pending"}</dd>
+        </dl>
+        <${Effects} store=${store} frame=${frame} />
+      </div>
+    </div>`}
   </section>`;
+}
+
+/** The bytes, and a table with one row for each field. The field under the pointer or the focus is marked in both. */
+function Fields({ frame }) {
+  const [marked, setMarked] = useState(null);
+  const [current, setCurrent] = useState(0);
+  const table = useRef(null);
+  const bytes = (frame.whole || frame.bytes).match(/../g) ?? [];
+  const part = (field) => bytes.slice(field.offset, field.offset + field.length);
+  const go = (to) => {
+    if (to < 0 || to >= frame.fields.length) return;
+    setCurrent(to);
+    table.current.querySelectorAll("tbody tr")[to].focus();
+  };
+  const move = (e) => {
+    const to = { ArrowDown: current + 1, ArrowUp: current - 1, Home: 0, End: frame.fields.length - 1 }[e.key];
+    if (to === undefined) return;
+    e.preventDefault();
+    go(to);
+  };
+  const tint = (i) => `field f${i % 6} ${marked === i ? "marked" : ""}`;
+  return html`<div class="fields" onMouseLeave=${() => setMarked(null)}>
+    <p class="mono bytes" aria-label="Bytes of the frame, in hexadecimal">
+      ${frame.fields.map(
+        (field, i) => field.length > 0 && html`<span class=${tint(i)} title=${field.name} onMouseEnter=${() => setMarked(i)} onClick=${() => go(i)}>${part(field).join(" ")}</span> `,
+      )}
+    </p>
+    ${frame.whole && html`<p class="soft">This frame is the last piece of a reply. Its bytes are shown with the pieces before it.</p>`}
+    <table class="list" ref=${table} onKeyDown=${move}>
+      <thead><tr><th>Bytes</th><th>Field</th><th>Value</th><th>Explanation</th></tr></thead>
+      <tbody>
+        ${frame.fields.map(
+          (field, i) => html`<tr
+            key=${i}
+            class=${marked === i ? "marked" : ""}
+            tabindex=${i === current ? 0 : -1}
+            onFocus=${() => (setCurrent(i), setMarked(i))}
+            onBlur=${() => setMarked(null)}
+            onMouseEnter=${() => setMarked(i)}
+          >
+            <td class="mono">${field.length > 0 && html`<span class=${tint(i)}>${shortened(part(field))}</span>`}</td>
+            <td>${field.name}</td><td class="value">${field.value}</td><td class="soft note">${field.note}</td>
+          </tr>`,
+        )}
+      </tbody>
+    </table>
+  </div>`;
+}
+
+const shortened = (bytes) => (bytes.length > 8 ? `${bytes.slice(0, 7).join(" ")} …` : bytes.join(" "));
+
+/** The changes of tags in the half second after a frame: of those that it carried, and of those that the PLC writes. */
+function Effects({ store, frame }) {
+  const groups = [
+    ["Values that changed", frame.effects.filter((e) => !e.program), "trends"],
+    ["Outputs that the PLC changed", frame.effects.filter((e) => e.program), "plc"],
+  ];
+  return html`<h3>In the half second after this frame</h3>
+    ${frame.effects.length === 0 && html`<p class="soft">No tag of this frame and no output of the PLC changed.</p>`}
+    ${groups.map(
+      ([title, effects, view]) =>
+        effects.length > 0 &&
+        html`<h4>${title}</h4>
+          <ul class="effects">
+            ${effects.map(
+              (e) => html`<li>
+                <a href=${address(store.name, "trends", { tags: e.tag })}>${e.tag}</a>
+                ${` ${number(e.before)} → ${number(e.value)}`}${e.quality !== "good" && html` <${Quality} quality=${e.quality} why=${e.reason} />`}
+                <span class="soft">${` after ${milliseconds(Math.max(0, e.t_ns - frame.t_ns))}`}</span>
+                ${view === "plc" && html` <a href=${address(store.name, "plc")}>program ${e.program}</a>`}
+              </li>`,
+            )}
+          </ul>`,
+    )}`;
+}
+
+/** Downloads of the selected frames. A selection that a format cannot hold is explained on the page. */
+function Exports({ path, selection }) {
+  const [run, error, busy] = useAction();
+  const save = (kind) =>
+    run(async () => {
+      const [name, content] = await getFile(`${path}/frames/export?format=${kind}&${selection}`);
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(content);
+      link.download = name;
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  return html`<span class="exports">
+      <span class="soft">Export as</span>
+      ${["pcap", "candump", "recording"].map((kind) => html`<button class="quiet" disabled=${busy} onClick=${() => save(kind)}>${kind}</button>`)}
+    </span>
+    ${error && html`<p class="error wide" role="alert">${error}</p>`}`;
 }

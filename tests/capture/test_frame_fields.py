@@ -148,10 +148,10 @@ def test_nmt_heartbeat_emcy_and_sync_are_explained() -> None:
 
 
 def test_a_mapped_pdo_has_a_field_for_each_object() -> None:
-    mapped = [(cob, pdo) for node in NODES.values() for cob, pdo in node.pdos.items() if pdo.mapping]
+    mapped = [(cob, pdo.mapping) for node in NODES.values() for cob, pdo in node.pdos.items() if pdo.mapping]
     assert mapped
-    for cob, pdo in mapped:
-        spans = canopen_fields(CanFrame(cob, bytes(pdo.mapping.length)), NODES)
+    for cob, mapping in mapped:
+        spans = canopen_fields(CanFrame(cob, bytes(mapping.length)), NODES)
         assert len(spans) > 1
         assert spans[1].name[4:6] == "h:"
-        assert_covered(spans, pdo.mapping.length)
+        assert_covered(spans, mapping.length)

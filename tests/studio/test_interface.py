@@ -129,10 +129,10 @@ def test_a_frame_has_its_fields_and_the_changes_of_tags_after_it(observatory: St
             lambda: next((r for r in latest(client, device="ctd") if r["tags"].get("sample_period_s") == 9), None),
             "the value is read",
         )
-        shown = until(
-            lambda: (d := client.get(f"{NAME}/frames/{reply['number']}").json())["effects"] and d,
-            "the change is recorded",
-        )
+        assert reply
+        path = f"{NAME}/frames/{reply['number']}"
+        until(lambda: client.get(path).json()["effects"], "the change is recorded")
+        shown = client.get(path).json()
         client.delete(f"{NAME}/tags/ctd.sample_period_s/set").raise_for_status()
     fields = {f["name"]: f for f in shown["fields"]}
     assert fields["sample_period_s"]["value"].startswith("9 s")

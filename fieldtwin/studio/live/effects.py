@@ -1,4 +1,4 @@
-"""What followed a frame: the changes of the tags that it carried, and of the tags that PLC programs write.
+"""The changes after a frame: those of the tags that it carried, and those of the tags that PLC programs write.
 
 That a change followed a frame does not prove that the frame caused it; the page says "after" for this reason.
 """

@@ -101,7 +101,7 @@ def test_a_reply_has_the_values_of_the_tags_that_lie_at_its_registers() -> None:
     unit = {1: TagMap(CTD.profile)}
     spans = modbus_fields("rtu", False, reply, request, unit)
     [value] = [s for s in spans if s.name == "sample_period_s"]
-    assert (value.offset, value.length, value.value) == (3, 2, "5 s (5 (0005h))")
+    assert (value.offset, value.length, value.value) == (3, 2, "5 s (0005h)")
     assert "40002 (holding:1)" in value.note
     alone = modbus_fields("rtu", False, reply, b"", unit)
     assert said(alone)["register"] == "5 (0005h)"

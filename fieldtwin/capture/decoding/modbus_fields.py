@@ -331,8 +331,9 @@ class _Data:
             said = tags.show({name: values[name] for name in names})  # type: ignore[misc]
             if len(names) == 1:
                 said = said.removeprefix(f"{names[0]} ")
-            plain = SECRET if secret else f"{raw.hex().upper()}h" if end - at > 1 else _plain(int.from_bytes(raw))
-            return f"{said} ({plain})" if said and not secret else said or plain
+            if secret:
+                return said or SECRET
+            return f"{said} ({raw.hex().upper()}h)" if said else _plain(int.from_bytes(raw))
 
         return show
 

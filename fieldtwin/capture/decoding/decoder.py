@@ -178,16 +178,20 @@ def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0
     found = []
     for seen in captured:
         bus = buses.get(str(seen.endpoint))
-        if bus is None:
-            continue
-        data: dict[str, Any] = {"dir": "sent" if seen.direction is Direction.SENT else "received"}
-        if isinstance(seen.item, CanFrame):
-            data |= {"bytes": seen.item.data.hex(), "id": seen.item.can_id}
-            data |= {k: True for k, on in _flags(seen.item) if on}
-        else:
-            data["bytes"] = seen.item.hex()
-        found.append(TraceEvent(seen.t_ns - start_ns, TraceKind.FRAME, bus, data))
+        if bus is not None:
+            found.append(frame_event(seen, bus, start_ns))
     return found
+
+
+def frame_event(seen: Captured, bus: str, start_ns: int = 0) -> TraceEvent:
+    """Return one item of a tap as a FRAME event of a bus."""
+    data: dict[str, Any] = {"dir": "sent" if seen.direction is Direction.SENT else "received"}
+    if isinstance(seen.item, CanFrame):
+        data |= {"bytes": seen.item.data.hex(), "id": seen.item.can_id}
+        data |= {k: True for k, on in _flags(seen.item) if on}
+    else:
+        data["bytes"] = seen.item.hex()
+    return TraceEvent(seen.t_ns - start_ns, TraceKind.FRAME, bus, data)
 
 
 def _flags(frame: CanFrame) -> list[tuple[str, bool]]:

@@ -14,6 +14,7 @@ import json
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ _MACS = {_CLIENT: bytes((2, 0, 0, 0, 0, 1)), _SERVER: bytes((2, 0, 0, 0, 0, 2))}
 _SYN, _ACK, _PSH = 0x02, 0x10, 0x08
 
 
+KEPT_ENDPOINTS = 1_024
 MAX_LINE_BYTES = 1 << 20
 """Longer lines are refused; the longest chunk that a tap sees is a fraction of it."""
 
@@ -86,7 +88,13 @@ def captured_of(line: dict[str, object]) -> Captured:
     t_ns = line["t_ns"]
     if not isinstance(t_ns, int):
         raise ValueError(f"t_ns is {t_ns!r}")
-    return Captured(t_ns, Endpoint.parse(str(line["endpoint"])), Direction(line["direction"]), item)
+    return Captured(t_ns, _endpoint(str(line["endpoint"])), Direction(line["direction"]), item)
+
+
+@lru_cache(maxsize=KEPT_ENDPOINTS)
+def _endpoint(text: str) -> Endpoint:
+    """Parse an endpoint. Cached, because a capture repeats the same few in every line."""
+    return Endpoint.parse(text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,12 @@ from typing import Any
 
 import msgspec
 
-from fieldtwin.capture.decoding.decoder import Decoder, frame_events
+from fieldtwin.capture.decoding.decoder import Decoder, frame_event
 from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.capture.decoding.fields import FieldSpan
 from fieldtwin.capture.formats.pcap import captured_of
 from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.results.trace import TraceEvent
 from fieldtwin.twin.site.system import System
@@ -33,6 +34,8 @@ from fieldtwin.twin.site.system import System
 MOST_FRAMES = 4_000_000
 """Frames that are indexed; the capture itself is limited to 1 GiB."""
 MOST_FILTERS = 8
+MOST_ENDPOINTS = 1_024
+"""Endpoints of a capture whose bus is kept."""
 MOST_OPEN = 4_096
 """Requests whose reply is still awaited. More than the buses can have open at the same time."""
 AT_ONCE_BYTES = 32_768
@@ -123,6 +126,7 @@ class FrameLog:
         self._raw_at, self._row_at, self._times = array("Q"), array("Q"), array("q")
         self._verdicts, self._replies = array("H"), array("L")
         self._buses, self._devices, self._services = array("H"), array("H"), array("H")
+        self._bus_names: dict[str, str] = {}
         self._names, self._problems = _Names(), _Names()
         for reserved in ("", "good"):
             self._problems.number(reserved)
@@ -221,7 +225,8 @@ class FrameLog:
     def fields(self, number: int) -> list[FieldSpan]:
         """Explain a frame field by field; the last piece of a reply is explained with the pieces before it."""
         row = self.row(number)
-        [event] = frame_events(self.captured([number]), self._system)
+        [seen] = self.captured([number])
+        event = frame_event(seen, row.bus)
         if row.whole:
             event = TraceEvent(event.t_ns, event.kind, event.where, event.data | {"bytes": row.whole})
         request = bytes.fromhex(self.row(row.request).bytes) if row.request is not None else b""
@@ -262,12 +267,22 @@ class FrameLog:
             read = json.loads(line)
             if "refused" in read:
                 return
-            events = frame_events([captured_of(read)], self._system)
+            seen, bus = captured_of(read), self._bus_of(read["endpoint"])
         except (ValueError, KeyError, TypeError, FieldtwinError):
             self.invalid_lines += 1
             return
-        for event in events:
-            self._add(event, at)
+        if bus:
+            self._add(frame_event(seen, bus), at)
+
+    def _bus_of(self, endpoint: str) -> str:
+        """Return the bus at an endpoint, "" without one. Kept, because writing an endpoint as text takes longer than decoding."""
+        bus = self._bus_names.get(endpoint)
+        if bus is None:
+            text = str(Endpoint.parse(endpoint))
+            bus = next((name for name, b in self._system.buses.items() if str(b.endpoint) == text), "")
+            if len(self._bus_names) < MOST_ENDPOINTS:
+                self._bus_names[endpoint] = bus
+        return bus
 
     def _add(self, event: TraceEvent, at: int) -> None:
         number, decoded = len(self), self._decoder.decode(event)

@@ -110,7 +110,7 @@ def append(path: Path, rate: int, seconds: float) -> None:
 
 
 class Server:
-    """Studio as a process of its own, with its start measured."""
+    """A process of Studio, with its start measured."""
 
     def __init__(self, root: Path) -> None:
         self.url = f"http://127.0.0.1:{free_port()}/"

@@ -274,7 +274,7 @@ class VirtualBench(AsyncResource):
 
 
 class _FrameTap:
-    """`fieldtwin.gateway.core.connection.Tap` that writes a trace, and when something was sent."""
+    """A tap (`fieldtwin.gateway.core.connection.Tap`) that writes all bytes and frames into the bench's trace."""
 
     def __init__(self, bench: VirtualBench, system: System) -> None:
         self._bench = bench

@@ -390,7 +390,7 @@ def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None
 
 
 def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
-    """Return an expression that names something of the system, so that it can be true or false."""
+    """Return `text` as an expression that names at least one tag or variable. Raises `FileInvalid` for a constant."""
     expression = scenario.expression(text, *loc)
     if expression.is_constant:
         raise scenario.file.error(

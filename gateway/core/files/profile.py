@@ -277,6 +277,10 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
         table, _, number = text.partition(":")
         if table not in READ_FUNCTION:
             raise ValueError(f"no table {table!r}: coil, discrete, input or holding")
+        if not re.fullmatch(r"[0-9]{1,5}|0x[0-9a-fA-F]{1,4}", number):
+            raise ValueError(
+                f"no address {number!r} in the table {table!r}: one number, such as {table}:100 or {table}:0x10"
+            )
         address = int(number, 0)
         found: Table | None = table
     elif numbering == "printed" and re.fullmatch(r"[0-9]{5,6}", str(text)):

@@ -149,3 +149,9 @@ def test_an_identification_names_the_text_that_it_lacks() -> None:
 def test_an_address_that_is_no_address_is_refused_with_the_forms_of_a_coil_too() -> None:
     with pytest.raises(FileInvalid, match=r"00001 \(coil\).*coil:0"):
         read("protocol: modbus\ntags: {a: {at: 1, type: bool}}\n")
+
+
+@pytest.mark.parametrize("text", ["holding:0..5", "holding:", "holding:x", "holding:-1"])
+def test_an_address_that_is_not_one_number_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(ValueError, match="one number, such as holding:100"):
+        resolve_address(text, "sent")

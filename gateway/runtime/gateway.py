@@ -183,6 +183,18 @@ class Gateway:
         if not isinstance(driver, TransmitterDriver):
             self.outputs.outputs += [self._make_output(tag) for tag in tags if tag not in known]
 
+    def offer(self, tag: str) -> None:
+        """Add a `writable` tag that neither a program nor a server writes as an output, so that a user can write it.
+
+        Any other tag is left as it is; a write of it is then refused.
+        """
+        name, _, local = tag.partition(".")
+        device, known = self.config.devices.get(name), {output.tag for output in self.outputs.outputs}
+        if device is None or tag in known or local not in device.writable:
+            return
+        if not isinstance(self.drivers[name], TransmitterDriver):
+            self.outputs.outputs.append(self._make_output(tag))
+
     def _message_sources(self) -> dict[str, Consumer[DATA]]:
         sources: dict[str, Consumer[DATA]] = {pump.driver.message_tag: pump.inbox for pump in self.pumps}
         for driver in self.drivers.values():

@@ -45,9 +45,10 @@ class Studio:
 
 
 @contextmanager
-def studio(*arguments: str, folder: Path | None = None) -> Iterator[Studio]:
-    """Start ``fieldtwin studio ARGUMENTS`` with two tokens, and stop it at the end."""
-    root = Path(tempfile.mkdtemp(prefix="fts", dir="/tmp"))
+def studio(*arguments: str, folder: Path | None = None, root: Path | None = None) -> Iterator[Studio]:
+    """Start ``fieldtwin studio ARGUMENTS`` with two tokens, and stop it at the end. Run directories are in `root`/run."""
+    made = root is None
+    root = root or Path(tempfile.mkdtemp(prefix="fts", dir="/tmp"))
     (root / "operate").write_text(OPERATE)
     (root / "view").write_text(VIEW)
     log = root / "log"
@@ -68,7 +69,8 @@ def studio(*arguments: str, folder: Path | None = None) -> Iterator[Studio]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-        shutil.rmtree(root, ignore_errors=True)
+        if made:
+            shutil.rmtree(root, ignore_errors=True)
 
 
 def _ready(log: Path, process: subprocess.Popen[bytes]) -> str:

@@ -2,7 +2,7 @@
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
 instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
-command, reload, stop.
+write, command, reload, stop.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.control import ControlServer
-from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, learnt_statuses
@@ -49,6 +50,7 @@ FLUSH_ROWS = 8
 program.
 """
 MOST_COMMAND_BYTES = 64
+WRITE_WITHIN_S = 5.0
 MOST_CHANGES_TOLD = 20
 PUBLISHED_AT_ONCE = 20_000
 """The most that fits into one line of the control channel."""
@@ -146,6 +148,7 @@ class GatewayProcess:
                 "published": self._published,
                 "watch": self._watch,
                 "gate": self._gate,
+                "write": self._write,
                 "command": self._command,
                 "reload": self._reload,
                 "stop": self._request_stop,
@@ -218,6 +221,41 @@ class GatewayProcess:
         """Return the plant's current switch position and the current limits of commands from a digital twin."""
         may = self._system.commands
         return {"remote": self._gateway.config.remote, "period_s": list(may.period_s), "per_minute": may.per_minute}
+
+    async def _write(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Write a tag once for a user (``by``), under the rules for clients, and answer when the device has confirmed it.
+
+        Raises `NotAllowed` for a read-only plant, a tag that is not writable or that the PLC commands, and a value outside its
+        limits; and the device's error. Each of these is in the audit log. Raises `ReplyTimeout` after `WRITE_WITHIN_S` seconds.
+        """
+        tag, value = args.get("tag"), args.get("value")
+        if (
+            not isinstance(tag, str)
+            or isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not isfinite(value)
+        ):
+            raise UsageError(
+                "a write", expected='{"tag": DEVICE.TAG, "value": NUMBER, "by": USER}', got=repr(args)[:80]
+            )
+        done: asyncio.Future[FieldtwinError | None] = asyncio.get_running_loop().create_future()
+
+        def end(error: FieldtwinError | None) -> None:
+            if not done.done():
+                done.set_result(error)
+
+        self._gateway.offer(tag)
+        self._gateway.outputs.request(tag, float(value), str(args.get("by", ""))[:64], end)
+        try:
+            async with asyncio.timeout(WRITE_WITHIN_S):
+                error = await done
+        except TimeoutError as e:
+            raise ReplyTimeout(
+                f"no confirmation within {WRITE_WITHIN_S:g} s; the value may still be written", where=tag
+            ) from e
+        if error is not None:
+            raise error
+        return {"tag": tag, "value": value}
 
     async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
         """Pass a command of the digital twin (``payload`` in hex) to the control logic, as if the transmitter had received it."""

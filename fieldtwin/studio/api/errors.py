@@ -8,6 +8,7 @@ from starlette.responses import JSONResponse, Response
 from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import (
     Bug,
+    CheckFailed,
     DeviceRefused,
     FieldtwinError,
     NotAllowed,
@@ -19,6 +20,7 @@ from fieldtwin.studio.live.gallery import NoInstance
 
 STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
     (NoInstance, 404),
+    (CheckFailed, 409),
     (NotAllowed, 403),
     (UsageError, 400),
     (Unreachable, 503),
@@ -37,7 +39,8 @@ def status_of(error: FieldtwinError) -> int:
     if isinstance(error, NotFound):
         return 404
     if isinstance(error, RemoteError):
-        return 400 if error.remote_exit_code == UsageError.exit_code else 502
+        kind = next((kind for kind, _ in STATUS if kind.__name__ == error.kind), None)
+        return dict(STATUS)[kind] if kind else 400 if error.remote_exit_code == UsageError.exit_code else 502
     if isinstance(error, Bug):
         return 500
     return next((status for kind, status in STATUS if isinstance(error, kind)), 422)

@@ -7,16 +7,26 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.studio.api.common import INSTANCE, attached, prototype, recordings_of, tag_of
+from fieldtwin.gateway.core.errors import CheckFailed, Unreachable, UsageError
+from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, prototype, recordings_of, tag_of
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
 from fieldtwin.studio.live.tag_history import MOST_POINTS
+
+WRITE_WITHIN_S = 8.0
+"""Longer than the gateway itself waits for the device."""
 
 
 class SetValue(msgspec.Struct, forbid_unknown_fields=True):
     """The value that a simulated device shall hold, in engineering units."""
 
     value: float | bool
+
+
+class WriteValue(msgspec.Struct, forbid_unknown_fields=True):
+    """A value to write to a device, in engineering units, and the value that the user has seen before."""
+
+    value: float
+    old: float | bool | str | None
 
 
 async def list_tags(request: Request) -> dict[str, Any]:
@@ -65,6 +75,23 @@ async def release_value(request: Request) -> dict[str, Any]:
     return {"tag": f"{device}.{name}", "value": None}
 
 
+async def write_value(request: Request) -> Any:
+    """Write a tag of a device once, through the gateway, under its rules: the run must allow writes, the tag must be writable,
+    the value must be within the limits, and no program may command the tag. The audit log records the user.
+    """
+    attachment = await attached(request)
+    device, name = tag_of(request, attachment)
+    form = await body_of(request, WriteValue)
+    tag = f"{device}.{name}"
+    seen = attachment.gateway.tags[tag].value if attachment.gateway is not None else None
+    if seen != form.old:
+        raise CheckFailed(
+            f"{tag} has changed since it was shown", expected=repr(form.old), got=repr(seen), hint="look again"
+        )
+    await attachment.gateway_channel.call("write", WRITE_WITHIN_S, tag=tag, value=form.value, by=by_studio(request))
+    return {"tag": tag, "value": form.value}
+
+
 TAG = INSTANCE + "/tags/{tag}"
 OPERATIONS = (
     Operation("GET", f"{INSTANCE}/tags", list_tags, "Read all tags"),
@@ -81,6 +108,7 @@ OPERATIONS = (
             ),
         ),
     ),
+    Operation("POST", f"{TAG}/write", write_value, "Write a writable tag of a device", body=WriteValue, changes=True),
     Operation("PUT", f"{TAG}/set", set_value, "Set a value in a simulated device", body=SetValue, changes=True),
     Operation("DELETE", f"{TAG}/set", release_value, "Release a value that was set", changes=True),
 )

@@ -1,7 +1,7 @@
 // All registers and objects by name, with value, quality, age and a sparkline. In a prototype a value of the simulated device can be set.
 
 import { html, useState } from "../vendor/preact.js";
-import { put, remove } from "../lib/api.js";
+import { post, put, remove } from "../lib/api.js";
 import { age, number, value } from "../lib/format.js";
 import { Dialog, Failure, Quality, Sparkline, useAction } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
@@ -15,6 +15,7 @@ export function Devices({ store, query }) {
   const [device, setDevice] = useState(query.get("device") ?? "");
   const [onlyBad, setOnlyBad] = useState(false);
   const [setting, setSetting] = useState(null);
+  const [writing, setWriting] = useState(null);
   const [run, error] = useAction();
   const { devices } = store.about.system;
   const rows = Object.entries(devices)
@@ -59,6 +60,7 @@ export function Devices({ store, query }) {
                 (full in set
                   ? html`<button class="quiet" onClick=${() => run(() => remove(`${store.path}/tags/${full}/set`))}>Release</button>`
                   : html`<button class="quiet" onClick=${() => setSetting({ full, about })}>Set …</button>`)}
+                ${mayWrite(store, about) && html`<button class="quiet" onClick=${() => setWriting({ full, about })}>Write …</button>`}
               </td>
             </tr>`;
           })}
@@ -67,6 +69,7 @@ export function Devices({ store, query }) {
       ${rows.length > MOST_ROWS && html`<p class="empty">The first ${MOST_ROWS} are shown. Search for the others.</p>`}
       ${!rows.length && html`<p class="empty">No value fits.</p>`}
     </div>
+    ${writing && html`<${WriteDialog} store=${store} ...${writing} onClose=${() => setWriting(null)} />`}
     ${setting && html`<${SetDialog} store=${store} ...${setting} onClose=${() => setSetting(null)} />`}`;
 }
 
@@ -89,6 +92,35 @@ function SetDialog({ store, full, about, onClose }) {
       <footer>
         <button type="button" onClick=${onClose}>Cancel</button>
         <button class="primary" disabled=${!valid || busy}>Set</button>
+      </footer>
+    </form>
+  <//>`;
+}
+
+const mayWrite = (store, about) => store.mayOperate && about.writable && !about.secret && store.about.allow_writes;
+
+/** A write through the gateway to the device. On a plant this is real hardware, so old and new value are confirmed. */
+function WriteDialog({ store, full, about, onClose }) {
+  const [old] = useState(() => store.tags[full]?.value ?? null);
+  const [text, setText] = useState("");
+  const [run, error, busy] = useAction();
+  const wanted = Number(text.replace(",", "."));
+  const valid = text.trim() !== "" && Number.isFinite(wanted);
+  const plant = !store.isPrototype;
+  const send = async (e) => {
+    e.preventDefault();
+    if (await run(() => post(`${store.path}/tags/${full}/write`, { value: wanted, old }))) onClose();
+  };
+  return html`<${Dialog} title="Write ${full}" onClose=${onClose}>
+    <form onSubmit=${send}>
+      ${plant && html`<p class="error">This is a plant: the value is written to a real device.</p>`}
+      ${about.impact && html`<p class="soft">Impact of a write: ${about.impact}</p>`}
+      <${Failure} text=${error} />
+      <label>New value <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${about.unit}</label>
+      <p>${number(old)} ${about.unit} → <strong>${valid ? number(wanted) : "…"} ${about.unit}</strong></p>
+      <footer>
+        <button type="button" onClick=${onClose}>Cancel</button>
+        <button class=${plant ? "danger" : "primary"} disabled=${!valid || busy}>Write</button>
       </footer>
     </form>
   <//>`;

@@ -35,6 +35,8 @@ def test_an_editor_shows_no_error_in_a_file_that_the_program_accepts(folder: str
     files = check_site(CHECKOUT / folder).files
     assert len(files) > 2
     for name, kind in files.items():
+        if kind == "compose":  # its schema is that of the Compose Specification, not ours
+            continue
         schema = json.loads(shipped({"device": "profile"}.get(kind, kind)).read_text("utf-8"))
         data = json.loads(json.dumps(load(CHECKOUT / folder / name).data))
         errors = [

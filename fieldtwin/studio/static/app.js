@@ -128,8 +128,7 @@ function Banners({ store }) {
     ${(field?.faults?.length > 0 || set.length > 0) &&
     html`<div class="banner" role="status">
       <span class="grow"
-        >Faults:
-        ${[
+        >${"Faults: "}${[
           ...(field.faults ?? []).map((f) => `${f.name} on ${f.device || f.bus}`),
           ...set.map(([tag, v]) => `${tag} set to ${number(v)}`),
         ].join(", ")}</span

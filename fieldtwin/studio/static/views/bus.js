@@ -154,7 +154,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
             class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""}"
             key=${position}
             style=${{ top: `${top}px` }}
-            aria-selected=${r.number === selected}
+            aria-current=${r.number === selected}
             onClick=${() => setSelected(r.number)}
           >
             <span class="mono">${clock(r.t_ns - started)}</span><span>${r.bus}</span>

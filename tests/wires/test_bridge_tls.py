@@ -117,7 +117,7 @@ def test_a_role_limits_a_bridges_client_and_is_recorded(pki: Pki, tmp_path: Path
                 await operator.write_register(1, 0, 9)
             assert bank.read("holding", 0, 1, 0) == [9]
             notes = [json.loads(line) for line in (tmp_path / "audit.jsonl").read_text("ascii").splitlines()]
-            assert [n["result"] for n in notes] == ["exception 01h", "asked", "done"]
+            assert [n["result"] for n in notes] == ["the allow list of the bridge refuses it", "asked", "done"]
             assert notes[0]["by"].endswith("(Viewer)")
             assert notes[-1]["by"].endswith("(Operator)")
 

@@ -13,6 +13,8 @@ release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 html_theme = "furo"
 html_title = f"fieldtwin {__version__}"
+html_static_path = ["book.css"]
+html_css_files = ["book.css"]
 html_show_sphinx = False
 html_last_updated_fmt = None  # the same source gives the same pages
 

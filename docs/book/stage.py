@@ -163,7 +163,8 @@ def stage(target: Path) -> None:
     """Write the book's source to `target`, which is emptied first. Raises BrokenLink."""
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    shutil.copy(Path(__file__).parent / "conf.py", target / "conf.py")
+    for name in ("conf.py", "book.css"):
+        shutil.copy(Path(__file__).parent / name, target / name)
     book, texts = pages(), generated()
     for source, page in book.items():
         texts[page], beside = with_links((ROOT / source).read_text("utf-8"), source, page, book)

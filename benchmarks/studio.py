@@ -32,6 +32,9 @@ from typing import Any, TextIO
 from peers import Goals, Missing, free_port, peak_mb, python, stop
 
 SCREEN_MS, MEMORY_MB, SHOWN_MS, FIRST_PAGE_S = 250, 400, 200, 2.0
+FOLLOWED = 0.85
+"""Share of the appended frames that must reach the screen, because a page that stops following has no late frames. The
+measurement ends half a second before the last frame."""
 MOST_STEAL = 0.02
 NAME = "bench"
 BATCH_S = 0.01
@@ -331,6 +334,7 @@ def main() -> int:
         print(f"INCONCLUSIVE: the host took {steal:.1%} of the CPU time away (at most {MOST_STEAL:.0%})")
         return 3
     goals = Goals()
+    goals.least("share of the appended frames that reached the screen", len(ages) / (options.rate * seconds), FOLLOWED)
     goals.most("frame to screen, 95 %", late, SCREEN_MS, "ms")
     goals.most("memory of the server", memory, MEMORY_MB, "MB")
     goals.most("any frame on the screen, 95 %", slow, SHOWN_MS, "ms")

@@ -50,6 +50,7 @@ export function Bus({ store, query }) {
 
 function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
   const view = useRef(null);
+  const reached = useRef(0); // the latest position of the view
   const pages = useRef(new Map());
   const [state, setState] = useState({ total: 0, top: 0, tall: 400 });
   const [error, setError] = useState("");
@@ -120,7 +121,9 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
   }, [at]);
   const scrolled = (e) => {
     const { scrollTop, clientHeight, scrollHeight } = e.target;
-    if (live && scrollTop + clientHeight < scrollHeight - 4 * ROW) setLive(false);
+    // The page itself only scrolls down. A fast bus adds rows between that and this event, so the distance to the end proves nothing.
+    if (live && scrollTop < reached.current && scrollTop + clientHeight < scrollHeight - 4 * ROW) setLive(false);
+    reached.current = scrollTop;
     setState((s) => ({ ...s, top: scrollTop, tall: clientHeight }));
   };
   const move = (e) => {

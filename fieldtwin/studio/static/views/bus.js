@@ -67,7 +67,6 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
         const answer = await get(`${store.path}/frames?start=${page * PAGE}&count=${PAGE}&${search}`);
         pages.current.set(page, answer.rows);
         while (pages.current.size > MOST_PAGES) pages.current.delete(pages.current.keys().next().value);
-        setState((s) => ({ ...s, total: answer.total }));
         setError("");
       } catch (e) {
         pages.current.delete(page);
@@ -121,7 +120,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
   }, [at]);
   const scrolled = (e) => {
     const { scrollTop, clientHeight, scrollHeight } = e.target;
-    // The page itself only scrolls down. A fast bus adds rows between that and this event, so the distance to the end proves nothing.
+    // While it follows, the page itself only scrolls down. A fast bus adds rows between that and this event, so the distance to the end proves nothing.
     if (live && scrollTop < reached.current && scrollTop + clientHeight < scrollHeight - 4 * ROW) setLive(false);
     reached.current = scrollTop;
     setState((s) => ({ ...s, top: scrollTop, tall: clientHeight }));

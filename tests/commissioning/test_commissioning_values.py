@@ -39,7 +39,7 @@ def test_raw_addresses_names_and_patterns_are_tags() -> None:
     [
         ("voltage_l9", "modbus", "did you mean 'voltage_l"),
         ("holding:65536", "modbus", "exceeds the table"),
-        ("holding:x", "modbus", "invalid literal"),
+        ("holding:x", "modbus", "such as holding:100"),
         ("9", "modbus", "an address such as"),
         ("60", "canopen", "6041h:00"),
     ],

@@ -87,7 +87,9 @@ def test_files_of_each_combination(tmp_path: Path, control: str, ci: str, compos
     )
     assert check_site(folder).errors == []
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    visible = {name for name in files if not name.startswith((".fieldtwin/", "__pycache__/"))}  # the check imports programs
+    visible = {
+        name for name in files if not name.startswith((".fieldtwin/", "__pycache__/"))
+    }  # the check imports programs
     program = {"python": {"plant_control.py"}, "st": {"plant.st"}}.get(control, set())
     assert visible == {
         *(

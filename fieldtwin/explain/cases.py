@@ -47,6 +47,12 @@ def spelled_out(sources: str) -> str:
     return "; ".join(dict.fromkeys(parts))
 
 
+def _weight(case: About) -> str:
+    """Return how much a failure weighs, also on the transports on which it weighs differently."""
+    others = [f"On {other.wire}: {WEIGHT[other.basis]}" for other in case.elsewhere if other.basis is not case.basis]
+    return " ".join([WEIGHT[case.basis], *others])
+
+
 def _entries() -> Iterable[Explanation]:
     found: dict[str, list[tuple[str, str, About]]] = {}
     for command, tested, cases in LISTS:
@@ -58,7 +64,7 @@ def _entries() -> Iterable[Explanation]:
             sent = (
                 f"fieldtwin {case.does or 'only listens'}" if case.role == "client" else f"fieldtwin sends: {case.does}"
             )
-            meaning.append(f"Test of {tested}: {sent}. Expected: {case.must or 'go on'}. {WEIGHT[case.basis]}")
+            meaning.append(f"Test of {tested}: {sent}. Expected: {case.must or 'go on'}. {_weight(case)}")
         run = " or ".join(f"`fieldtwin check {command} ... --only {id}`" for command, _, _ in of)
         sources = spelled_out("; ".join(case.sources for _, _, case in of if case.sources))
         row = of[0][2].row

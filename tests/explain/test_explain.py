@@ -108,3 +108,9 @@ def test_without_a_word_all_are_listed_and_json_has_the_same() -> None:
     assert len(data) == len(everything())
     assert all(entry["id"] in listed for entry in data)
     assert {"id", "kind", "title", "meaning", "todo", "source", "also", "page"} == set(data[0])
+
+
+def test_a_case_that_the_standard_requires_on_one_transport_says_so() -> None:
+    [entry] = [entry for entry in everything() if entry.id == "MB-013"]
+    assert "No clause requires it" in entry.meaning
+    assert "On TCP: The standard requires it: a failure is a deviation." in entry.meaning

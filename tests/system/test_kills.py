@@ -81,7 +81,7 @@ def test_a_killed_thread_process_is_restarted_and_its_twin_misses_nothing(tmp_pa
         place, first = thread("get")["place"], run.pid_of("t", "thread")
         twin = ("twin", "observatory", "--from", place, "--instance", "tt", "--json")
         with fieldtwin(tmp_path, *twin, "--command", "1", name="twin") as its:
-            wait_for(lambda: thread("get")["sent_through"] > 20, 20, its.err)
+            wait_for(lambda: answered(thread, "sent_through") > 20, 20, its.err)
             os.kill(first, signal.SIGKILL)
             wait_for(lambda: not alive(first), 5, "it is gone")
             wait_for(lambda: answered(thread, "place") == place, 10, "another one, at the same place")

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -27,8 +27,6 @@ from fieldtwin.service.attached import RunService, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
 from fieldtwin.service.studio_child import StudioChild
-from fieldtwin.twin.plant.instance import capture_path
-from fieldtwin.twin.site.system import load_system
 
 NEITHER = """run needs --plant or --prototype; there is no default.
   --prototype   emulate the field devices as defined in NAME.prototype.yaml; no real device is touched
@@ -239,6 +237,7 @@ def command(
         can=field.can,
         commands=commands,
         capture=capture,
+        record_frames=bool(studio),
         cold=place.cold,
         thread=thread.thread,
         thread_store=thread.thread_store,
@@ -253,10 +252,6 @@ async def _run(options: RunOptions, service_options: ServiceOptions, studio: str
     from fieldtwin.console import show_warnings
 
     check(service_options)
-    if studio and options.capture is None:
-        options = replace(
-            options, capture=capture_path(options.instance or load_system(options.system, options.profiles).name)
-        )
     notifier = Notifier.from_environment()
     session = RunSession(options)
     interrupted = started = False

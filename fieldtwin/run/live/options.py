@@ -33,6 +33,8 @@ class RunOptions:
     can: str = ""
     commands: tuple[int, ...] = ()
     capture: Path | None = None
+    record_frames: bool = False
+    """Whether to capture into the instance's own file (`capture_path`) if `capture` names none, as Studio needs it."""
     cold: bool = False
     thread: str = ""
     """The destination of the plant's side of a digital thread (`fieldtwin.twin.thread.place`), empty for none."""

@@ -40,7 +40,7 @@ from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.thread_return import ThreadReturn
 from fieldtwin.run.processes.topside import TopsideController, script
 from fieldtwin.twin.plant.controller import ControllerConfig
-from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.plant.instance import Instance, capture_path
 from fieldtwin.twin.plant.mapping import mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
@@ -103,6 +103,7 @@ class RunSession(AsyncResource):
 
             self.faults += load_faults(options.fault_file, lambda spec: target(self.system, spec))
         self.instance = Instance(options.instance or self.system.name)
+        self.capture = options.capture or (capture_path(self.instance.name) if options.record_frames else None)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
         self.cables: dict[str, BridgeCable] = {}
@@ -223,7 +224,7 @@ class RunSession(AsyncResource):
             allow_writes=self.options.prototype or self.options.allow_writes,
             mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
             profiles=tuple(str(p.resolve()) for p in self.options.profiles),
-            capture=str(self.options.capture.resolve()) if self.options.capture else "",
+            capture=str(self.capture.resolve()) if self.capture else "",
             delegated=(self.delegated,) if self.delegated else (),
             resolved=self._resolved,
         )
@@ -246,7 +247,7 @@ class RunSession(AsyncResource):
             started_utc_ns=self.clock.utc_ns(),
             started_ns=self.started_ns,
             pid=os.getpid(),
-            capture=str(o.capture.resolve()) if o.capture else "",
+            capture=str(self.capture.resolve()) if self.capture else "",
             field_elsewhere=bool(o.field_host),
         )
 

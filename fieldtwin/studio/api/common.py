@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TypeVar
+
 from starlette.requests import HTTPConnection
 
 from fieldtwin.gateway.core.errors import NotAllowed
@@ -11,20 +14,29 @@ from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.live.recordings import Recordings
 
 INSTANCE = "/instances/{instance}"
+T = TypeVar("T")
+
+
+def of_server(request: HTTPConnection, name: str, kind: type[T]) -> T:
+    """Return a part of the server that `fieldtwin.studio.app` has put into the application's state."""
+    part = getattr(request.app.state, name)
+    assert isinstance(part, kind)
+    return part
 
 
 def gallery_of(request: HTTPConnection) -> Gallery:
     """Return the gallery of the server."""
-    gallery = request.app.state.gallery
-    assert isinstance(gallery, Gallery)
-    return gallery
+    return of_server(request, "gallery", Gallery)
 
 
 def recordings_of(request: HTTPConnection) -> Recordings:
     """Return the scenario recordings of the server, in which handlers note what clients do."""
-    recordings = request.app.state.recordings
-    assert isinstance(recordings, Recordings)
-    return recordings
+    return of_server(request, "recordings", Recordings)
+
+
+def folder_of(request: HTTPConnection) -> Path:
+    """Return the server's working directory, which is searched for systems and scenarios."""
+    return of_server(request, "folder", Path)
 
 
 async def attached(request: HTTPConnection) -> Attachment:

@@ -18,7 +18,13 @@ from fieldtwin.gateway.core.errors import (
 )
 from fieldtwin.studio.live.gallery import NoInstance
 
+
+class NotFound(UsageError):
+    """The interface has nothing under this name."""
+
+
 STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
+    (NotFound, 404),
     (NoInstance, 404),
     (CheckFailed, 409),
     (NotAllowed, 403),
@@ -29,18 +35,13 @@ STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
 )
 """The first class that fits gives the status; any other error is 422, a bug 500."""
 
-
-class NotFound(UsageError):
-    """The interface has nothing under this name."""
+_BY_NAME = {kind.__name__: status for kind, status in STATUS}
 
 
 def status_of(error: FieldtwinError) -> int:
     """Return the HTTP status of an error."""
-    if isinstance(error, NotFound):
-        return 404
     if isinstance(error, RemoteError):
-        kind = next((kind for kind, _ in STATUS if kind.__name__ == error.kind), None)
-        return dict(STATUS)[kind] if kind else 400 if error.remote_exit_code == UsageError.exit_code else 502
+        return _BY_NAME.get(error.kind, 400 if error.remote_exit_code == UsageError.exit_code else 502)
     if isinstance(error, Bug):
         return 500
     return next((status for kind, status in STATUS if isinstance(error, kind)), 422)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, attached, gallery_of
+from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, gallery_of, of_server
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.live.instances import FoundInstance, find_instances
@@ -30,13 +29,13 @@ async def list_instances(request: Request) -> list[dict[str, Any]]:
 
 async def list_systems(request: Request) -> list[dict[str, Any]]:
     """Return the systems that have a prototype: those of the working directory, and the shipped ones."""
-    return [msgspec.to_builtins(known) for known in known_systems(_folder(request))]
+    return [msgspec.to_builtins(known) for known in known_systems(folder_of(request))]
 
 
 async def start_prototype(request: Request) -> dict[str, Any]:
     """Start the prototype of a known system. The answer comes when its gateway runs."""
     form = await body_of(request, StartPrototype)
-    known = {system.path for system in known_systems(_folder(request))}
+    known = {system.path for system in known_systems(folder_of(request))}
     if form.system not in known:  # a page must not start arbitrary files
         raise NotFound(f"no system {form.system[:80]!r}", expected=", ".join(sorted(known)))
     instance = await _launcher(request).start(form.system, form.instance)
@@ -51,15 +50,7 @@ async def stop_instance(request: Request) -> dict[str, Any]:
 
 
 def _launcher(request: Request) -> Launcher:
-    launcher = request.app.state.launcher
-    assert isinstance(launcher, Launcher)
-    return launcher
-
-
-def _folder(request: Request) -> Path:
-    folder = request.app.state.folder
-    assert isinstance(folder, Path)
-    return folder
+    return of_server(request, "launcher", Launcher)
 
 
 async def get_instance(request: Request) -> dict[str, Any]:

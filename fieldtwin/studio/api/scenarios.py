@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, attached, prototype, recordings_of
+from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, of_server, prototype, recordings_of
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.live.scenario_run import ScenarioRunner, known_scenarios
@@ -30,7 +30,7 @@ class SaveScenario(msgspec.Struct, forbid_unknown_fields=True):
 async def list_scenarios(request: Request) -> dict[str, Any]:
     """Return the scenario files of the system, and the present or latest run with its result."""
     attachment = await attached(request)
-    files = known_scenarios(Path(attachment.record.path), _folder(request))
+    files = known_scenarios(Path(attachment.record.path), folder_of(request))
     return {"files": [msgspec.to_builtins(file) for file in files], "run": _runner(request).state()}
 
 
@@ -38,7 +38,7 @@ async def run_scenario(request: Request) -> dict[str, Any]:
     """Start a scenario. One runs at a time; it has its own gateway, PLC and devices."""
     attachment = await attached(request)
     form = await body_of(request, RunScenario)
-    known = [file.path for file in known_scenarios(Path(attachment.record.path), _folder(request))]
+    known = [file.path for file in known_scenarios(Path(attachment.record.path), folder_of(request))]
     if form.path not in known:  # a page must not run arbitrary files
         raise NotFound(f"no scenario {form.path[:80]!r}", expected=", ".join(known) or "a scenario; there is none")
     await _runner(request).start(form.path, form.target)
@@ -73,26 +73,18 @@ async def begin_recording(request: Request) -> dict[str, Any]:
 async def finish_recording(request: Request) -> dict[str, Any]:
     """End the recording and return the proposed scenario as YAML."""
     attachment = await prototype(request)
-    return {"draft": await recordings_of(request).finish(attachment, _folder(request))}
+    return {"draft": await recordings_of(request).finish(attachment, folder_of(request))}
 
 
 async def save_scenario(request: Request) -> dict[str, Any]:
     """Write the latest proposed scenario to a new file."""
     attachment = await prototype(request)
     form = await body_of(request, SaveScenario)
-    return {"path": str(recordings_of(request).save(attachment, _folder(request).resolve(), form.name))}
+    return {"path": str(recordings_of(request).save(attachment, folder_of(request).resolve(), form.name))}
 
 
 def _runner(request: Request) -> ScenarioRunner:
-    runner = request.app.state.runner
-    assert isinstance(runner, ScenarioRunner)
-    return runner
-
-
-def _folder(request: Request) -> Path:
-    folder = request.app.state.folder
-    assert isinstance(folder, Path)
-    return folder
+    return of_server(request, "runner", ScenarioRunner)
 
 
 SCENARIOS = f"{INSTANCE}/scenarios"

@@ -9,7 +9,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, UsageError
 from fieldtwin.run.processes.run_record import read_record
 from fieldtwin.studio.live.instances import GATEWAY_SOCKET, accepts, find_instance
 from fieldtwin.twin.plant.child import command
@@ -144,7 +144,7 @@ class _Run:
 
     async def _is_ready(self, run_dir: Path) -> bool:
         """Return whether this run, not an earlier one, has written its record, and its gateway accepts connections."""
-        with contextlib.suppress(Exception):
+        with contextlib.suppress(FileInvalid):
             record = read_record(run_dir)
             return record is not None and record.pid == self._process.pid and await accepts(run_dir / GATEWAY_SOCKET)
         return False

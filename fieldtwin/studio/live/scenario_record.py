@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.studio.live.attachment import Attachment
-from fieldtwin.twin.plant.physical import bound_programs
 from fieldtwin.twin.prototype.field_status import FieldStatus
-from fieldtwin.twin.site.system import System
 
 LOOK_EVERY_S = 0.25
 MOST_ACTIONS = 500
@@ -83,7 +81,6 @@ class Recorder:
     def __init__(self, attachment: Attachment) -> None:
         self.attachment = attachment
         self.recording = Recording(attachment.now_ns())
-        self._words = words_of(attachment.system)
         self._set: set[str] = set()
         self._changes = 0
         self._nursery = Nursery()
@@ -147,11 +144,20 @@ class Recorder:
                 value = point.value if name in self._set else None
                 self._add_tag(name, Seen(point.t_ns, value, point.quality, point.reason))
         variables = self.attachment.plc.variables if self.attachment.plc is not None else {}
-        for name, words in self._words.items():
+        for name, words in self._state_words().items():
             word = words.get(variables.get(name, -1))
             states = self.recording.states.setdefault(name, [])
             if word is not None and (not states or states[-1].word != word) and self._has_room():
                 states.append(State(now_ns, word))
+
+    def _state_words(self) -> Words:
+        """Return the words of the programs' states, as the PLC describes them; none until it has answered."""
+        variables = {name: program["variables"].get(STATE) for name, program in self.attachment.programs.items()}
+        return {
+            f"{name}.{STATE}": {int(code): word for code, word in state["words"].items()}
+            for name, state in variables.items()
+            if state is not None and state["words"]
+        }
 
     def _add_tag(self, name: str, seen: Seen) -> None:
         changes = self.recording.tags.setdefault(name, [])
@@ -162,17 +168,3 @@ class Recorder:
         self._changes += 1
         self.recording.is_full = self._changes > MOST_CHANGES
         return not self.recording.is_full
-
-
-def words_of(system: System) -> Words:
-    """Return the words of the programs' states. A program that cannot be loaded here has none."""
-    try:
-        programs = bound_programs(system, ErrorCollector())
-    except FieldtwinError:
-        return {}
-    return {
-        tag: {int(value): word for value, word in variable.words}
-        for program in programs
-        for variable, tag in program.published()
-        if tag == f"{program.name}.state" and variable.words
-    }

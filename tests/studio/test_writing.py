@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from shed_site import FILES
 from studio_rig import Studio, studio, until
 
 SITE = {
@@ -21,15 +22,7 @@ system: shed
 buses: {lan: {url: "tcp://127.0.0.1:PORT", timeout_ms: 500}}
 devices: {tank: {profile: tank.yaml, bus: lan, unit: 1, poll: {values: {every_ms: 100}}, writable: [valve]}}
 """,
-    "tank.yaml": """device: own/tank
-source: "this test"
-protocol: modbus
-numbering: printed
-defaults: {poll: values}
-tags:
-  level: {at: 30001, type: uint16, range: [0, 500]}
-  valve: {at: 40001, type: uint16, access: rw, range: [0, 1]}
-""",
+    "tank.yaml": FILES["tank.yaml"],
 }
 TAG = "/instances/shed/tags"
 

@@ -11,6 +11,7 @@ from fieldtwin.capture.decoding.exchange import SECRET, TouchedSpan
 from fieldtwin.capture.decoding.fields import FieldReader, FieldSpan
 from fieldtwin.capture.decoding.modbus_pdu import (
     BIT_TABLES,
+    TABLES,
     DecodedRequest,
     bits,
     exception_text,
@@ -25,10 +26,6 @@ _CLAUSES = {
     0x01: "6.1", 0x02: "6.2", 0x03: "6.3", 0x04: "6.4", 0x05: "6.5", 0x06: "6.6", 0x07: "6.7", 0x08: "6.8", 0x0B: "6.9",
     0x0C: "6.10", 0x0F: "6.11", 0x10: "6.12", 0x11: "6.13", 0x14: "6.14", 0x15: "6.15", 0x16: "6.16", 0x17: "6.17",
     0x18: "6.18", 0x2B: "6.19",
-}  # fmt: skip
-_TABLES: dict[int, Table] = {
-    0x01: "coil", 0x02: "discrete", 0x03: "holding", 0x04: "input", 0x05: "coil", 0x06: "holding", 0x0F: "coil",
-    0x10: "holding", 0x16: "holding", 0x17: "holding", 0x18: "holding",
 }  # fmt: skip
 _MBAP_BYTES = 7
 
@@ -180,7 +177,7 @@ class _Data:
         self._clause = clause
         self._asked = asked if asked is not None and asked.function == function else None
         self._tags = tags
-        self._table: Table = _TABLES.get(function, "holding")
+        self._table: Table = TABLES.get(function, "holding")
 
     def read(self, is_request: bool) -> None:
         """Take the fields of the function."""

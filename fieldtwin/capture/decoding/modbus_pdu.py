@@ -20,12 +20,12 @@ SERVICES = {
     0x17: "read/write registers", 0x18: "read FIFO queue", 0x2B: "read device identification",
 }  # fmt: skip
 
-_TABLES: dict[int, Table] = {
+TABLES: dict[int, Table] = {
     0x01: "coil", 0x02: "discrete", 0x03: "holding", 0x04: "input", 0x05: "coil", 0x06: "holding", 0x0F: "coil",
     0x10: "holding", 0x16: "holding", 0x18: "holding",
 }  # fmt: skip
 BIT_TABLES = ("coil", "discrete")
-assert set(_TABLES.values()) <= set(get_args(Table))
+assert set(TABLES.values()) <= set(get_args(Table))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ def parse_request(pdu: bytes) -> DecodedRequest:
         return DecodedRequest(
             function,
             service_of(function),
-            (TouchedSpan("read", _TABLES[function], address, count),),
+            (TouchedSpan("read", TABLES[function], address, count),),
             reply_bytes=2 + size,
         )
     if function in (0x05, 0x06) and len(pdu) == 5:
@@ -103,11 +103,11 @@ def parse_request(pdu: bytes) -> DecodedRequest:
             return malformed
         spans = (TouchedSpan("read", "holding", at, count), TouchedSpan("write", "holding", to, many))
         return DecodedRequest(function, service_of(function), spans, pdu[10:], 2 + 2 * count)
-    return malformed if (function in _TABLES and function != 0x18) or function == 0x17 else _other(function, pdu)
+    return malformed if (function in TABLES and function != 0x18) or function == 0x17 else _other(function, pdu)
 
 
 def _write(function: int, address: int, count: int, written: bytes, echoes: int) -> DecodedRequest:
-    span = TouchedSpan("write", _TABLES[function], address, count)
+    span = TouchedSpan("write", TABLES[function], address, count)
     return DecodedRequest(function, service_of(function), (span,), written, echoes, echoes)
 
 

@@ -25,7 +25,7 @@ async def list_fault_kinds(request: Request) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "kind": kind.kind.value if hasattr(kind.kind, "value") else str(kind.kind),
+            "kind": kind.kind.value,
             "summary": kind.summary,
             "aims": aims_of(kind),
             "parameters": kind.form.model_json_schema().get("properties", {}),

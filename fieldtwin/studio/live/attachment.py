@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import RemoteError
@@ -39,7 +40,6 @@ FIELD_EVERY_S = 0.5
 FRAMES_EVERY_S = 0.05
 AGAIN_AFTER_S = 1.0
 """Pause in seconds before a process that did not answer is asked again."""
-SECRET = "(secret)"
 NONE_OF_THEM = 1 << 62
 """The number after which the refused writes are wanted: the status has them already."""
 
@@ -77,12 +77,9 @@ class Attachment:
         """Changes of tags that the gateway had dropped before they were read."""
         self.frames: FrameLog | None = None
         self._clock = clock
-        self._secrets = {
-            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values() if t.secret
-        }
-        self.history = TagHistory(
-            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()
-        )
+        tags = {f"{d.name}.{t.name}": t for d in system.devices.values() for t in d.profile.tags.values()}
+        self._secrets = {name for name, tag in tags.items() if tag.secret}
+        self.history = TagHistory(tags)
         self._seen_change: int | None = None
         """The number of the latest change that was read, None before the first answer."""
         self._described: tuple[int, int] | None = None
@@ -111,11 +108,6 @@ class Attachment:
             await channel.aclose()
         if self.frames is not None:
             self.frames.close()
-
-    @property
-    def running(self) -> bool:
-        """Return whether the gateway answers."""
-        return self.gateway is not None
 
     def now_ns(self) -> int:
         """Return the present time on the run's monotonic clock."""

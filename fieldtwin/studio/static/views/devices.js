@@ -75,26 +75,17 @@ export function Devices({ store, query }) {
 
 function SetDialog({ store, full, about, onClose }) {
   const now = store.tags[full]?.value;
-  const [text, setText] = useState(typeof now === "number" ? number(now) : "");
-  const [run, error, busy] = useAction();
-  const wanted = Number(text.replace(",", "."));
-  const valid = text.trim() !== "" && Number.isFinite(wanted);
-  const send = async (e) => {
-    e.preventDefault();
-    if (await run(() => put(`${store.path}/tags/${full}/set`, { value: wanted }))) onClose();
-  };
-  return html`<${Dialog} title="Set ${full} in the simulated device" onClose=${onClose}>
-    <form onSubmit=${send}>
-      <p class="soft">The device holds this value until you release it. The gateway reads it over the bus, like any other value.</p>
-      <${Failure} text=${error} />
-      <label>Value <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${about.unit}</label>
-      <p class="soft">now ${number(now)} ${about.unit}${about.range ? `, range ${about.range.join(" to ")}` : ""}</p>
-      <footer>
-        <button type="button" onClick=${onClose}>Cancel</button>
-        <button class="primary" disabled=${!valid || busy}>Set</button>
-      </footer>
-    </form>
-  <//>`;
+  return html`<${NumberDialog}
+    title="Set ${full} in the simulated device"
+    label="Value"
+    first=${typeof now === "number" ? number(now) : ""}
+    unit=${about.unit}
+    action="Set"
+    send=${(wanted) => put(`${store.path}/tags/${full}/set`, { value: wanted })}
+    above=${html`<p class="soft">The device holds this value until you release it. The gateway reads it over the bus, like any other value.</p>`}
+    below=${() => html`<p class="soft">now ${number(now)} ${about.unit}${about.range ? `, range ${about.range.join(" to ")}` : ""}</p>`}
+    onClose=${onClose}
+  />`;
 }
 
 const mayWrite = (store, about) => store.mayOperate && about.writable && !about.secret && store.about.allow_writes;
@@ -102,25 +93,40 @@ const mayWrite = (store, about) => store.mayOperate && about.writable && !about.
 /** A write through the gateway to the device. On a plant this is real hardware, so old and new value are confirmed. */
 function WriteDialog({ store, full, about, onClose }) {
   const [old] = useState(() => store.tags[full]?.value ?? null);
-  const [text, setText] = useState("");
-  const [run, error, busy] = useAction();
-  const wanted = Number(text.replace(",", "."));
-  const valid = text.trim() !== "" && Number.isFinite(wanted);
   const plant = !store.isPrototype;
-  const send = async (e) => {
+  return html`<${NumberDialog}
+    title="Write ${full}"
+    label="New value"
+    unit=${about.unit}
+    action="Write"
+    danger=${plant}
+    send=${(wanted) => post(`${store.path}/tags/${full}/write`, { value: wanted, old })}
+    above=${html`${plant && html`<p class="error">This is a plant: the value is written to a real device.</p>`}
+    ${about.impact && html`<p class="soft">Impact of a write: ${about.impact}</p>`}`}
+    below=${(wanted) => html`<p>${number(old)} ${about.unit} → <strong>${wanted === null ? "…" : number(wanted)} ${about.unit}</strong></p>`}
+    onClose=${onClose}
+  />`;
+}
+
+/** Ask for a number and send it. `above` and `below` are drawn around the field; `below` gets null while the text is no number. */
+function NumberDialog({ title, label, first = "", unit, action, danger, send, above, below, onClose }) {
+  const [text, setText] = useState(first);
+  const [run, error, busy] = useAction();
+  const entered = Number(text.replace(",", "."));
+  const wanted = text.trim() !== "" && Number.isFinite(entered) ? entered : null;
+  const submit = async (e) => {
     e.preventDefault();
-    if (await run(() => post(`${store.path}/tags/${full}/write`, { value: wanted, old }))) onClose();
+    if (await run(() => send(wanted))) onClose();
   };
-  return html`<${Dialog} title="Write ${full}" onClose=${onClose}>
-    <form onSubmit=${send}>
-      ${plant && html`<p class="error">This is a plant: the value is written to a real device.</p>`}
-      ${about.impact && html`<p class="soft">Impact of a write: ${about.impact}</p>`}
+  return html`<${Dialog} title=${title} onClose=${onClose}>
+    <form onSubmit=${submit}>
+      ${above}
       <${Failure} text=${error} />
-      <label>New value <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${about.unit}</label>
-      <p>${number(old)} ${about.unit} → <strong>${valid ? number(wanted) : "…"} ${about.unit}</strong></p>
+      <label>${label} <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${unit}</label>
+      ${below(wanted)}
       <footer>
         <button type="button" onClick=${onClose}>Cancel</button>
-        <button class=${plant ? "danger" : "primary"} disabled=${!valid || busy}>Write</button>
+        <button class=${danger ? "danger" : "primary"} disabled=${wanted === null || busy}>${action}</button>
       </footer>
     </form>
   <//>`;

@@ -14,6 +14,7 @@ from fieldtwin.cli.options import Secret
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.installation import install_hint
+from fieldtwin.service.studio_child import READY
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def command(system: str, no_browser: bool, instance: str, server: ServerOptions)
     check_pages()
 
     def on_ready(serving: Serving) -> None:
-        stderr.print(f"Studio  →  {serving.url}", soft_wrap=True, markup=False, highlight=False)
+        stderr.print(f"{READY}{serving.url}", soft_wrap=True, markup=False, highlight=False)
         if not no_browser and not open_browser(serving.url):
             stderr.print("no browser was found: open this address yourself", soft_wrap=True)
 

@@ -31,7 +31,7 @@ async def measure(function: int, start: int, address: int, count: int, registers
     if function == 4:
         seconds = time.monotonic() - BEGAN
         flow = 12.0 + 3.0 * math.sin(seconds / 7.0)
-        registers[0:6] = words(flow, 1.9 + 0.03 * flow, 21.5 + 0.7 * math.sin(seconds / 31.0))
+        registers[0:6] = words(flow, 1.9 + 0.03 * flow, 21.5 + 0.7 * math.sin(seconds / 5.0))
         total = 184_467 + int(seconds * 900)
         registers[6:8] = [total >> 16, total & 0xFFFF]
 

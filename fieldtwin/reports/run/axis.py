@@ -4,7 +4,9 @@ for it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.reports.markup import Markup, el
@@ -16,12 +18,23 @@ CHAR = 6.3
 """Width of a character of the 10.5 px monospace face, in px."""
 
 
+class Lane(NamedTuple):
+    """A lane: its height, its marks, and where the grid of times is drawn in it (None: over the whole height)."""
+
+    height: float
+    marks: list[Markup]
+    grid: Sequence[tuple[float, float]] | None = None
+    """Stretches without text, from top to bottom, so that no line crosses a text that has no box around it."""
+
+
 @dataclass
 class TimeAxis:
     """Converts times to positions, in px from the left."""
 
     start_ns: int
     span_ns: int
+    at_ns: int | None = None
+    """Time of the verdict. No text may cross the line that is drawn there."""
 
     def x(self, t_ns: int) -> float:
         share = (t_ns - self.start_ns) / self.span_ns
@@ -38,13 +51,25 @@ def label(name: str, below: str = "") -> list[Markup]:
     return parts
 
 
-def fitted(said: str, x1: float, x2: float, y: float, cls: str, *, cut: bool = False) -> list[Markup]:
-    """Return text inside a box if there is room for it; with `cut`, also the beginning of a longer text."""
-    room = int((x2 - x1 - 8) / CHAR)
-    if len(said) > room and (not cut or room < 3):
-        return []
-    shown = said if len(said) <= room else said[: room - 1] + "…"
-    return [el("text", shown, cls=cls, x=max(x1, LEFT) + 5, y=y)]
+def fitted(axis: TimeAxis, said: str, x1: float, x2: float, y: float, cls: str, *, cut: bool = False) -> list[Markup]:
+    """Return text inside a box if there is room for it, on one side of the line of the verdict.
+
+    With `cut`, a text that is too long is cut; if only a few characters would remain, its part before a colon is used.
+    """
+    x1 = max(x1, LEFT)
+    sides = [(x1, x2)]
+    if axis.at_ns is not None and x1 < (line := axis.x(axis.at_ns)) < x2:
+        sides = sorted([(x1, line), (line, x2)], key=lambda side: (_room(*side) < len(said), side[0] - side[1]))
+    start, room = sides[0][0], _room(*sides[0])
+    if len(said) > room and cut:
+        first = said.partition(":")[0]
+        said = said[: room - 1] + "…" if room >= (3 if first == said else 6) else first
+    return [el("text", said, cls=cls, x=start + 5, y=y)] if len(said) <= room else []
+
+
+def _room(x1: float, x2: float) -> int:
+    """Return the number of characters that fit between two positions."""
+    return int((x2 - x1 - 8) / CHAR)
 
 
 def seconds(t_ns: int) -> str:

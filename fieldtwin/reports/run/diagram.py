@@ -8,13 +8,14 @@ their own.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.tags import show_value
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.reports.markup import Markup, el
-from fieldtwin.reports.run.axis import CHAR, LEFT, RIGHT, WIDTH, TimeAxis, fitted, label, seconds
+from fieldtwin.reports.run.axis import CHAR, LEFT, RIGHT, WIDTH, Lane, TimeAxis, fitted, label, seconds
 from fieldtwin.reports.run.value_lanes import value_lane
 from fieldtwin.reports.run.window import FaultBar, PlotStep, Window
 from fieldtwin.twin.site.system import System
@@ -29,8 +30,8 @@ MOST_MARKS = 250
 
 def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
     """Return the drawing."""
-    axis = TimeAxis(window.start_ns, window.span_ns)
-    lanes: list[tuple[float, list[Markup]]] = []
+    axis = TimeAxis(window.start_ns, window.span_ns, window.at_ns)
+    lanes: list[Lane] = []
     lanes += [_fault_lane(axis, bar) for bar in window.faults[:MOST_FAULTS]]
     lanes += [_wire_lane(axis, window, bus, system) for bus in _buses(window)]
     lanes += _scan_lane(axis, window, system)
@@ -40,18 +41,21 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
             words = dict(tag.values) if tag else {}
             lanes.append(value_lane(axis, window, name, steps[name], tag.unit if tag else "", words))
     unseen = [n for n in window.check.names if "." in n and n not in window.tags and n not in window.states]
-    lanes += [(22.0, [*label(n), el("text", "never published", cls="sub", x=LEFT + 5, y=15.0)]) for n in unseen]
+    never = el("text", "never published", cls="sub", x=LEFT + 5, y=15.0)
+    lanes += [Lane(22.0, [*label(n), never], ()) for n in unseen]
+    times = _times(window)
     top, parts = 30.0, []
-    for number, (height, marks) in enumerate(lanes):
-        stripe = el("rect", cls=f"stripe{number % 2}", x=0.0, y=0.0, width=WIDTH, height=height)
-        parts.append(el("g", stripe, marks, transform=f"translate(0 {top:.0f})"))
-        top += height + 2
+    for number, lane in enumerate(lanes):
+        stripe = el("rect", cls=f"stripe{number % 2}", x=0.0, y=0.0, width=WIDTH, height=lane.height)
+        grid = _grid(axis, times, lane)
+        parts.append(el("g", stripe, grid, lane.marks, transform=f"translate(0 {top:.0f})"))
+        top += lane.height + 2
     height = top + 6
     return el(
         "svg",
         el("title", title),
         parts,
-        _time_axis(axis, window, height),
+        _ticks(axis, times),
         _failure(axis, window, height),
         cls="timing", viewBox=f"0 0 {WIDTH:.0f} {height:.0f}", role="img", xmlns="http://www.w3.org/2000/svg",
     )  # fmt: skip
@@ -101,7 +105,7 @@ def _tag(system: System | None, name: str) -> Tag | None:
 # -- lanes --------------------------------------------------------------------------------------------------------------
 
 
-def _fault_lane(axis: TimeAxis, bar: FaultBar) -> tuple[float, list[Markup]]:
+def _fault_lane(axis: TimeAxis, bar: FaultBar) -> Lane:
     x1, x2 = axis.x(bar.on_ns), axis.x(bar.off_ns) if bar.off_ns is not None else WIDTH - RIGHT
     said = f"{bar.name} {bar.target}".strip()
     off = f"to {seconds(bar.off_ns)}" if bar.off_ns is not None else "and not removed"
@@ -109,10 +113,10 @@ def _fault_lane(axis: TimeAxis, bar: FaultBar) -> tuple[float, list[Markup]]:
         "rect", el("title", f"fault {bar.id}: {said}, from {seconds(bar.on_ns)} {off}"), cls="fault",
         x=x1, y=3.0, width=max(2.0, x2 - x1), height=16.0, rx=2,
     )  # fmt: skip
-    return 22.0, [*label(f"fault {bar.id}"), box, *fitted(said, x1, x2, 15.0, "faulttext")]
+    return Lane(22.0, [*label(f"fault {bar.id}"), box, *fitted(axis, said, x1, x2, 15.0, "faulttext")])
 
 
-def _wire_lane(axis: TimeAxis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
+def _wire_lane(axis: TimeAxis, window: Window, bus: str, system: System | None) -> Lane:
     """Return the lane of a bus.
 
     A request is a box as long as the wait for its answer, a message is a tick; text is added where there is room.
@@ -139,23 +143,30 @@ def _wire_lane(axis: TimeAxis, window: Window, bus: str, system: System | None) 
     thinned = max(step.values()) > 1 or bus in window.thinned
     if thinned:
         marks.append(el("text", "thinned: too many", cls="sub", x=8.0, y=41.0))
-    return max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0), marks + _words(words)
+    height = max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0)
+    grid = [(17.0 + 32 * row, min(32.0 + 32 * row, height)) for row in range(len(rows))]
+    return Lane(height, marks + _words(axis, words), grid)
 
 
 _RANK = {"message": 3, "asked": 2, "wrote": 1}
 """Priority of the labels where there is not room for all; errors come first."""
 
 
-def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
-    """Return as many labels as fit without overlap. Each of `words` is rank, y, x, text, kind."""
+def _words(axis: TimeAxis, words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
+    """Return as many labels as fit without overlap. Each of `words` is rank, y, x, text, kind.
+
+    A label that would cross the line of the verdict ends before it.
+    """
+    line = axis.x(axis.at_ns) if axis.at_ns is not None else WIDTH
     placed: dict[float, list[tuple[float, float]]] = {}
     marks = []
     for _, y, x1, said, kind in sorted(words):
-        x2 = x1 + len(said) * CHAR + 8
+        width = len(said) * CHAR + 8
+        left = line - width if x1 < line < x1 + width else x1
         taken = placed.setdefault(y, [])
-        if x2 < WIDTH and all(x2 <= a or x1 >= b for a, b in taken):
-            taken.append((x1, x2))
-            marks.append(el("text", said, cls=f"words {kind}", x=x1, y=y))
+        if left >= LEFT and left + width < WIDTH and all(left + width <= a or left >= b for a, b in taken):
+            taken.append((left, left + width))
+            marks.append(el("text", said, cls=f"words {kind}", x=left, y=y))
     return marks
 
 
@@ -164,7 +175,7 @@ def _row(exchange: DecodedExchange) -> int:
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
 
-def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
+def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[Lane]:
     """Return the lane of the scans that changed something, each with its changes; other scans are not drawn."""
     changed: dict[int, list[str]] = {}
     for name, steps in window.states.items():
@@ -178,7 +189,7 @@ def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[tu
     for t_ns in sorted(changed)[-MOST_MARKS:]:
         said = "\n".join([seconds(t_ns), *changed[t_ns][:8]])
         marks.append(el("rect", el("title", said), cls="x scan", x=axis.x(t_ns), y=6.0, width=2.2, height=16.0))
-    return [(34.0, marks)]
+    return [Lane(34.0, marks)]
 
 
 def _kind(exchange: DecodedExchange) -> str:
@@ -215,18 +226,24 @@ def _tooltip(exchange: DecodedExchange) -> str:
 # -- axis and failure -----------------------------------------------------------------------------------------------
 
 
-def _time_axis(axis: TimeAxis, window: Window, height: float) -> list[Markup]:
+def _times(window: Window) -> dict[int, str]:
+    """Return the round times of the window, each with its text, about eight."""
     wanted = window.span_ns / 8
     magnitude = 10 ** math.floor(math.log10(wanted))
     step = int(next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= wanted))
     first = -(-window.start_ns // step) * step
     digits = max(0, 9 - int(math.log10(step) + 1e-9))
-    marks = []
-    for t_ns in range(first, window.end_ns + 1, max(1, step)):
-        x = axis.x(t_ns)
-        marks.append(el("line", cls="grid", x1=x, x2=x, y1=26.0, y2=height - 4))
-        marks.append(el("text", f"{t_ns / NS_PER_S:.{digits}f} s", cls="tick", x=x, y=16.0))
-    return marks
+    return {t_ns: f"{t_ns / NS_PER_S:.{digits}f} s" for t_ns in range(first, window.end_ns + 1, max(1, step))}
+
+
+def _grid(axis: TimeAxis, times: Iterable[int], lane: Lane) -> list[Markup]:
+    """Return the lines of round times in a lane, below its marks."""
+    stretches = [(-2.0, lane.height)] if lane.grid is None else lane.grid
+    return [el("line", cls="grid", x1=axis.x(t), x2=axis.x(t), y1=y1, y2=y2) for t in times for y1, y2 in stretches]
+
+
+def _ticks(axis: TimeAxis, times: Mapping[int, str]) -> list[Markup]:
+    return [el("text", said, cls="tick", x=axis.x(t_ns), y=16.0) for t_ns, said in times.items()]
 
 
 def _failure(axis: TimeAxis, window: Window, height: float) -> list[Markup]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from fieldtwin.capture.decoding.tags import show_value
 from fieldtwin.reports.markup import Markup, el
-from fieldtwin.reports.run.axis import TimeAxis, fitted, label, seconds
+from fieldtwin.reports.run.axis import Lane, TimeAxis, fitted, label, seconds
 from fieldtwin.reports.run.window import PlotStep, Window, thin_steps
 
 MOST_POINTS = 300
@@ -26,26 +26,27 @@ def value_lane(
     steps: list[PlotStep],
     unit: str = "",
     words: Mapping[Any, str] | None = None,
-) -> tuple[float, list[Markup]]:
-    """Return height and marks of a lane. `words` are the names of values; a state with more values is drawn as a number."""
+) -> Lane:
+    """Return the lane of a tag or variable. `words` are the names of values; a state with more values is drawn as a number."""
     drawn = _thinned(steps)
     numbers = [s.value for s in drawn if _is_number(s.value)]
     is_state = not any(s.quality for s in drawn)
     thinned = name in window.thinned or len(drawn) < len(steps)
     if words or not numbers or (is_state and len(set(numbers)) <= _FEW):
-        return 26.0, [*label(name), *_boxes(axis, window, drawn, words or {}, "state" if is_state else "value")]
+        boxes = _boxes(axis, window, drawn, words or {}, "state" if is_state else "value")
+        return Lane(26.0, [*label(name), *boxes])
     return _line(axis, window, name, drawn, unit, thinned=thinned)
 
 
-def _line(
-    axis: TimeAxis, window: Window, name: str, steps: Sequence[PlotStep], unit: str, *, thinned: bool
-) -> tuple[float, list[Markup]]:
+def _line(axis: TimeAxis, window: Window, name: str, steps: Sequence[PlotStep], unit: str, *, thinned: bool) -> Lane:
     numbers = [s.value for s in steps if _is_number(s.value)]
     low, high = min(numbers), max(numbers)
-    height, room = 44.0, 30.0
+    bad = [span for span in _merged(window, steps, by_quality=True) if _quality(span[0]) != "good"]
+    top, room = (20.0 if bad else 8.0), 30.0
+    height = top + room + 6
 
     def y(value: float) -> float:
-        return 8.0 + room * (0.5 if high == low else 1 - (value - low) / (high - low))
+        return top + room * (0.5 if high == low else 1 - (value - low) / (high - low))
 
     bounds = f"{_number(low)} … {_number(high)} {unit}" if high != low else f"{_number(low)} {unit}"
     marks = [*label(name, bounds), *([el("text", "thinned", cls="sub", x=8.0, y=40.0)] if thinned else [])]
@@ -55,17 +56,15 @@ def _line(
         if _is_number(step.value):
             x1, x2 = axis.x(step.t_ns), axis.x(end_ns)
             paths.setdefault(_quality(step), []).append(f"M{x1:.1f} {y(step.value):.1f}H{max(x2, x1 + 1):.1f}")
-    for step, end_ns in _merged(window, steps, by_quality=True):
+    for step, end_ns in bad:
         x1, x2, kind = axis.x(step.t_ns), axis.x(end_ns), _quality(step)
-        if kind == "good":
-            continue
         why = f"{step.quality}" + (f": {step.reason}" if step.reason not in ("", "none") else "")
         size = {"x": x1, "y": 3.0, "width": max(1.0, x2 - x1), "height": height - 6}
         marks.append(el("rect", el("title", f"{seconds(step.t_ns)}  {name} {why}"), cls=f"q {kind}", **size))
-        lines += fitted(why, x1, x2, 14.0, f"qtext {kind}", cut=True)
+        lines += fitted(axis, why, x1, x2, 14.0, f"qtext {kind}", cut=True)
     lines += [el("path", cls=f"line {kind}", d="".join(d)) for kind, d in paths.items()]
     lines.append(_risers(axis, steps, y))
-    return height, marks + lines
+    return Lane(height, marks + lines)
 
 
 def _thinned(steps: list[PlotStep]) -> list[PlotStep]:
@@ -101,7 +100,7 @@ def _boxes(
         edge, back = f"l{slant:.1f} -9H{x2 - slant:.1f}", f"l{slant:.1f} 9l{-slant:.1f} 9H{x1 + slant:.1f}z"
         title = el("title", f"{seconds(step.t_ns)}  {said} {why}")
         marks.append(el("path", title, cls=f"{cls} {quality}", d=f"M{x1:.1f} {top + 9:.1f}{edge}{back}"))
-        marks += fitted(said, x1 + 2, x2, top + 13, f"{cls}text", cut=True)
+        marks += fitted(axis, said, x1 + 2, x2, top + 13, f"{cls}text", cut=True)
     return marks
 
 

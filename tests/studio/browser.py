@@ -15,6 +15,7 @@ from selenium.common.exceptions import (
     StaleElementReferenceException,
 )
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
@@ -77,8 +78,8 @@ class Window:
         self._act(css, "", lambda e: e.send_keys(Keys.CONTROL + "a" + Keys.NULL + text))
 
     def press(self, *keys: str) -> None:
-        """Press keys on the element that has the focus."""
-        self.driver.switch_to.active_element.send_keys(*keys)
+        """Press keys. The element that has the focus then receives them."""
+        ActionChains(self.driver).send_keys(*keys).perform()
 
     def size(self, width: int, height: int) -> None:
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}

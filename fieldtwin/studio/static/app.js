@@ -1,6 +1,6 @@
 // The frame of the page: which instance and which view the address names, navigation, and warnings that are visible on every view.
 
-import { html, render, useEffect, useState } from "./vendor/preact.js";
+import { html, render, useEffect, useRef, useState } from "./vendor/preact.js";
 import { address } from "./lib/address.js";
 import { remove } from "./lib/api.js";
 import { Failure, useAction } from "./lib/parts.js";
@@ -53,6 +53,13 @@ function Instance({ place }) {
   }, [store]);
   useStore(store);
   const { view: View, fill } = VIEWS[place.view];
+  const main = useRef(null);
+  const first = useRef(true);
+  useEffect(() => {
+    // The link of the earlier view is gone: without this, the tab key would begin at the top of the page again.
+    if (!first.current) main.current.focus();
+    first.current = false;
+  }, [place]);
   return html`<div class="frame">
     <${Top} store=${store} />
     <${Banners} store=${store} />
@@ -65,7 +72,7 @@ function Instance({ place }) {
           </a>`,
       )}
     </nav>
-    <main class=${fill ? "fill" : ""} id="view">
+    <main class=${fill ? "fill" : ""} id="view" ref=${main} tabindex="-1">
       ${store.error && html`<${Failure} text=${store.error} /><p><a href="#/">All instances</a></p>`}
       ${store.about && html`<${View} store=${store} query=${place.query} key=${place.view} />`}
       ${!store.about && !store.error && html`<p class="empty">Reading the instance …</p>`}

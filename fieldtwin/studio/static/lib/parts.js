@@ -42,13 +42,19 @@ export function useFetched(fetcher, keys) {
   return [state.result, state.error, () => setRound((n) => n + 1)];
 }
 
-/** A modal dialog; Escape and Cancel close it. */
+/** A modal dialog; Escape and Cancel close it. Afterwards the element that opened it has the focus again. */
 export function Dialog({ title, onClose, children }) {
   const ref = useRef(null);
+  const removed = useRef(false);
   useEffect(() => {
-    ref.current.showModal();
+    const dialog = ref.current;
+    dialog.showModal();
+    return () => {
+      removed.current = true;
+      dialog.close(); // the browser returns the focus only from a dialog that is closed, not from one that is removed
+    };
   }, []);
-  return html`<dialog ref=${ref} onClose=${onClose} aria-label=${title}>
+  return html`<dialog ref=${ref} onClose=${() => removed.current || onClose()} aria-label=${title}>
     <h2>${title}</h2>
     ${children}
   </dialog>`;

@@ -145,7 +145,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
       <div class="row head">
         <span>Time</span><span>Bus</span><span></span><span>Device</span><span>Function</span><span>Meaning</span><span>Bytes</span><span>Latency</span><span>Verdict</span>
       </div>
-      <div class="view" ref=${view} onScroll=${scrolled} tabindex="0" aria-label="Scroll with the arrow keys">
+      <div class="view" ref=${view} onScroll=${scrolled} role="group" tabindex="0" aria-label="Scroll with the arrow keys">
         <div style=${{ height: `${whole}px` }}></div>
         ${rows.map(([position, r]) => {
           const top = factor === 1 ? position * ROW : state.top + (position - first) * ROW;
@@ -156,6 +156,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
             class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""}"
             key=${position}
             style=${{ top: `${top}px` }}
+            tabindex=${live ? -1 : 0 /* rows that move would hold the tab key; an arrow key or Pause stops them */}
             aria-current=${r.number === selected}
             onClick=${() => setSelected(r.number)}
           >

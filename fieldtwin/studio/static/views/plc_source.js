@@ -13,7 +13,7 @@ export function Source({ store, name }) {
     <header><h2>Source of ${name}</h2><span class="soft"><span class="mono">${source.file}</span> · ${source.language}</span></header>
     ${!source.text && html`<p class="soft">The text is not shown: ${source.reason}.</p>`}
     ${source.text &&
-    html`<div class="scroll code" tabindex="0" aria-label="Text of ${source.file}">
+    html`<div class="scroll code" role="group" tabindex="0" aria-label="Text of ${source.file}">
       <table>
         <tbody>
           ${lines.map(

@@ -49,7 +49,7 @@ export function States({ store, name, changes }) {
 export function Transitions({ store, name, changes }) {
   if (!changes.length) return html`<p class="soft">No transition since the programs began.</p>`;
   const word = (code) => store.word(name, "state", code);
-  return html`<div class="scroll transitions" tabindex="0" aria-label="Last transitions of ${name}">
+  return html`<div class="scroll transitions" role="group" tabindex="0" aria-label="Last transitions of ${name}">
     <table class="list">
       <thead><tr><th>Time in the run</th><th>From</th><th>To</th><th class="number">Scan</th><th>Set by</th></tr></thead>
       <tbody>

@@ -77,7 +77,7 @@ function Record({ store, path, onSaved }) {
     ${state?.draft &&
     !state.recording &&
     html`<h3>Proposed scenario</h3>
-      <pre class="yaml draft" tabindex="0" aria-label="Proposed scenario">${state.draft}</pre>
+      <pre class="yaml draft" role="group" tabindex="0" aria-label="Proposed scenario">${state.draft}</pre>
       ${store.mayOperate &&
       html`<form class="bar" onSubmit=${save}>
         <label>Name <input size="20" required value=${name} onInput=${(e) => setName(e.target.value)} /></label>

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "rigs")]
+TESTS = Path(__file__).parent
+sys.path[:0] = [str(TESTS), str(TESTS / "rigs"), str(TESTS / "system")]  # set-ups that tests of several folders import
 
 # The time per example depends on the host's load. In CI, the examples are the same each time.
 settings.register_profile("fieldtwin", deadline=None, derandomize=bool(os.environ.get("CI")))
@@ -61,7 +62,8 @@ Each of the two queues takes about as long as all other tests together: three pr
 def line_of(nodeid: str) -> str:
     """Return the tests' group, which shares a process: a queue of `LINES`, or else the file."""
     file = nodeid.partition("::")[0]
-    return LINES.get(Path(file).parent.name, file)
+    folders = Path(file).parts
+    return LINES.get(folders[1], file) if len(folders) > 2 else file
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,7 +1,7 @@
 """Both readers of data sheets accept the public files of other projects, and interpret them identically.
 
 The test fetches the files from package registries, because they belong to other projects; without a registry it is skipped.
-tests/gateway/canopen/test_eds_readers_agree.py tests each construct without them.
+tests/gateway/protocols/canopen/eds/test_eds_readers_agree.py tests each construct without them.
 """
 
 from __future__ import annotations

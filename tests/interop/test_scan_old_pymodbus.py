@@ -1,6 +1,7 @@
 """`scan` on a TCP server of pymodbus 3.9.2: the package itself, fetched from the package registry when the test runs.
 
-tests/commissioning/test_scan_odd_replies.py tests its reply to an unknown unit, and the result of the scan, without the package.
+tests/commissioning/scan/test_scan_odd_replies.py tests its reply to an unknown unit, and the result of the scan,
+without the package.
 """
 
 from __future__ import annotations

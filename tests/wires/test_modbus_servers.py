@@ -1,7 +1,7 @@
 """The Modbus client against servers that share no code with it: pymodbus, libmodbus (C) and pyModbusTCP.
 
 It covers every wire that they support: RTU over TCP, ASCII, UDP and TLS with certificates (pymodbus), TCP and RTU (libmodbus),
-TCP (pyModbusTCP). test_modbus_interop covers pymodbus over TCP and RTU.
+TCP (pyModbusTCP). test_modbus_client_with_pymodbus covers pymodbus over TCP and RTU.
 """
 
 from __future__ import annotations

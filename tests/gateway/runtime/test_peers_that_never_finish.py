@@ -19,7 +19,7 @@ from canopen_master_bus import LoopClock, bus, run_virtual, running
 from gateway_rig import FieldBus, profile, running_bus, unit, wire
 from modbus_virtual import run_virtually
 from support import eventually, run
-from test_gateway_modbus_bus import TWO_GROUPS, bank, config
+from two_poll_groups import TWO_GROUPS, bank, config
 
 from fieldtwin.emulators.endpoints.can import bus_server
 from fieldtwin.emulators.endpoints.can.bus_hello import BusHello

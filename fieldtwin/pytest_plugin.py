@@ -59,7 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
         "fieldtwin(device=, on=, unit=, values=, recording=, system=, plc=, ...): what the fixtures device, prototype and plc "
-        "are (docs/how-to/pytest.md)",
+        "are (docs/reference/pytest-plugin.md)",
     )
     config.addinivalue_line("markers", "requirement(*ids): requirements that the test covers")
     if config.getoption("--fieldtwin-html") and not hasattr(config, "workerinput"):  # with xdist, once for all workers

@@ -216,7 +216,7 @@ STATES = st.sampled_from([READABLE, REFUSED, SILENT, INVALID])
 def test_blocks_of_eight_that_give_single_registers_or_pairs_are_found(
     blocks: list[tuple[int, int, str]], limit: int
 ) -> None:
-    """The promise of docs/how-to/maps.md, on devices that refuse everything else, mixed kinds of blocks included."""
+    """The promise of docs/explanation/dumping.md, on devices that refuse everything else, mixed kinds of blocks included."""
     answer: dict[str, object] = {}
     for start, count, kind in blocks:
         count -= count % 2 if kind == "pairs" else 0

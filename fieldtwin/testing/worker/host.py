@@ -1,7 +1,7 @@
 """The process behind a test run: emulated devices, whole field simulators and stepped programs, created and ended on request.
 
-It uses the control channel's protocol over its standard input and output (docs/reference/pytest-plugin.md lists the commands), so it
-may run in another virtual environment or in an image, and it ends with the process that started it. It does not depend
+It uses the control channel's protocol over its standard input and output (docs/reference/pytest-plugin.md lists the commands), so
+it may run in another virtual environment or in an image, and it ends with the process that started it. It does not depend
 on a test runner.
 """
 

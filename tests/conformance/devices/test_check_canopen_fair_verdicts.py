@@ -21,6 +21,7 @@ from fieldtwin.results.model import Verdict
 
 SDO, REPLY = 0x600 + NODE, 0x580 + NODE
 ABORT = bytes.fromhex("80 00 10 00 01 00 04 05")
+LENGTH, VALUE = (code.to_bytes(4, "little") for code in (0x0607_0010, 0x0609_0030))
 NEEDS_A_NUMBER = ("CO-009a", "CO-009b", "CO-013a", "CO-013b", "CO-015", "CO-029")
 NEEDS_A_TEXT = ("CO-001b", "CO-017", "CO-020")
 Serve = Callable[[CanConnection, VirtualClock], object]
@@ -49,6 +50,36 @@ class AbortingNode(CanopenNode):
         replies = super().feed(frame, now_ns)
         self._in_transfer = frame.data[0] & 0xE0 == 0x60 and not any(reply.data[0] & 0x81 for reply in replies)
         return replies
+
+
+class GeneralCodesNode(CanopenNode):
+    """A node that aborts with the general codes of CiA 301, and checks a length only when the data is complete."""
+
+    _held_back = False
+
+    def accepts(self, frame: CanFrame) -> bool:
+        return True
+
+    def feed(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
+        if self._held_back and frame.can_id == SDO and not frame.extended:
+            self._held_back = False
+            return [CanFrame(REPLY, b"\x80\0\x20\0" + LENGTH)]
+        replies = [general(reply) for reply in super().feed(frame, now_ns)]
+        if frame.data[:1] == b"\x21" and replies and replies[0].data[4:] == LENGTH:
+            self._held_back = True
+            return [CanFrame(REPLY, b"\x60" + frame.data[1:4] + bytes(4))]
+        return replies
+
+
+def general(reply: CanFrame) -> CanFrame:
+    """Return an abort with the general code that contains its specific one; other replies unchanged."""
+    wider = {0x0607_0012: LENGTH, 0x0607_0013: LENGTH, 0x0609_0031: VALUE, 0x0609_0032: VALUE}
+    code = int.from_bytes(reply.data[4:], "little") if reply.data[:1] == b"\x80" else 0
+    return CanFrame(reply.can_id, reply.data[:4] + wider[code]) if code in wider else reply
+
+
+async def general_codes(connection: CanConnection, clock: VirtualClock) -> None:
+    await serve_node(connection, GeneralCodesNode(parse_eds(LONG), NODE), clock)
 
 
 def aborting(*, hangs: bool) -> Callable[[CanConnection, VirtualClock], object]:
@@ -88,6 +119,14 @@ def test_a_node_that_aborts_a_new_initiate_and_serves_no_more_fails(tmp_path: Pa
     verdict, reason = verdicts(aborting(hangs=True), tmp_path, "CO-005", may_write=())["CO-005"]
     assert verdict is Verdict.FAILED
     assert "afterwards: abort" in reason
+
+
+def test_the_general_abort_codes_for_lengths_and_values_are_accepted(tmp_path: Path) -> None:
+    # CiA 301, 7.2.4.3.17 has a general code beside the specific ones, and does not say which of them an object needs.
+    # A server may also check the length of a segmented download when the data is complete.
+    only = ("CO-009a", "CO-009b", "CO-010a", "CO-010b", "CO-013a", "CO-013b")
+    found = verdicts(general_codes, tmp_path, *only, may_write=((0x2000, 0),))
+    assert {id: verdict for id, (verdict, _) in found.items()} == dict.fromkeys(only, Verdict.PASSED), found
 
 
 def test_the_heartbeat_time_alone_serves_the_cases_that_need_a_number(tmp_path: Path) -> None:

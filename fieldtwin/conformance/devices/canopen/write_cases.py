@@ -16,7 +16,10 @@ from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.sdo.block import crc16
 
 UNKNOWN, CRC, READ_ONLY = 0x0504_0001, 0x0504_0004, 0x0601_0002
-TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x0607_0012, 0x0607_0013, 0x0609_0031, 0x0609_0032
+# CiA 301, 7.2.4.3.17 has a general code beside each pair, and does not say which of them a server must choose.
+WRONG_LENGTH, WRONG_VALUE = 0x0607_0010, 0x0609_0030
+TOO_LONG, TOO_SHORT = (0x0607_0012, WRONG_LENGTH), (0x0607_0013, WRONG_LENGTH)
+TOO_HIGH, TOO_LOW = (0x0609_0031, WRONG_VALUE), (0x0609_0032, WRONG_VALUE)
 SIGNED = frozenset({DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32})
 ANY_LENGTH = frozenset({DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.UNICODE_STRING, DataType.DOMAIN})
 
@@ -119,13 +122,14 @@ async def store_signature(wire: NodeConnection) -> Finding:
 
 
 async def too_long(wire: NodeConnection) -> Finding:
-    """CO-009: one byte more than the object has, announced."""
+    """CO-009: one byte more than the object has. The node may refuse the announced size, or the complete data."""
     key, before = await _number(wire)
+    more = before + b"\0"
     async with _borrowed(wire, key):
-        reply = await wire.ask(b"\x21" + mux(*key) + (len(before) + 1).to_bytes(4, "little"))
-        if reply.data and not reply.abort:
-            await wire.abandon(key)
-        return await _unchanged(wire, key, before, aborted(reply, TOO_LONG))
+        reply = await wire.ask(b"\x21" + mux(*key) + len(more).to_bytes(4, "little"))
+        if reply.specifier == 3:
+            reply = await wire.ask(bytes(((7 - len(more)) << 1 | 1,)) + more)
+        return await _unchanged(wire, key, before, aborted(reply, *TOO_LONG))
 
 
 async def too_short(wire: NodeConnection) -> Finding:
@@ -134,7 +138,7 @@ async def too_short(wire: NodeConnection) -> Finding:
     if len(before) < 2:
         raise NotHere(f"{shown(key)} has one byte")
     async with _borrowed(wire, key):
-        return await _unchanged(wire, key, before, aborted(await wire.download(key, before[:-1]), TOO_SHORT))
+        return await _unchanged(wire, key, before, aborted(await wire.download(key, before[:-1]), *TOO_SHORT))
 
 
 async def _limit(wire: NodeConnection, *, above: bool) -> Finding:
@@ -149,7 +153,7 @@ async def _limit(wire: NodeConnection, *, above: bool) -> Finding:
             if not least <= value < least + (1 << bits):  # no value exists beyond it
                 continue
             reply = await wire.download(key, (value % (1 << bits)).to_bytes(len(before), "little"))
-            return await _unchanged(wire, key, before, aborted(reply, TOO_HIGH if above else TOO_LOW))
+            return await _unchanged(wire, key, before, aborted(reply, *(TOO_HIGH if above else TOO_LOW)))
     raise NotHere("no object of --write has such a limit in the EDS, with values of its type outside it")
 
 
@@ -163,7 +167,7 @@ async def below_limit(wire: NodeConnection) -> Finding:
     return await _limit(wire, above=False)
 
 
-async def _announced(wire: NodeConnection, more: int, code: int) -> Finding:
+async def _announced(wire: NodeConnection, more: int, codes: tuple[int, ...]) -> Finding:
     key, before = await _number(wire)
     sent = len(before) + more
     if not sent:
@@ -173,7 +177,7 @@ async def _announced(wire: NodeConnection, more: int, code: int) -> Finding:
         if reply.specifier != 3:
             raise NotHere(f"{shown(key)} takes no download in segments: {reply}")
         reply = await wire.ask(bytes(((7 - sent) << 1 | 1,)) + before[:sent].ljust(sent, b"\0"))
-        return await _unchanged(wire, key, before, aborted(reply, code))
+        return await _unchanged(wire, key, before, aborted(reply, *codes))
 
 
 async def more_than_announced(wire: NodeConnection) -> Finding:

@@ -1,14 +1,15 @@
 """A Modbus device without a recording: its profile defines its registers and functions.
 
 The cells are those of the tags; addresses between them do not exist (exception 02). Cells hold the values of the prototype file
-(0 by default) until a client writes them. Effects, device-specific functions, identification, files and queues are as the profile
-states. The device changes only with requests: nothing here waits.
+until a client writes them; by default 0, or where the tag's range excludes 0, the nearest value in that range. Effects,
+device-specific functions, identification, files and queues are as the profile states. The device changes only with requests:
+nothing here waits.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
@@ -34,6 +35,7 @@ class ProfileRegisters(RegisterBank):
         self._cells = MapBank(spans_of(profile), undeclared=profile.form.undeclared)
         self._effects = Effects(profile.effects)
         self._exponents = {t.name: _exponent(t, values) for t in profile.tags.values()}
+        self._start_in_range(profile, values)
         for name, value in values.items():
             tag = profile.tags[name]
             number = _number(tag, value) if isinstance(value, str) != (tag.type == "string") else value
@@ -43,6 +45,14 @@ class ProfileRegisters(RegisterBank):
             self._put(tag, value)
         for tag in self._tags:
             self._note(tag, now_ns)
+
+    def _start_in_range(self, profile: DeviceProfile, given: Collection[str]) -> None:
+        """Give each tag whose range excludes an empty register a value in that range: no device has the unit ID 0."""
+        for tag in profile.tags.values():
+            if tag.range is not None and tag.name not in given and not tag.is_text:
+                low, high = tag.range
+                if not low <= tag.offset <= high:
+                    self._put(tag, low if tag.offset < low else high)
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
         values = self._cells.read(table, address, count, now_ns)

@@ -139,7 +139,8 @@ def _modbus_device(
 ) -> EmulatedModbus:
     """Return the device that a Modbus profile describes, with `values` or the values of a recording.
 
-    The recording is `recording`, or the shipped one under the profile's name. Without any of them, all registers are 0.
+    The recording is `recording`, or the shipped one under the profile's name. Without any of them, the
+    registers begin with 0, or with the nearest value in their range.
     """
     if values is not None:
         return register_device(profile, kind, values, clock.monotonic_ns())
@@ -150,7 +151,10 @@ def _modbus_device(
         identity = {t.name: "0000" for t in profile.tags.values() if t.type == "string"}
         return sampled_device(profile, kind, _player(profile, recording, speed, clock), identity)
     if recording is None and _recording_of(profile) is None:
-        stderr.print(f"{profile.name}: no recording; every register of its profile begins with 0", soft_wrap=True)
+        stderr.print(
+            f"{profile.name}: no recording; the registers of its profile begin with 0, or with the nearest value in their range",
+            soft_wrap=True,
+        )
         return register_device(profile, kind, {}, clock.monotonic_ns())
     path = find_recording(str(recording or f"{Path(profile.path).stem}.jsonl"))
     replay, recorded = load_replay(profile, path)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.emulators.codec import decode
 from fieldtwin.emulators.emulator import EmulatedUnit
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.emulators.models.modbus.register_device import ProfileRegisters, add_own_functions
@@ -19,6 +20,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
+from fieldtwin.twin.site.data_files import data_root
 
 PROFILE = """
 device: mysite/tank
@@ -291,3 +293,18 @@ def why_not(path: str) -> str:
     except FieldtwinError as e:
         return str(e)
     return " ".join(run.errors)
+
+
+def test_registers_begin_with_a_value_in_their_range() -> None:
+    # Defect: the unit ID of a simulated meter was 0, so that its shadow reported it as outside of 1 to 247.
+    meter = load_profile(data_root() / "profiles" / "devices" / "eastron-sdm630.yaml")
+
+    def held(values: dict[str, float | str], name: str) -> float:
+        tag = meter.tags[name]
+        bank = ProfileRegisters(meter, values, 0)
+        cells = [bank.peek(tag.registers.table, at) for at in range(tag.registers.address, tag.registers.end)]
+        return float(decode(cells, tag.type, tag.order))
+
+    assert held({}, "unit_id") == 1
+    assert held({"unit_id": 3}, "unit_id") == 3
+    assert held({}, "demand_period") == 0, "0 is in its range"

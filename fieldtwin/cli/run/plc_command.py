@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,25 @@ from fieldtwin.twin.site.system import System, load_system
 instance_option = click.option(
     "--instance", default="", metavar="NAME", help="Name of the instance; default: the only running one."
 )
+
+
+def _one_instance(ctx: click.Context, parameter: click.Parameter, named: str) -> str:
+    """Return the instance of --instance or of the argument INSTANCE, which the command does not get."""
+    argument: str = ctx.params.pop("named_instance", "")
+    if named and argument and named != argument:
+        raise UsageError(f"two instances: {argument!r} and {named!r}", expected="one of them")
+    return named or argument
+
+
+def instance_argument(function: Callable[..., int]) -> Callable[..., int]:
+    """Add the argument INSTANCE, as that of `fieldtwin reload`, and --instance with the same meaning."""
+    argument = click.argument("named_instance", metavar="[INSTANCE]", default="", is_eager=True)
+    option = click.option(
+        "--instance", default="", metavar="NAME", callback=_one_instance, help="The same as INSTANCE."
+    )
+    return argument(option(function))
+
+
 yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
 
 
@@ -80,7 +100,7 @@ def _act(instance: str, command: str, **args: Any) -> Any:
 
 
 @command.command("status")
-@instance_option
+@instance_argument
 @json_option
 def status(instance: str, as_json: bool) -> int:
     """Show the state, the cycle statistics of each task, forces, retained variables and counters."""
@@ -155,7 +175,7 @@ def unforce(tag: str | None, every: bool, instance: str) -> int:
 
 @command.command("pause")
 @yes_option
-@instance_option
+@instance_argument
 def pause(yes: bool, instance: str) -> int:
     """Pause the execution of programs; the outputs keep their values, and the plant keeps them."""
     _sure("pause the PLC: its outputs keep their values, whatever happens in the plant", yes)
@@ -165,7 +185,7 @@ def pause(yes: bool, instance: str) -> int:
 
 
 @command.command("go")
-@instance_option
+@instance_argument
 def go(instance: str) -> int:
     """Continue after a pause."""
     _act(instance, "go")
@@ -193,7 +213,7 @@ def step(count: int, instance: str) -> int:
 @command.command("restart")
 @click.option("--cold", is_flag=True, help="Reset retained variables as well.")
 @yes_option
-@instance_option
+@instance_argument
 def restart(cold: bool, yes: bool, instance: str) -> int:
     """Restart the programs: first scan, initial values, and (unless --cold) retained values."""
     _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are safe during the restart", yes)

@@ -18,6 +18,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.prove import Proof, SearchResult
 from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE, matches
 from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
+from fieldtwin.run.processes.plc_client import running_instances
 
 REFRESH_S = 0.25
 IN_A_PIPE = 500
@@ -44,6 +45,10 @@ async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[
     names: list[str] = (await client.call("image"))["names"]
     for pattern in patterns:
         if not any(matches(name, pattern) for name in names):
+            if pattern in running_instances():
+                raise UsageError(
+                    f"{pattern!r} is a running instance, not a tag", expected=f"--instance {pattern}, and tags"
+                )
             raise UsageError(f"no tag {pattern!r}", expected=", ".join(names[:12]) + (", ..." if names[12:] else ""))
     return [name for name in names if not patterns or any(matches(name, p) for p in patterns)]
 

@@ -35,6 +35,11 @@ def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, m
         run.control("p", "plc")
         wait_for(lambda: json.loads(plc("status", "--json"))["variables"]["relay.state"] == 1, 15, "ACTIVE")
         text = plc("status")
+        assert plc("status", "p").splitlines()[0] == text.splitlines()[0], (
+            "the instance, as `fieldtwin reload` takes it"
+        )
+        with pytest.raises(UsageError, match="two instances: 'p' and 'q'"):
+            plc("status", "p", "--instance", "q")
         assert "PLC: running" in text
         assert "no tag is forced" in text
         assert "relay.state" in plc("watch", "relay.*")
@@ -58,6 +63,8 @@ def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, m
         plc("step", "5")
         wait_for(lambda: json.loads(plc("status", "--json"))["scans"] == scans + 5, 5, "five scans")
         plc("go")
+        with pytest.raises(UsageError, match=r"'p' is a running instance, not a tag; expected .*--instance p"):
+            plc("watch", "p")
         with pytest.raises(UsageError, match="no tag 'nothing'"):
             plc("watch", "nothing")
         plc("restart", "--cold", "--yes")

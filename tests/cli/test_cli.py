@@ -97,6 +97,7 @@ def test_neither_flag_is_a_default_and_both_exclude_each_other(invoke: Invoke) -
         (("emulate", "observatory", "--control", "nowhere"), "HOST:PORT"),
         (("import", "cast.txt"), ".cnv"),
         (("topside", "observatory"), "--far"),
+        (("topside", "lab_vehicle"), "lab_vehicle has no acoustic modem"),
         (("fly",), "No such command"),
         (("shore", "observatory"), "now called 'topside'"),
         (("check", "modbus-master"), "now called 'modbus-client'"),

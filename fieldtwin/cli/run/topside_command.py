@@ -66,18 +66,26 @@ def command(
 ) -> int:
     """Send commands to SYSTEM from the topside end of its modem, and show the responses."""
     loaded = load_system(system, profiles)
+    transmitter = _transmitter(loaded, device)
     if bool(far) == bool(field_host):
         raise UsageError("the endpoint of the topside modem is missing", expected="--far ENDPOINT or --field HOST")
     periods = parse_periods(commands)
-    return asyncio.run(_run(loaded, _transmitter(loaded, device), far, field_host, token, periods, duration_s, as_json))
+    return asyncio.run(_run(loaded, transmitter, far, field_host, token, periods, duration_s, as_json))
 
 
 def _transmitter(system: System, name: str) -> str:
     transmitters = [d.name for d in system.devices.values() if d.profile.inbox is not None]
+    if not transmitters:
+        raise UsageError(
+            f"{system.name} has no acoustic modem, so it has no topside controller",
+            where=str(system.path),
+            expected="a system with a device whose profile has an `inbox`, such as the profile modem-mailbox",
+            hint="an HMI or SCADA reads and commands other systems through `serve:` in the system file",
+        )
     if name and name not in transmitters:
-        raise UsageError(f"{name!r} is no transmitter", expected=", ".join(transmitters) or "none in this system")
+        raise UsageError(f"{name!r} is no transmitter", expected=", ".join(transmitters))
     if not name and len(transmitters) != 1:
-        raise UsageError("which transmitter?", expected="--device with one of " + (", ".join(transmitters) or "none"))
+        raise UsageError("which transmitter?", expected="--device with one of " + ", ".join(transmitters))
     return name or transmitters[0]
 
 

@@ -22,8 +22,12 @@ FUNCTION_NAMES = {
 }  # fmt: skip
 
 
+LONG_S = 60.0
+"""A dump that can take longer than this number of seconds is announced with what makes it shorter."""
+
+
 def estimate_text(estimate: Estimate, passes: int, rate: float) -> str:
-    """Return one line that estimates the dump before anything is sent."""
+    """Return one line that estimates the dump before anything is sent, and for a long one, what makes it shorter."""
     low, high = estimate.least_requests, estimate.most_requests
     requests = f"{low}" if low == high else f"{low} to {high}"
     text = f"{requests} requests, {_time(estimate.least_s)}"
@@ -33,7 +37,10 @@ def estimate_text(estimate: Estimate, passes: int, rate: float) -> str:
     text += f"; then {passes - 1} more passes" if passes > 1 else ""
     if estimate.budgets_s:
         text += f"; up to {_time(estimate.budgets_s)} more in unreadable ranges (--budget)"
-    return text + ". Ctrl-C stops; --resume continues"
+    text += ". Ctrl-C stops; --resume continues"
+    if estimate.most_s > LONG_S:
+        text += f". It is shorter with {estimate.shorter}" + (", or with a higher --rate" if rate else "")
+    return text
 
 
 def _time(seconds: float) -> str:

@@ -16,6 +16,9 @@ from fieldtwin.commissioning.scan.settings import name_of
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
+MANY = 8
+"""Units from this number on that give the same exception are shown in one row."""
+
 
 def show_modbus(scan: ModbusScan) -> None:
     """Print the units, then the notes."""
@@ -29,14 +32,12 @@ def show_modbus(scan: ModbusScan) -> None:
         one = scan.units[0]
         table.add_row("any", _settings(one), _answer(one), f"{one.answer.latency_ns / 1e6:.1f} ms")
     else:
-        for found in scan.units:
+        for group in _with_the_same_answer(scan.units):
+            found, latencies = group[0], [f.answer.latency_ns / 1e6 for f in group]
             late = " (late: try a longer --timeout)" if found.answer.late else ""
-            table.add_row(
-                str(found.answer.unit),
-                _settings(found),
-                _answer(found),
-                f"{found.answer.latency_ns / 1e6:.1f} ms{late}",
-            )
+            after = " to ".join(dict.fromkeys(f"{ms:.1f}" for ms in (min(latencies), max(latencies))))
+            units = unit_ranges(sorted(f.answer.unit for f in group))
+            table.add_row(units, _settings(found), _answer(found), f"{after} ms{late}")
     for unit in sorted(set(heard.live if heard is not None else []) - {f.answer.unit for f in scan.units}):
         at = name_of(scan.verdict.settings) if scan.verdict is not None else ""
         table.add_row(str(unit), at, Text("answers another client", "dim"), "")
@@ -57,6 +58,18 @@ def show_modbus(scan: ModbusScan) -> None:
     if scan.echo:
         stderr.print("this line echoes sent bytes: use --echo with the other commands")
     _end(scan.notes, scan.asked, "question", bool(table.row_count))
+
+
+def _with_the_same_answer(units: Sequence[FoundUnit]) -> list[list[FoundUnit]]:
+    """Return the units of each row: many units that give the same exception share one of the last rows, every other unit has
+    its own.
+    """
+    groups: dict[tuple[object, ...], list[FoundUnit]] = {}
+    for found in units:
+        key = (found.answer.exception, found.settings, found.doubtful, found.answer.late)
+        groups.setdefault(key if found.answer.exception else (found.answer.unit, *key), []).append(found)
+    rows = [row for group in groups.values() for row in ([group] if len(group) >= MANY else [[f] for f in group])]
+    return sorted(rows, key=lambda row: len(row) >= MANY)
 
 
 def unit_ranges(units: Sequence[int]) -> str:

@@ -38,7 +38,8 @@ CAN_BITS = 2 * 130
 class Estimate:
     """The number of requests and the duration of the first pass, if everything can be read and if nearly nothing can.
 
-    `budgets_s` is the additional time that questions without a result may take, in all tables together.
+    `budgets_s` is the additional time that questions without a result may take, in all tables together. `shorter` names
+    what the user can give to make the dump shorter.
     """
 
     least_requests: int
@@ -46,6 +47,7 @@ class Estimate:
     least_s: float
     most_s: float
     budgets_s: float
+    shorter: str
 
 
 def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
@@ -99,7 +101,13 @@ def estimate(job: DumpJob, spacing_s: float) -> Estimate:
         long_s, short_s = (8 + 7 + 255) * char_s, (8 + 7 + 7) * char_s
     each = spacing_s + REPLY_S
     budgets_s = job.budget_s * len(job.sweeps())
-    return Estimate(least, most, least * (each + long_s), most * (each + short_s), budgets_s)
+    if job.spans or job.objects:
+        shorter = "fewer ranges"
+    elif endpoint.is_can:
+        shorter = "ranges, such as 6000..6FFF, with --eds"
+    else:
+        shorter = "ranges, such as holding:0..999, with --profile"
+    return Estimate(least, most, least * (each + long_s), most * (each + short_s), budgets_s, shorter)
 
 
 def frames(job: DumpJob) -> list[str]:

@@ -12,6 +12,7 @@ from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldtwin.cli.device.dump_view import estimate_text
 from fieldtwin.commissioning.access.reading import DeviceTarget
 from fieldtwin.commissioning.dump.coverage import NOT_ASKED, READABLE, REFUSED
 from fieldtwin.commissioning.dump.dump import DumpJob
@@ -315,3 +316,16 @@ def test_response_times_in_the_file_are_in_microseconds_and_complete(us: list[in
     assert [limit for limit, _ in line["buckets"]] == sorted(
         {next((b // 1000 for b in LATENCY_LIMITS_NS if v * 1000 <= b), None) for v in us}, key=lambda b: b or 10**9
     )
+
+
+def test_the_estimate_of_a_long_dump_names_what_shortens_it() -> None:
+    everything = estimate(DumpJob(DeviceTarget("tcp://192.0.2.1", 1)), 0.02)
+    text = estimate_text(everything, 1, 50.0)
+    assert everything.most_s > 1000
+    assert "shorter with ranges, such as holding:0..999, with --profile, or with a higher --rate" in text
+    few = DumpJob(DeviceTarget("tcp://192.0.2.1", 1), register_spans(["holding:0..99"]))
+    assert "shorter" not in estimate_text(estimate(few, 0.02), 1, 50.0)
+    wide = DumpJob(DeviceTarget("tcp://192.0.2.1", 1), register_spans(["holding"]))
+    assert "shorter with fewer ranges, or with a higher --rate" in estimate_text(estimate(wide, 0.02), 1, 50.0)
+    drive = DumpJob(DeviceTarget("can:socketcan/can0", 5))
+    assert "such as 6000..6FFF, with --eds" in estimate_text(estimate(drive, 0.02), 1, 50.0)

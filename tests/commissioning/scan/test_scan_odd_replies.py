@@ -7,6 +7,7 @@ Defect: with pymodbus 3.9.2, which answers for an absent unit ID as unit 0 with 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 import pytest
 from commissioning_rig import loop, run_virtually
@@ -18,16 +19,26 @@ from fieldtwin.commissioning.scan.odd_replies import OddReply
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 
+Absent = bytes | Callable[[int], bytes]
+
 
 class Server:
-    """A connector to a TCP server that has unit 1 only; `absent` is the body (unit and PDU) of its reply for any other unit."""
+    """A connector to a TCP server that has unit 1 only; `absent` is the body (unit and PDU) of its reply for any other unit,
+    or returns it for a unit.
+    """
 
-    def __init__(self, absent: bytes) -> None:
+    def __init__(self, absent: Absent) -> None:
         self.absent = absent
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
         def answer(data: bytes) -> None:
-            body = b"\x01\x03\x02\x00\x07" if data[6] == 1 else self.absent
+            body = (
+                b"\x01\x03\x02\x00\x07"
+                if data[6] == 1
+                else self.absent
+                if isinstance(self.absent, bytes)
+                else self.absent(data[6])
+            )
             frame = data[:4] + len(body).to_bytes(2) + body
             asyncio.get_running_loop().call_later(0.005, wire.feed, frame)
 
@@ -38,7 +49,7 @@ class Server:
         raise AssertionError
 
 
-def scan(absent: bytes, units: tuple[int, ...] | None = None) -> ModbusScan:
+def scan(absent: Absent, units: tuple[int, ...] | None = None) -> ModbusScan:
     async def main() -> ModbusScan:
         scanner = ModbusScanner("tcp://192.0.2.1:502", ScanOptions(units=units), connector=Server(absent), clock=loop())
         return await scanner.run()
@@ -90,3 +101,20 @@ def test_the_advice_fits_the_wire() -> None:
 def test_ranges_of_units() -> None:
     assert unit_ranges([0, 2, 3, 4, 247, 255]) == "0, 2-4, 247, 255"
     assert unit_ranges([]) == ""
+
+
+def test_units_that_give_the_same_exception_share_a_row(capsys: pytest.CaptureFixture[str]) -> None:
+    """Defect: a server that answers exception 04h for each unit ID that it does not have filled 246 rows."""
+
+    def answer(unit: int) -> bytes:
+        return bytes((unit,)) + (b"\x03\x02\x00\x07" if unit == 1 else b"\x83\x04")
+
+    show_modbus(scan(answer, (1, 2, 3)))
+    rows = [line.split("  ")[0].strip() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert rows == ["1", "2", "3"], "a few units have rows of their own"
+    show_modbus(scan(answer))
+    captured = capsys.readouterr()
+    rows = [line.split("  ")[0].strip() for line in captured.out.splitlines()[1:]]
+    assert rows == ["1", "0, 2-247, 255"], captured.out
+    assert "exception 04h" in captured.out
+    assert len([line for line in captured.err.splitlines() if "04h" in line]) == 1

@@ -98,7 +98,8 @@ json_option = click.option("--json", "as_json", **JSON)
 PROFILES: dict[str, Any] = {
     "multiple": True,
     "type": click.Path(exists=True, file_okay=False, path_type=Path),
-    "help": "A folder with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the shipped ones.",
+    "help": "A folder of profiles, or with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the "
+    "shipped ones.",
 }
 """The arguments of `profiles_option`, also for groups of options."""
 profiles_option = click.option("--profiles", **PROFILES)

@@ -45,12 +45,36 @@ def search_path(extra: Iterable[Path] = ()) -> list[Path]:
     return [f for f in folders if f.is_dir()]
 
 
+def device_files(folder: Path) -> list[Path]:
+    """Return the device profiles of a folder of the search path: those in its `devices`, and those in the folder itself."""
+    return [*sorted((folder / "devices").glob("*.yaml")), *_with_key(folder, "device")]
+
+
+def system_files(folder: Path) -> list[Path]:
+    """Return the files in a folder that describe a system."""
+    return _with_key(folder, "system")
+
+
+def _with_key(folder: Path, key: str) -> list[Path]:
+    """Return the YAML files of a folder with this key at the top level, and without that of a scenario."""
+    found = []
+    for path in sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")]):
+        try:
+            with path.open("rb") as file:
+                keys = {line.partition(b":")[0] for line in file.read(MAX_BYTES).splitlines() if line[:1].isalpha()}
+        except OSError:
+            continue
+        if key.encode() in keys and b"scenario" not in keys:
+            found.append(path)
+    return found
+
+
 def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path] = ()) -> Path:
     """Return the file that `name` refers to: a path, or a bare name in the search path. `kind` is ``systems`` or
     ``devices``.
 
-    `beside` is the file that contains the reference: a relative path is tried in its folder first. Raises `UsageError`,
-    which lists the available names.
+    `beside` is the file that contains the reference: a relative path is tried in its folder first. A folder stands for the
+    only system file in it. Raises `UsageError`, which lists the available names.
     """
     direct = Path(name)
     places = [beside.parent / direct] if beside else []
@@ -66,6 +90,8 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
                 for candidate in (sub / f"{name}.yaml", sub / name):
                     if candidate.is_file():
                         return candidate
+    if kind == "systems" and direct.is_dir():
+        return _only_system(direct)
     known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if "." not in p.stem})
     if direct.exists() and not direct.is_dir():
         raise UsageError(f"{name!r} is not a regular file", expected=f"a {kind[:-1]}'s file")
@@ -76,6 +102,21 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
         f"no {kind[:-1]} {name!r}",
         expected="a file, or one of " + ", ".join(known),
         hint=f"did you mean {files[0]!r}?" if files else did_you_mean(direct.name, known),
+    )
+
+
+def _only_system(folder: Path) -> Path:
+    found = system_files(folder)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = " or ".join(str(path) for path in found)
+        raise UsageError(f"this folder has {len(found)} system files", where=str(folder), expected=names)
+    raise UsageError(
+        "no system file in this folder",
+        where=str(folder),
+        expected="a system file, or a folder with one",
+        hint="`fieldtwin new DIR` writes a site",
     )
 
 

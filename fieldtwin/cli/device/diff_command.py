@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.reports.site.about import headed
-from fieldtwin.twin.site.data_files import find, search_path
+from fieldtwin.twin.site.data_files import device_files, find, search_path
 
 DIFFERENT = 1
 
@@ -118,7 +118,7 @@ def _named(dump: Dump, name: str, folders: tuple[Path, ...]) -> DeviceProfile | 
     if not known:
         return None
     for folder in search_path(folders):
-        for path in sorted((folder / "devices").glob("*.yaml")):
+        for path in device_files(folder):
             if f"device: {known}" in path.read_text(encoding="utf-8", errors="replace"):
                 return load_profile(path)
     stderr.print(f"no profile {known} here: addresses instead of names (--profile)", soft_wrap=True)

@@ -24,7 +24,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.wallclock import run as run_precise
-from fieldtwin.twin.site.data_files import search_path
+from fieldtwin.twin.site.data_files import device_files, search_path
 
 COLOUR = {
     Sureness.CERTAIN: "bold green",
@@ -132,11 +132,17 @@ def _first_frames(endpoint: str, node: int) -> Iterator[str]:
 def known_profiles(folders: Iterable[Path]) -> list[DeviceProfile]:
     """Return every device profile in the search path, the first of each file name.
 
-    A profile that cannot be read is reported and skipped.
+    A profile that cannot be read is reported and skipped. Raises `UsageError` for a folder of `folders` without profiles.
     """
     found: dict[str, DeviceProfile] = {}
-    for folder in search_path(folders):
-        for path in sorted((folder / "devices").glob("*.yaml")):
+    given = list(folders)
+    for folder in given:
+        if not device_files(folder) and not (folder / "systems").is_dir():
+            raise UsageError(
+                "no device profile in this folder", where=str(folder), expected="NAME.yaml or devices/NAME.yaml"
+            )
+    for folder in search_path(given):
+        for path in device_files(folder):
             if path.stem in found:
                 continue
             try:

@@ -130,9 +130,9 @@ def _ask_for_devices(profiles: tuple[Path, ...]) -> list[DeviceWish]:
     """Ask for devices until the answer is empty. A wrong answer is explained, and asked again."""
     from fieldtwin.new_site.devices import site_devices
     from fieldtwin.new_site.wishes import EXAMPLE, parse_device
-    from fieldtwin.twin.site.data_files import search_path
+    from fieldtwin.twin.site.data_files import device_files, search_path
 
-    known = sorted({path.stem for folder in search_path(profiles) for path in (folder / "devices").glob("*.yaml")})
+    known = sorted({path.stem for folder in search_path(profiles) for path in device_files(folder)})
     _say(f"Profiles: {', '.join(known)}")
     _say(
         "A device is a profile or a profile file, with @ENDPOINT and #ADDRESS if you know them; `scan ENDPOINT` scans."

@@ -9,7 +9,7 @@ from commissioning_rig import Wired, bank, loop, run_virtually, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.cli.device.identify_command import command
+from fieldtwin.cli.device.identify_command import command, known_profiles
 from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
 from fieldtwin.commissioning.identify.modbus import ModbusIdentity, identify_modbus
 from fieldtwin.commissioning.identify.sunspec import next_model
@@ -18,6 +18,7 @@ from fieldtwin.emulators.modbus.functions.identification import Identification
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitParts
 from fieldtwin.emulators.models.modbus.recorded_device import load_replay
 from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
 
@@ -163,3 +164,18 @@ def test_an_exception_that_takes_600_ms_is_an_answer() -> None:
 
     run_virtually(main())
     assert next(option.default for option in command.params if option.name == "timeout_s") == "1s"
+
+
+def test_a_folder_of_profiles_needs_no_folder_devices(tmp_path: Path) -> None:
+    text = "device: strange/meter\nsource: a test\nprotocol: modbus\ntags: {x: {at: 'holding:0'}}\n"
+    (tmp_path / "strange.yaml").write_text(text)
+    (tmp_path / "site.yaml").write_text("fieldtwin: 1\nsystem: site\n")
+    (tmp_path / "site.prototype.yaml").write_text("prototype_of: site.yaml\n")
+    found = {profile.name for profile in known_profiles([tmp_path])}
+    assert "strange/meter" in found
+    assert "site" not in found
+
+
+def test_a_folder_without_profiles_says_what_is_expected(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no device profile in this folder.*NAME.yaml.*devices/NAME.yaml"):
+        known_profiles([tmp_path])

@@ -59,3 +59,27 @@ def test_a_virtual_run_that_cannot_begin_is_an_error_of_the_file() -> None:
     options = VirtualOptions(system="observatory", duration_s=1.0, recordings={"ctd": "nowhere.jsonl"})
     with pytest.raises(FileInvalid, match=r"nowhere.jsonl"):
         VirtualRun(options).run()
+
+
+def test_a_folder_with_one_system_file_names_that_system(tmp_path: Path) -> None:
+    shipped = data_root() / "profiles" / "systems"
+    for name in ("observatory.yaml", "observatory.prototype.yaml", "ctd-silent.scenario.yaml"):
+        shutil.copy(shipped / name, tmp_path / name)
+    (tmp_path / "compose.yaml").write_text("services: {}\n")
+    assert find("systems", str(tmp_path)) == tmp_path / "observatory.yaml"
+    assert load_system(str(tmp_path)).name == "observatory"
+
+
+def test_a_folder_with_several_system_files_lists_them(tmp_path: Path) -> None:
+    for name in ("east.yaml", "west.yml"):
+        (tmp_path / name).write_text("fieldtwin: 1\nsystem: east\n")
+    with pytest.raises(UsageError, match=r"this folder has 2 system files; expected .*east.yaml or .*west.yml"):
+        find("systems", str(tmp_path))
+
+
+def test_a_folder_without_a_system_file_says_what_is_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "observatory").mkdir()
+    with pytest.raises(UsageError, match=r"no system file in this folder; expected .*fieldtwin new"):
+        find("systems", ".")
+    assert find("systems", "observatory").is_file(), "a bare name still refers to the shipped system"

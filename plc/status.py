@@ -102,6 +102,10 @@ class PlcStatus(ScanStatus, frozen=True, kw_only=True):
     """The number of manual interventions, by kind."""
     programs: dict[str, str] = {}
     """By program: the name of its class."""
+    duration_buckets: Buckets = []
+    """The durations of the first task's scans, likewise `lateness_buckets`. A brief status has them only if the client asks with
+    ``"buckets": true``."""
+    lateness_buckets: Buckets = []
 
 
 class WholePlcStatus(PlcStatus, frozen=True, kw_only=True):
@@ -111,6 +115,3 @@ class WholePlcStatus(PlcStatus, frozen=True, kw_only=True):
     inputs: dict[str, Any] = {}
     outputs: dict[str, Any] = {}
     variables: dict[str, Any] = {}
-    duration_buckets: Buckets = []
-    """The durations of the first task's scans, likewise `lateness_buckets`."""
-    lateness_buckets: Buckets = []

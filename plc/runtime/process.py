@@ -4,7 +4,8 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
 
     ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
     get       all that a display shows: state, error, statistics, forces; unless {"brief": true}, also every tag's value and the
-              retained variables, which with thousands of tags takes longer than the time between two scans
+              retained variables, which with thousands of tags takes longer than the time between two scans; {"brief": true,
+              "buckets": true} adds the distribution of scan times, at most 30 numbers each
     image     {"tags": [...]}, at most 64: of each tag value, quality, time, age, unit, limits, force, and what programs see;
               without tags, the names of all tags
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
@@ -129,24 +130,25 @@ class PlcProcess:
 
     async def _get(self, args: dict[str, Any]) -> PlcStatus:
         now_ns, runner = monotonic_ns(), self._runner
+        is_brief, first = args.get("brief") is True, runner.entries[0].task
+        with_buckets = not is_brief or args.get("buckets") is True
         brief = structs.replace(
             runner.status(),
             pid=os.getpid(),
             realtime=self._realtime.status(),
             acts=dict(self._acts.counts),
             programs={p.name: type(p.program).__name__ for p in runner.programs},
+            duration_buckets=first.duration.buckets_us() if with_buckets else [],
+            lateness_buckets=first.lateness.buckets_us() if with_buckets else [],
         )
-        if args.get("brief") is True:
+        if is_brief:
             return brief
         outputs = runner.outputs.last()
-        first = runner.entries[0].task
         return WholePlcStatus(
             **structs.asdict(brief),
             retained=runner.retained.values(),
             inputs={tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
             outputs=outputs,
-            duration_buckets=first.duration.buckets_us(),
-            lateness_buckets=first.lateness.buckets_us(),
             variables={f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         )
 

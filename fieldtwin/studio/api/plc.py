@@ -26,9 +26,8 @@ class Steps(msgspec.Struct, forbid_unknown_fields=True):
 
 
 async def get_plc(request: Request) -> Any:
-    """Return the status of the PLC with all inputs, outputs and variables."""
-    attachment = await attached(request)
-    return await attachment.plc_channel.call("get")
+    """Return the status of the PLC, with all inputs, outputs and variables as the process image has them."""
+    return msgspec.to_builtins(await (await attached(request)).read_plc())
 
 
 async def get_programs(request: Request) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Observe one running instance through its control channels and its capture.
 
 The statuses of gateway, PLC and field simulator are read two to four times a second, changes of tags ten times a second. A
-process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
+process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current. The
+PLC is asked only for what it answers in a bounded time; the values of its tags come from the process image.
 """
 
 from __future__ import annotations
@@ -12,20 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from fieldtwin.capture.decoding.exchange import SECRET
-from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.runtime.about import STATE
-from fieldtwin.plc.status import WholePlcStatus
+from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord
 from fieldtwin.studio.live.channel import Channel
 from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
 from fieldtwin.studio.live.observed import describe_system
+from fieldtwin.studio.live.plc_values import PlcValues
 from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.studio.live.subscription import Publisher
 from fieldtwin.studio.live.tag_history import Point, TagHistory
@@ -36,6 +39,8 @@ from fieldtwin.twin.site.system import System
 TAGS_EVERY_S = 0.1
 GATEWAY_EVERY_S = 0.5
 PLC_EVERY_S = 0.25
+BUCKETS_EVERY_S = 2.0
+"""The distribution of scan times is read less often, because it takes the PLC longer than the rest of its brief status."""
 FIELD_EVERY_S = 0.5
 FRAMES_EVERY_S = 0.05
 AGAIN_AFTER_S = 1.0
@@ -84,6 +89,9 @@ class Attachment:
         """The number of the latest change that was read, None before the first answer."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
+        self._plc_values = PlcValues(found.dir)
+        self._buckets_ns = 0
+        """When the distribution of scan times was read."""
         self._nursery = Nursery()
 
     async def __aenter__(self) -> Attachment:
@@ -106,6 +114,7 @@ class Attachment:
         await self._nursery.__aexit__(None, None, None)
         for channel in (self.gateway_channel, self.plc_channel, self.field_channel):
             await channel.aclose()
+        self._plc_values.close()
         if self.frames is not None:
             self.frames.close()
 
@@ -152,6 +161,7 @@ class Attachment:
             self.gateway = None
         elif what == "plc":
             self.plc = None
+            self._plc_values.close()
         elif what == "field":
             self.field = None
         if self.troubles.get(what) != reason:
@@ -162,11 +172,21 @@ class Attachment:
         self.gateway = await self.gateway_channel.ask("get", GatewayStatus)
         self.updates.publish({"type": "status", "status": self.status()})
 
-    async def _read_plc(self) -> None:
-        plc = await self.plc_channel.ask("get", WholePlcStatus)
-        if self._described != (plc.pid, plc.restarts):  # a restart reads Structured Text again
+    async def read_plc(self, buckets: bool = True) -> WholePlcStatus:
+        """Ask the PLC for its brief status, and return it with the present values; `buckets` asks for the distributions too."""
+        brief = await self.plc_channel.ask("get", PlcStatus, brief=True, buckets=buckets)
+        if self._described != (brief.pid, brief.restarts):  # a restart reads Structured Text again
             self.programs = await self._read_programs()
-            self._described = (plc.pid, plc.restarts)
+            self._described = (brief.pid, brief.restarts)
+        return self._plc_values.read(brief, self.programs, self.now_ns())
+
+    async def _read_plc(self) -> None:
+        known, buckets = self.plc, self.plc is None or self.now_ns() - self._buckets_ns >= BUCKETS_EVERY_S * NS_PER_S
+        plc = await self.read_plc(buckets)
+        if buckets:
+            self._buckets_ns = self.now_ns()
+        elif known is not None:
+            plc = structs.replace(plc, duration_buckets=known.duration_buckets, lateness_buckets=known.lateness_buckets)
         state_tags = {
             name: program["variables"][STATE]["tag"]
             for name, program in self.programs.items()

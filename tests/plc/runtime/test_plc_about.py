@@ -123,7 +123,10 @@ def test_the_status_has_buckets_whose_counts_are_all_scans(tmp_path: Path) -> No
             assert sum(count for _, count in status["duration_buckets"]) == status["duration_us"]["count"]
             limits = [limit for limit, _ in status["duration_buckets"]]
             assert limits == sorted(limits)
-            assert "duration_buckets" not in await client.call("get", brief=True)
+            assert (await client.call("get", brief=True))["duration_buckets"] == []
+            asked = await client.call("get", brief=True, buckets=True)
+            assert sum(count for _, count in asked["duration_buckets"]) == asked["duration_us"]["count"]
+            assert "outputs" not in asked
             beating.cancel()
             await asyncio.wait([beating])
 

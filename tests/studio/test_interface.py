@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 import websockets
+from msgspec import structs
 from studio_rig import OPERATE, VIEW, Studio, until
 
 from fieldtwin.capture.formats.pcap import MAGIC_NS
 from fieldtwin.gateway.core.files.recording import RecordingReader
+from fieldtwin.run.processes.run_record import SYSTEM_FILE, read_record, write_record
 
 NAME = "/instances/observatory"
 
@@ -273,3 +276,31 @@ def test_the_description_of_the_interface_names_every_operation(observatory: Stu
     force = told["paths"]["/api/v1/instances/{instance}/plc/forces"]["post"]
     assert force["requestBody"]["content"]["application/json"]["schema"]["$ref"] == "#/components/schemas/Force"
     assert set(told["components"]["schemas"]["Force"]["properties"]) == {"tag", "value"}
+
+
+def test_a_client_is_sent_to_the_new_run_when_a_run_starts_under_the_same_name(observatory: Studio) -> None:
+    folder = observatory.run_root / "again"
+    folder.mkdir(mode=0o700)
+    shutil.copy(observatory.run_root / "observatory" / SYSTEM_FILE, folder / SYSTEM_FILE)
+    first = read_record(observatory.run_root / "observatory")
+    assert first is not None
+    write_record(folder, structs.replace(first, started_ns=1, capture=""))
+    address = f"{observatory.url.replace('http', 'ws', 1)}api/v1/instances/again/stream"
+    headers = {"Authorization": f"Bearer {VIEW}"}
+
+    async def main() -> tuple[list[str], int]:
+        async with websockets.connect(address, additional_headers=headers) as socket:
+            assert json.loads(await socket.recv())["started_ns"] == 1
+            write_record(folder, structs.replace(first, started_ns=2, capture=""))
+            types = [json.loads(message)["type"] async for message in socket]  # until the server closes the connection
+        async with websockets.connect(address, additional_headers=headers) as socket:
+            return types, json.loads(await socket.recv())["started_ns"]
+
+    try:
+        types, started_ns = asyncio.run(asyncio.wait_for(main(), 30))
+        assert types[-1] == "end"
+        assert started_ns == 2
+        with observatory.client(VIEW) as client:
+            assert client.get("/instances/again").json()["started_ns"] == 2
+    finally:
+        shutil.rmtree(folder)

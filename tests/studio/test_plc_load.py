@@ -1,4 +1,4 @@
-"""The load that Studio puts on a PLC with 5,000 tags, whose thread executes the scans, and the source of the values that it shows.
+"""The load that Studio puts on a PLC with 5,000 tags, and the source of the values that it shows.
 
 A relay between Studio and the PLC's control socket notes each request and the size of its answer.
 """

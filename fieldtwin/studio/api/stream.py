@@ -35,7 +35,9 @@ async def stream(socket: WebSocket) -> None:
         return
     subscription = attachment.updates.subscribe()
     try:
-        await socket.send_json({"type": "hello", "status": attachment.status()})
+        await socket.send_json(
+            {"type": "hello", "started_ns": attachment.record.started_ns, "status": attachment.status()}
+        )
         await _serve(socket, subscription)
     except (WebSocketDisconnect, TimeoutError, RuntimeError):
         pass  # the client is gone, or does not read

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
-from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord
+from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, read_record
 from fieldtwin.studio.live.channel import Channel
 from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
@@ -43,6 +43,7 @@ BUCKETS_EVERY_S = 2.0
 """The distribution of scan times is read less often, because it takes the PLC longer than the rest of its brief status."""
 FIELD_EVERY_S = 0.5
 FRAMES_EVERY_S = 0.05
+RECORD_EVERY_S = 0.5
 AGAIN_AFTER_S = 1.0
 """Pause in seconds before a process that did not answer is asked again."""
 NONE_OF_THEM = 1 << 62
@@ -107,6 +108,7 @@ class Attachment:
             self._nursery.start(self._repeat("field", self._read_field, FIELD_EVERY_S), "field")
         if self.frames is not None:
             self._nursery.start(self._follow_frames(self.frames), "frames")
+        self._nursery.start(self._until_replaced(), "record")
         return self
 
     async def __aexit__(self, *error: object) -> None:
@@ -136,9 +138,8 @@ class Attachment:
             "transitions": self.state_history.newest,
             "field": msgspec.to_builtins(self.field) if self.field is not None else None,
             "troubles": dict(self.troubles),
-            "frames": None
-            if frames is None
-            else {"total": len(frames), "behind_bytes": frames.behind_bytes, "full": frames.is_full},
+            "changes_lost": self.changes_lost,
+            "frames": None if frames is None else _counts(frames),
         }
 
     def point(self, name: str, t_ns: int, value: Any, quality: str, reason: str) -> Point:
@@ -231,5 +232,26 @@ class Attachment:
             new = frames.follow()
             if len(frames) != told and (not new or frames.behind_bytes < 1 << 16):
                 told = len(frames)
-                self.updates.publish({"type": "frames", "total": told, "behind_bytes": frames.behind_bytes})
+                self.updates.publish({"type": "frames"} | _counts(frames))
             await asyncio.sleep(0 if new else FRAMES_EVERY_S)
+
+    async def _until_replaced(self) -> None:
+        """End the updates when another run has begun under the same name: clients then ask for that run."""
+        while True:
+            await asyncio.sleep(RECORD_EVERY_S)
+            try:
+                is_same = read_record(self.dir) in (self.record, None)
+            except FileInvalid:  # a run of another version
+                is_same = False
+            if not is_same:
+                self.updates.end()
+                return
+
+
+def _counts(frames: FrameLog) -> dict[str, Any]:
+    return {
+        "total": len(frames),
+        "behind_bytes": frames.behind_bytes,
+        "full": frames.is_full,
+        "invalid_lines": frames.invalid_lines,
+    }

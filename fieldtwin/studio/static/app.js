@@ -5,7 +5,6 @@ import { address } from "./lib/address.js";
 import { remove } from "./lib/api.js";
 import { Failure, useAction } from "./lib/parts.js";
 import { Store, useStore } from "./lib/store.js";
-import { number } from "./lib/format.js";
 import { Home } from "./views/home.js";
 import { Overview } from "./views/overview.js";
 import { Devices } from "./views/devices.js";
@@ -74,7 +73,7 @@ function Instance({ place }) {
     </nav>
     <main class=${fill ? "fill" : ""} id="view" ref=${main} tabindex="-1">
       ${store.error && html`<${Failure} text=${store.error} /><p><a href="#/">All instances</a></p>`}
-      ${store.about && html`<${View} store=${store} query=${place.query} key=${place.view} />`}
+      ${store.about && html`<${View} store=${store} query=${place.query} key=${`${place.view} ${store.about.started_ns}`} />`}
       ${!store.about && !store.error && html`<p class="empty">Reading the instance …</p>`}
     </main>
   </div>`;
@@ -129,7 +128,7 @@ function Banners({ store }) {
     ${plc?.state === "paused" && html`<div class="banner" role="alert">The PLC is paused: it executes no program, and its outputs keep their values.</div>`}
     ${forces.length > 0 &&
     html`<div class="banner" role="alert">
-      <span class="grow">Forced: ${forces.map(([tag, f]) => `${tag} = ${number(f.value)}${f.by ? ` by ${f.by}` : ""}`).join(", ")}</span>
+      <span class="grow">Forced: ${forces.map(([tag, f]) => `${tag} = ${store.wordOf(tag, f.value)}${f.by ? ` by ${f.by}` : ""}`).join(", ")}</span>
       ${store.mayOperate && html`<button onClick=${() => run(() => remove(`${store.path}/plc/forces`))}>Remove all forces</button>`}
     </div>`}
     ${(field?.faults?.length > 0 || set.length > 0) &&
@@ -137,7 +136,7 @@ function Banners({ store }) {
       <span class="grow"
         >${"Faults: "}${[
           ...(field.faults ?? []).map((f) => `${f.name} on ${f.device || f.bus}`),
-          ...set.map(([tag, v]) => `${tag} set to ${number(v)}`),
+          ...set.map(([tag, v]) => `${tag} set to ${store.wordOf(tag, v)}`),
         ].join(", ")}</span
       >
       <a href=${address(store.name, "faults")}>Show</a>

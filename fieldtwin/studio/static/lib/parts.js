@@ -8,6 +8,12 @@ export const Quality = ({ quality, why }) =>
 
 export const Failure = ({ text }) => (text ? html`<p class="error" role="alert">${text}</p>` : null);
 
+/** The number of changes that Studio could not record, because the gateway had already dropped them. */
+export const ChangesLost = ({ store }) => {
+  const lost = store.status?.changes_lost ?? 0;
+  return lost > 0 ? html`<span class="chip warn" title="The gateway dropped them before Studio read them">${lost} changes lost</span>` : null;
+};
+
 /** Run an action and keep its error for display: [run, error, busy]. */
 export function useAction() {
   const [error, setError] = useState("");

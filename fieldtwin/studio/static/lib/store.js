@@ -23,6 +23,7 @@ export class Store {
     this.rates = {}; // bus -> requests in a second
     this.listeners = new Set();
     this.waiting = 0;
+    this.beginning = false; // whether the description of another run is being fetched
     this.path = of(name);
   }
 
@@ -51,10 +52,30 @@ export class Store {
   }
 
   take(update) {
-    if (update.type === "hello" || update.type === "status") this.takeStatus(update.status);
+    if (update.type === "hello") this.begin(update);
+    else if (this.beginning) return; // the hello has all of it
+    else if (update.type === "status") this.takeStatus(update.status);
     else if (update.type === "tags") this.takeTags(update.changes);
     else if (update.type === "frames") this.frames = update;
     else if (update.type === "dropped") this.dropped = update.count;
+    this.tell();
+  }
+
+  /** A connection begins. If another run has started under the same name, everything that is known of the earlier one is dropped. */
+  async begin({ started_ns, status }) {
+    if (this.about.started_ns !== started_ns) {
+      Object.assign(this, { status: null, programs: {}, programsOf: "", rates: {}, dropped: 0 });
+      this.recent.clear();
+      this.changed.clear();
+      this.beginning = true;
+      try {
+        this.about = await get(this.path);
+      } catch (error) {
+        this.error = error.message;
+      }
+      this.beginning = false;
+    }
+    this.takeStatus(status);
     this.tell();
   }
 
@@ -87,6 +108,13 @@ export class Store {
   /** A value of a program's variable: by its name, if the program gives names to its values. */
   word(program, variable, value) {
     return this.programs[program]?.variables[variable]?.words[String(value)] ?? number(value);
+  }
+
+  /** A value of a tag: by its name, if a program or the profile gives names to its values. */
+  wordOf(tag, value) {
+    for (const { variables } of Object.values(this.programs))
+      for (const v of Object.values(variables)) if (v.tag === tag && v.words[String(value)]) return v.words[String(value)];
+    return this.tagOf(tag)?.values[String(value)] ?? number(value);
   }
 
   /** The present value of a program's variable; undefined if the PLC does not answer. */

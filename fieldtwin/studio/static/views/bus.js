@@ -41,6 +41,8 @@ export function Bus({ store, query }) {
       <label><input type="checkbox" checked=${!!filter.problems} onChange=${change("problems")} /> only problems</label>
       <span class="grow"></span>
       ${store.frames.behind_bytes > 100_000 && html`<span class="chip warn">reading earlier frames …</span>`}
+      ${store.frames.full && html`<span class="chip warn" title="Studio indexes no further frames of this run">index full</span>`}
+      ${store.frames.invalid_lines > 0 && html`<span class="chip warn" title="Lines of the capture that are no frames">${store.frames.invalid_lines} invalid lines</span>`}
       <span class="soft">${store.frames.total.toLocaleString("en")} frames</span>
       <${Exports} path=${store.path} selection=${selection} key=${String(selection)} />
     </div>

@@ -3,7 +3,7 @@
 import { html, useState } from "../vendor/preact.js";
 import { post, put, remove } from "../lib/api.js";
 import { age, number, value } from "../lib/format.js";
-import { Dialog, Failure, Quality, Sparkline, useAction } from "../lib/parts.js";
+import { ChangesLost, Dialog, Failure, Quality, Sparkline, useAction } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { address } from "../lib/address.js";
 
@@ -36,6 +36,7 @@ export function Devices({ store, query }) {
       </label>
       <label><input type="checkbox" checked=${onlyBad} onChange=${(e) => setOnlyBad(e.target.checked)} /> only bad values</label>
       <span class="grow"></span>
+      <${ChangesLost} store=${store} />
       <span class="soft">${rows.length} values</span>
     </div>
     <${Failure} text=${error} />

@@ -38,8 +38,8 @@ MOST_ENDPOINTS = 1_024
 """Endpoints of a capture whose bus is kept."""
 MOST_OPEN = 4_096
 """Requests whose reply is still awaited. More than the buses can have open at the same time."""
-AT_ONCE_BYTES = 32_768
-"""Bytes of the capture that one call of `follow` reads: about 250 frames, which take some 30 ms."""
+AT_ONCE_BYTES = 8_192
+"""Bytes of the capture that one call of `follow` reads: about 60 frames, which take some 5 ms. Requests wait for that time."""
 PENDING, GOOD = 0, 1
 
 

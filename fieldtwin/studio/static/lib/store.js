@@ -22,6 +22,7 @@ export class Store {
     this.changed = new Map(); // tag -> time in ns of the last change
     this.rates = {}; // bus -> requests in a second
     this.listeners = new Set();
+    this.frameListeners = new Set(); // called when the number of frames has changed
     this.waiting = 0;
     this.beginning = false; // whether the description of another run is being fetched
     this.path = of(name);
@@ -56,7 +57,10 @@ export class Store {
     else if (this.beginning) return; // the hello has all of it
     else if (update.type === "status") this.takeStatus(update.status);
     else if (update.type === "tags") this.takeTags(update.changes);
-    else if (update.type === "frames") this.frames = update;
+    else if (update.type === "frames") {
+      this.frames = update;
+      for (const listener of this.frameListeners) listener(); // at once: the rows are then fetched without waiting for the next drawing
+    }
     else if (update.type === "dropped") this.dropped = update.count;
     this.tell();
   }

@@ -1,6 +1,6 @@
 // The frames of the buses. Only the rows in view are fetched and drawn, so a million frames scroll like a hundred.
 
-import { html, useCallback, useEffect, useRef, useState } from "../vendor/preact.js";
+import { html, useCallback, useEffect, useLayoutEffect, useRef, useState } from "../vendor/preact.js";
 import { address } from "../lib/address.js";
 import { get, getFile } from "../lib/api.js";
 import { clock, hex, milliseconds, number } from "../lib/format.js";
@@ -53,6 +53,7 @@ export function Bus({ store, query }) {
 function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
   const view = useRef(null);
   const reached = useRef(0); // the latest position of the view
+  const [tail, setTail] = useState(null); // while the view follows: the newest rows, {total, start, rows}
   const pages = useRef(new Map());
   const [state, setState] = useState({ total: 0, top: 0, tall: 400 });
   const [error, setError] = useState("");
@@ -62,16 +63,17 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
 
   const fetchPage = useCallback(
     async (page) => {
-      if (pages.current.get(page) === "coming") return;
-      const known = pages.current.get(page);
-      pages.current.set(page, known ?? "coming");
+      const into = pages.current; // another filter has another map
+      const known = into.get(page);
+      if (known === "coming") return;
+      into.set(page, known ?? "coming");
       try {
         const answer = await get(`${store.path}/frames?start=${page * PAGE}&count=${PAGE}&${search}`);
-        pages.current.set(page, answer.rows);
-        while (pages.current.size > MOST_PAGES) pages.current.delete(pages.current.keys().next().value);
+        into.set(page, answer.rows);
+        while (into.size > MOST_PAGES) into.delete(into.keys().next().value);
         setError("");
       } catch (e) {
-        pages.current.delete(page);
+        into.delete(page);
         setError(e.message);
       }
       again((n) => n + 1);
@@ -81,32 +83,61 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
 
   useEffect(() => {
     pages.current = new Map();
+    setTail(null);
     setState((s) => ({ ...s, total: 0 }));
     get(`${store.path}/frames?count=1&${search}`).then((a) => setState((s) => ({ ...s, total: a.total })), (e) => setError(e.message));
   }, [key]);
-  // With a filter only the server knows the number of frames; it is asked while the view follows.
+  const count = Math.ceil(state.tall / ROW) + 1;
+  // While the view follows, it asks for the newest rows only, one request at a time: after each message with a new number of frames.
   useEffect(() => {
-    if (!live) return;
-    if (!search) setState((s) => ({ ...s, total: store.frames.total }));
-    else get(`${store.path}/frames?count=1&${search}`).then((a) => setState((s) => ({ ...s, total: a.total })), () => {});
-  }, [live, store.frames.total]);
+    if (!live) {
+      if (view.current) setState((s) => ({ ...s, top: view.current.scrollTop }));
+      return undefined;
+    }
+    let current = true;
+    let busy = false;
+    let missed = false;
+    const fetchTail = async () => {
+      missed = busy;
+      if (busy) return;
+      busy = true;
+      try {
+        const answer = await get(`${store.path}/frames?count=${count}&${search}`);
+        if (!current) return;
+        setTail(answer);
+        setState((s) => ({ ...s, total: answer.total }));
+        setError("");
+      } catch (e) {
+        if (current) setError(e.message);
+      }
+      busy = false;
+      if (missed && current) fetchTail();
+    };
+    fetchTail();
+    store.frameListeners.add(fetchTail);
+    return () => {
+      current = false;
+      store.frameListeners.delete(fetchTail);
+    };
+  }, [live, search, count, store]);
 
   const whole = Math.min(TALLEST, state.total * ROW);
   const factor = state.total * ROW > TALLEST ? (state.total * ROW - state.tall) / (TALLEST - state.tall) : 1;
+  const following = live && tail !== null;
   const first = Math.max(0, Math.min(state.total - 1, Math.floor((state.top * factor) / ROW)));
-  const count = Math.ceil(state.tall / ROW) + 1;
   const last = Math.min(state.total, first + count);
   useEffect(() => {
+    if (live) return;
     for (let page = Math.floor(first / PAGE); page * PAGE < last; page++) {
       const rows = pages.current.get(page);
       const complete = Array.isArray(rows) && (rows.length === PAGE || page * PAGE + rows.length >= last);
       const settled = Array.isArray(rows) && rows.every((r) => r.verdict !== "" || r.number < state.total - 500);
-      if (!complete || (live && !settled)) fetchPage(page);
+      if (!complete || !settled) fetchPage(page);
     }
-  });
-  useEffect(() => {
+  }, [live, first, last, search, state.total]);
+  useLayoutEffect(() => {
     if (live && view.current) view.current.scrollTop = whole;
-  }, [live, whole]);
+  }, [live, whole, state.tall]);
   useEffect(() => {
     const measure = () => view.current && setState((s) => ({ ...s, tall: view.current.clientHeight }));
     const observer = new ResizeObserver(measure);
@@ -123,9 +154,10 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
   const scrolled = (e) => {
     const { scrollTop, clientHeight, scrollHeight } = e.target;
     // While it follows, the page itself only scrolls down. A fast bus adds rows between that and this event, so the distance to the end proves nothing.
-    if (live && scrollTop < reached.current && scrollTop + clientHeight < scrollHeight - 4 * ROW) setLive(false);
+    const leaves = live && scrollTop < reached.current && scrollTop + clientHeight < scrollHeight - 4 * ROW;
+    if (leaves) setLive(false);
     reached.current = scrollTop;
-    setState((s) => ({ ...s, top: scrollTop, tall: clientHeight }));
+    if (!live || leaves || clientHeight !== state.tall) setState((s) => ({ ...s, top: scrollTop, tall: clientHeight }));
   };
   const move = (e) => {
     const step = { ArrowDown: 1, ArrowUp: -1, PageDown: count - 2, PageUp: 2 - count }[e.key];
@@ -135,10 +167,10 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
     view.current.scrollTop += (step * ROW) / factor;
   };
   const started = store.about.started_ns;
-  const rows = [];
-  for (let position = first; position < last; position++) {
+  const rows = following ? tail.rows.map((row, n) => [tail.start + n, row]) : [];
+  for (let position = first; position < last && !following; position++) {
     const page = pages.current.get(Math.floor(position / PAGE));
-    const row = Array.isArray(page) ? page[position % PAGE] : undefined;
+    const row = Array.isArray(page) ? page[position % PAGE] : tail?.rows[position - tail.start];
     rows.push([position, row]);
   }
   const linked = rows.find(([, r]) => r?.number === selected)?.[1];
@@ -150,7 +182,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
       <div class="view" ref=${view} onScroll=${scrolled} role="group" tabindex="0" aria-label="Scroll with the arrow keys">
         <div style=${{ height: `${whole}px` }}></div>
         ${rows.map(([position, r]) => {
-          const top = factor === 1 ? position * ROW : state.top + (position - first) * ROW;
+          const top = following ? whole - (tail.total - position) * ROW : factor === 1 ? position * ROW : state.top + (position - first) * ROW;
           if (!r) return html`<div class="row soft" key=${position} style=${{ position: "absolute", left: 0, top: `${top}px` }}>…</div>`;
           const bad = r.verdict !== "good" && r.verdict !== "";
           const tied = linked && (r.number === linked.request || r.number === linked.reply);

@@ -82,6 +82,11 @@ class _WithCommand(GroupedCommand):
         type=click.Path(dir_okay=False),
         help="Write every event of a single scenario to this file (JSON lines).",
     ),
+    click.option(
+        "--progress",
+        type=click.Path(dir_okay=False),
+        help="Write the steps, verdicts and checked values of a single scenario to this file while it runs (JSON lines).",
+    ),
     json_option,
 )
 def command(
@@ -95,6 +100,7 @@ def command(
     junit: JunitOptions,
     html: str | None,
     trace: str | None,
+    progress: str | None,
     as_json: bool,
 ) -> int:
     """Run the scenarios in FILES (*.scenario.yaml; for a folder, all in it; default: those of the working directory).
@@ -117,6 +123,7 @@ def command(
     """
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
     from fieldtwin.results.model import Report, key_of
+    from fieldtwin.run.targets.progress import Progress
     from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
     from fieldtwin.run.targets.template_scenarios import agree_to_scenario
     from fieldtwin.scenarios.judging.waiving import all_well, ids_of, waive
@@ -124,15 +131,16 @@ def command(
 
     target, controller = _controller(at.target, at.with_command)
     paths = _found(files)
-    if trace and len(paths) != 1:
-        raise UsageError("--trace needs a single scenario", got=f"{len(paths)} of them")
+    for option, given in (("--trace", trace), ("--progress", progress)):
+        if given and len(paths) != 1:
+            raise UsageError(f"{option} needs a single scenario", got=f"{len(paths)} of them")
     _check(target, at)
     if retries and target == "real" and Impact(at.allow).rank > Impact.READ.rank:
         raise UsageError(
             "--retry-inconclusive would repeat a scenario's writes to a plant",
             expected="--allow read, or no retries",
         )
-    _check_campaign(campaign, target, (seed, trace, retries))
+    _check_campaign(campaign, target, (seed, trace, progress, retries))
     folders = sources.profiles
     for path in paths:
         agree_to_scenario(sources.ask(), path, folders, plant=target == "real", virtual=target == "virtual")
@@ -152,6 +160,7 @@ def command(
         at.can,
         controller,
     )
+    shown = Progress(Path(progress)) if progress else None
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
     for scenario in scenarios:
@@ -165,11 +174,13 @@ def command(
             results += waived_ones
             seeds += waived_ones[1 : 1 + len(parse_seeds(campaign.seeds))]
             continue
-        result = run_scenario(scenario, where, Path(trace) if trace else None, retries)
+        result = run_scenario(scenario, where, Path(trace) if trace else None, retries, shown)
         result = replace(result, system=scenario.system)
         results.append(waive(result, waived, datetime.now(UTC).date()))
         if not as_json:
             _show(results[-1])
+    if shown is not None:
+        shown.close()
     machines = _machines([one.system for one in scenarios]) if html else {}
     report = Report(
         "scenarios",
@@ -219,7 +230,8 @@ def _check_campaign(campaign: CampaignOptions, target: str, of_one_run: tuple[ob
         )
     if campaign.seeds and any(of_one_run):
         raise UsageError(
-            "--seeds, which makes several runs", hint="--seed, --trace and --retry-inconclusive need a single run"
+            "--seeds, which makes several runs",
+            hint="--seed, --trace, --progress and --retry-inconclusive need a single run",
         )
 
 

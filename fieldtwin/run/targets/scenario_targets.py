@@ -29,6 +29,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.run.processes.field_found import find_field
 from fieldtwin.run.processes.with_controller import WithController
+from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.virtual_scenario import prototype_of, reproduce, run_virtual
 from fieldtwin.run.virtual.group_kinds import kind_named
 from fieldtwin.scenarios.bench import Can, NothingKnown
@@ -64,7 +65,11 @@ class ScenarioTarget:
 
 
 def run_scenario(
-    scenario: Scenario, target: ScenarioTarget, trace_file: Path | None = None, retries: int = 0
+    scenario: Scenario,
+    target: ScenarioTarget,
+    trace_file: Path | None = None,
+    retries: int = 0,
+    progress: Progress | None = None,
 ) -> ScenarioResult:
     """Run the scenario, and repeat it at most `retries` times while it is INCONCLUSIVE; the first other verdict counts.
 
@@ -72,19 +77,23 @@ def run_scenario(
     """
     earlier: list[str] = []
     while True:
-        result = _attempt(scenario, target, trace_file)
+        result = _attempt(scenario, target, trace_file, progress)
+        if progress is not None:
+            progress.end(result)
         if result.verdict is not Verdict.INCONCLUSIVE or len(earlier) >= retries or target.name == "virtual":
             return replace(result, earlier=tuple(earlier))
         earlier.append(result.why)
 
 
-def _attempt(scenario: Scenario, target: ScenarioTarget, trace_file: Path | None) -> ScenarioResult:
+def _attempt(
+    scenario: Scenario, target: ScenarioTarget, trace_file: Path | None, progress: Progress | None
+) -> ScenarioResult:
     """Run the scenario once.
 
     A scenario that the target does not allow or cannot run is SKIPPED; a lost system is an ERROR with its reason.
     """
     if target.name == "virtual":
-        return run_virtual(scenario, target.seed, trace_file)
+        return run_virtual(scenario, target.seed, trace_file, progress=progress)
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     refused = _of_a_plant(scenario, target) if target.name == "real" else ""
@@ -95,6 +104,8 @@ def _attempt(scenario: Scenario, target: ScenarioTarget, trace_file: Path | None
     sink = open_sink(trace_file) if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listen(collector.feed)
+    if progress is not None:
+        progress.begin(scenario, target.name, trace)
     try:
         if refused:  # nothing is sent to the plant
             result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)

@@ -17,6 +17,7 @@ from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.run_checks import RunJudge
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
@@ -27,7 +28,11 @@ from fieldtwin.twin.prototype.group import SystemGroup, one_system
 
 
 def run_virtual(
-    scenario: Scenario, seed: int | None = None, trace_file: Path | None = None, by_chance: ByChance | None = None
+    scenario: Scenario,
+    seed: int | None = None,
+    trace_file: Path | None = None,
+    by_chance: ByChance | None = None,
+    progress: Progress | None = None,
 ) -> ScenarioResult:
     """Run it. `seed` before the scenario's own and the prototype file's. `by_chance`: random faults of a campaign."""
     group = group_of(scenario)
@@ -46,6 +51,8 @@ def run_virtual(
         sink = open_sink(trace_file) if trace_file is not None else None
         trace = Trace(sink=sink)
         trace.listen(collector.feed)
+        if progress is not None:
+            progress.begin(scenario, "virtual", trace)
 
         async def main() -> ScenarioResult:
             kind = virtual_kind(group)

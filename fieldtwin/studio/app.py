@@ -25,8 +25,8 @@ from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api.stream import stream
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.live.launching import Launcher
-from fieldtwin.studio.live.recordings import Recordings
-from fieldtwin.studio.live.scenario_run import ScenarioRunner
+from fieldtwin.studio.scenarios.recordings import Recordings
+from fieldtwin.studio.scenarios.runner import ScenarioRunner
 
 STATIC = Path(__file__).parent / "static"
 OPERATIONS: tuple[Operation, ...] = (

@@ -46,7 +46,7 @@ def test_lines_name_the_steps_and_checks_before_the_run_and_their_verdicts_in_or
         *(("verdict", number) for number in ("always 1",)),
         ("result", None),
     ]
-    assert [step["text"] for step in lines[0]["steps"]][0] == "wait: until tank.level == 20, within 5s"
+    assert lines[0]["steps"][0]["text"] == "wait: until tank.level == 20, within 5s"
     assert lines[0]["checks"] == [{"number": "always 1", "text": "tank.level < 100"}]
     assert lines[-1]["verdict"] == result.verdict.value == "passed"
     assert verdicts(lines) == {check.number: check.verdict.value for check in result.checks}

@@ -59,7 +59,7 @@ class Progress:
         trace.listen(self._value, TraceKind.TAG, TraceKind.STATE)
 
     def end(self, result: ScenarioResult) -> None:
-        """Write the verdicts on the checks that are no steps, and the result."""
+        """Write the verdicts on the checks of the whole run, and the result."""
         for event in self._held.values():
             self._write_value(event)
         self._held = {}

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.live.gallery import Gallery
-from fieldtwin.studio.live.recordings import Recordings
+from fieldtwin.studio.scenarios.recordings import Recordings
 
 INSTANCE = "/instances/{instance}"
 T = TypeVar("T")

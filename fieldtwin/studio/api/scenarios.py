@@ -11,7 +11,7 @@ from starlette.requests import Request
 from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, of_server, prototype, recordings_of
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
-from fieldtwin.studio.live.scenario_run import ScenarioRunner, known_scenarios
+from fieldtwin.studio.scenarios.runner import ScenarioRunner, known_scenarios
 
 
 class RunScenario(msgspec.Struct, forbid_unknown_fields=True):

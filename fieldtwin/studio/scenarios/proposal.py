@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
-from fieldtwin.studio.live.scenario_record import Action, Recording, Seen, State
+from fieldtwin.studio.scenarios.recorder import Action, Recording, Seen, State
 
 BRIEF_NS = 500_000_000
 """A shorter state or quality is not expected: it depends on chance whether a check sees it."""

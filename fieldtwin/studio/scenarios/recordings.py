@@ -9,9 +9,9 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.studio.live.attachment import Attachment
-from fieldtwin.studio.live.scenario_proposal import as_scenario
-from fieldtwin.studio.live.scenario_record import Recorder
-from fieldtwin.studio.live.scenario_run import SUFFIX
+from fieldtwin.studio.scenarios.proposal import as_scenario
+from fieldtwin.studio.scenarios.recorder import Recorder
+from fieldtwin.studio.scenarios.runner import SUFFIX
 from fieldtwin.twin.site.data_files import search_path
 
 MOST_RECORDINGS = 8

@@ -1,6 +1,6 @@
 """Record what clients do to a prototype, and what its tags and programs then do, as a scenario.
 
-A `Recorder` notes actions and changes of one instance; `fieldtwin.studio.live.scenario_proposal` turns its `Recording` into a
+A `Recorder` notes actions and changes of one instance; `fieldtwin.studio.scenarios.proposal` turns its `Recording` into a
 scenario file.
 """
 

@@ -128,6 +128,8 @@ class ScenarioResult:
     took_s: float = 0.0
     trace: Sequence[TraceEvent] = ()
     trace_hash: str = ""
+    trace_file: str = ""
+    """The file with all events, if Studio can show it (`fieldtwin studio FILE`)."""
     dropped: int = 0
     counts: AccessCounts | None = None
     earlier: tuple[str, ...] = ()

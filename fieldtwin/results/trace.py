@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import msgspec
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.results.trace_about import about_path
 
 CAPACITY = 200_000
 _AT_ONCE = 256
@@ -178,8 +179,12 @@ def read_trace(lines: list[bytes]) -> list[TraceEvent]:
 
 
 def open_sink(path: Path) -> BinaryIO:
-    """Open the file for a trace; an older one is overwritten. Raises `FileInvalid` if it cannot be written."""
+    """Open the file for a trace; an older one is overwritten, and its description is removed.
+
+    Raises `FileInvalid` if it cannot be written.
+    """
     try:
+        about_path(path).unlink(missing_ok=True)
         return path.open("wb")
     except OSError as e:
         raise FileInvalid(f"cannot write the trace: {e.strerror or e}", path=str(path)) from e

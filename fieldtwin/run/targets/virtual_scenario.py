@@ -17,9 +17,11 @@ from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.results.trace_about import TraceAbout, checks_about, write_results
 from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.run_checks import RunJudge
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
+from fieldtwin.run.virtual.trace_description import begin_description
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario
@@ -47,6 +49,7 @@ def run_virtual(
     loop = VirtualLoop()
     error: FieldtwinError | None = None
     result: ScenarioResult | None = None
+    about: TraceAbout | None = None
     with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
         sink = open_sink(trace_file) if trace_file is not None else None
         trace = Trace(sink=sink)
@@ -56,7 +59,12 @@ def run_virtual(
 
         async def main() -> ScenarioResult:
             kind = virtual_kind(group)
+            nonlocal about
             async with kind.virtual(group, loop, Path(folder), trace, chosen, None, scenario.probes) as running:
+                if trace_file is not None:
+                    about = begin_description(
+                        trace_file, group, running, seed=chosen, profiles=scenario.profiles, title=scenario.form.scenario
+                    )
                 return await _judged(ScenarioRunner(scenario, running.bench, by_chance), judge, running)
 
         try:
@@ -72,9 +80,13 @@ def run_virtual(
         events = tuple(trace.events)
         checks = (gone(error, events[-1].t_ns if events else 0),)
         result = result_of(scenario, "virtual", Verdict.ERROR, checks=checks, reason=str(error), trace=events)
+    if trace_file is not None:
+        checks_of = checks_about(result.checks)
+        write_results(trace_file, about, verdict=result.verdict.value, reason=result.reason, checks=checks_of)
     return replace(
         result,
         seed=chosen,
+        trace_file="" if about is None else str(trace_file),
         reproduce=reproduce(scenario, "--seed", str(chosen)),
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),

@@ -20,11 +20,14 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.results.model import Verdict
 from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.results.trace_about import CheckAbout, TraceAbout, write_results
 from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.run.virtual.system_check import SystemCheck
+from fieldtwin.run.virtual.trace_description import begin_description
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 from fieldtwin.twin.prototype.group import SystemGroup, load_group, one_system
@@ -34,6 +37,8 @@ TRACE_KEPT = 20_000
 PIECE_S = 10.0
 """Virtual seconds between two progress reports, and between two checks."""
 MAX_ERRORS = 100
+MOST_REASON = 2000
+"""Characters of the errors in the description of a trace."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,8 @@ class VirtualRun:
         self.errors: list[str] = []
         self.trace = Trace(TRACE_KEPT)
         self._shared: dict[str, Any] = {}
+        self._about: TraceAbout | None = None
+        """The description of the trace, if there is one."""
         self._judged = False
         """False while the run cannot be judged: an error before that is a user's mistake and is raised."""
 
@@ -138,11 +145,26 @@ class VirtualRun:
                 if progress is not None:
                     progress(self.elapsed_s)
             self._ended(main, loop)
+        if self.options.trace is not None:
+            summary = self.summary()
+            broken = [
+                CheckAbout(
+                    number=one["number"], text=one["text"], verdict=one["verdict"], got=one["got"], where=one["where"]
+                )
+                for one in summary.get("invariants", ())
+            ]
+            verdict = Verdict.PASSED if summary["ok"] else Verdict.FAILED
+            reason = "; ".join(map(str, summary.get("errors", ())))[:MOST_REASON]
+            write_results(self.options.trace, self._about, verdict=verdict.value, reason=reason, checks=broken)
 
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
         kind, group, commands = self._kind, self.group, self.scripted
         async with kind.virtual(group, loop, folder, self.trace, self.seed, commands) as running:
             self.attach(running)
+            if self.options.trace is not None:
+                self._about = begin_description(
+                    self.options.trace, group, running, seed=self.seed, profiles=self.options.profiles
+                )
             for fault in self.faults:  # each has its own start time
                 await running.bench.inject(fault)
             async with Nursery() as nursery:

@@ -1,0 +1,123 @@
+"""The description of a trace: which system it is of, the programs of its PLC, and the results of its checks.
+
+A trace holds events only. Its run writes the description into a second file beside it (`about_path`) when the run begins, and again
+with the results when it ends. A reader needs no program of the system for it, and executes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.input_file import read_input
+
+SUFFIX = ".about.json"
+VERSION = 1
+MOST_BYTES = 8 << 20
+"""Size of a description that is read. The source texts of programs are the largest part, and have at most 1 MiB."""
+
+
+class CheckAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """A check of the run (`fieldtwin.results.model.CheckResult`). `t_ns` is None for a check that was not reached."""
+
+    number: str
+    text: str
+    verdict: str
+    t_ns: int | None = None
+    since_ns: int | None = None
+    expected: str = ""
+    got: str = ""
+    reason: str = ""
+    where: str = ""
+    names: list[str] = []
+
+
+class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """The description. `finished` is false while the run continues; `checks`, `verdict` and `reason` are then empty."""
+
+    version: int
+    system: str
+    """The name of the system."""
+    system_path: str
+    """The system file as the run read it."""
+    system_hash: str
+    profiles: list[str] = []
+    """Further folders of profiles."""
+    title: str = ""
+    """The name of the scenario; empty for a run without one."""
+    target: str = ""
+    seed: int | None = None
+    programs: dict[str, Any] = {}
+    """The description of the PLC's programs (`fieldtwin.plc.runtime.about`)."""
+    stale_after_ms: dict[str, int | None] = {}
+    """By tag: how long its value is good without being read again; None: for good."""
+    finished: bool = False
+    verdict: str = ""
+    reason: str = ""
+    checks: list[CheckAbout] = []
+
+
+def about_path(trace: Path) -> Path:
+    """Return the file with the description of a trace."""
+    return trace.with_name(trace.name + SUFFIX)
+
+
+def write_results(
+    trace: Path, about: TraceAbout | None, *, verdict: str, reason: str, checks: list[CheckAbout]
+) -> None:
+    """Write the description of a finished run. Does nothing for a run that has none. Raises `FileInvalid`."""
+    if about is not None:
+        write_about(
+            trace, msgspec.structs.replace(about, finished=True, verdict=verdict, reason=reason, checks=checks)
+        )
+
+
+def write_about(trace: Path, about: TraceAbout) -> None:
+    """Write the description of a trace, in place of an older one. Raises `FileInvalid`."""
+    path = about_path(trace)
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_bytes(msgspec.json.encode(about) + b"\n")
+        new.replace(path)
+    except OSError as e:
+        raise FileInvalid(f"cannot write the description of the trace: {e.strerror or e}", path=str(path)) from e
+
+
+def read_about(trace: Path) -> TraceAbout | None:
+    """Return the description of a trace, None without one. Raises `FileInvalid` for a file that is not a description."""
+    path = about_path(trace)
+    try:
+        about = msgspec.json.decode(read_input(path, MOST_BYTES), type=TraceAbout)
+    except FileNotFoundError:
+        return None
+    except OSError as e:
+        raise FileInvalid(f"cannot read the description of the trace: {e.strerror or e}", path=str(path)) from e
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as e:
+        raise FileInvalid(
+            f"not the description of a trace: {e}",
+            path=str(path),
+            hint="delete it, and name the system of the trace with --system",
+        ) from e
+    if about.version != VERSION:
+        raise FileInvalid(
+            "the description of the trace has another version",
+            path=str(path),
+            expected=str(VERSION),
+            got=str(about.version),
+        )
+    return about
+
+
+def checks_about(checks: Sequence[Any]) -> list[CheckAbout]:
+    """Return the results of checks (`CheckResult`) as parts of a description."""
+    return [
+        CheckAbout(
+            number=c.number, text=c.text, verdict=c.verdict.value, t_ns=c.t_ns, since_ns=c.since_ns, expected=c.expected,
+            got=c.got, reason=c.reason, where=c.where, names=list(c.names),
+        )
+        for c in checks
+    ]  # fmt: skip

@@ -1,14 +1,12 @@
 """The description of a trace: which system it is of, the programs of its PLC, and the results of its checks.
 
-A trace holds events only. Its run writes the description into a second file beside it (`about_path`) when the run begins, and again
-with the results when it ends. A reader needs no program of the system for it, and executes nothing.
+A trace holds events only. The run writes the description into a second file (`about_path`) when it begins, and again with
+the results when it ends. A reader needs no program of the system for it, and executes nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -36,10 +34,56 @@ class CheckAbout(msgspec.Struct, frozen=True, kw_only=True):
     names: list[str] = []
 
 
+class VariableAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """A variable of a program. `words` are the names of its values, `tag` is the name under which it is published."""
+
+    tag: str
+    role: str
+    kind: str
+    unit: str
+    words: dict[str, str] = {}
+
+
+class TransitionAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """A transition of a program. `source` is empty if it leaves any state."""
+
+    source: str
+    target: str
+    label: str
+
+
+class MachineAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """The states of a program. `declared`: whether the program declares its transitions."""
+
+    states: list[str]
+    initial: str
+    transitions: list[TransitionAbout]
+    declared: bool
+
+
+class SourceAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """The source text of a program; if it is empty, `reason` says why."""
+
+    language: str
+    file: str
+    text: str
+    reason: str
+
+
+class ProgramAbout(msgspec.Struct, frozen=True, kw_only=True):
+    """A program, as `fieldtwin.plc.runtime.about` describes it."""
+
+    variables: dict[str, VariableAbout]
+    machine: MachineAbout | None
+    source: SourceAbout
+
+
 class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     """The description. `finished` is false while the run continues; `checks`, `verdict` and `reason` are then empty."""
 
     version: int
+    run: str = ""
+    """A number that no other run has. It tells whether a file of the same name was written anew."""
     system: str
     """The name of the system."""
     system_path: str
@@ -51,8 +95,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     """The name of the scenario; empty for a run without one."""
     target: str = ""
     seed: int | None = None
-    programs: dict[str, Any] = {}
-    """The description of the PLC's programs (`fieldtwin.plc.runtime.about`)."""
+    programs: dict[str, ProgramAbout] = {}
     stale_after_ms: dict[str, int | None] = {}
     """By tag: how long its value is good without being read again; None: for good."""
     finished: bool = False
@@ -71,9 +114,7 @@ def write_results(
 ) -> None:
     """Write the description of a finished run. Does nothing for a run that has none. Raises `FileInvalid`."""
     if about is not None:
-        write_about(
-            trace, msgspec.structs.replace(about, finished=True, verdict=verdict, reason=reason, checks=checks)
-        )
+        write_about(trace, msgspec.structs.replace(about, finished=True, verdict=verdict, reason=reason, checks=checks))
 
 
 def write_about(trace: Path, about: TraceAbout) -> None:
@@ -110,14 +151,3 @@ def read_about(trace: Path) -> TraceAbout | None:
             got=str(about.version),
         )
     return about
-
-
-def checks_about(checks: Sequence[Any]) -> list[CheckAbout]:
-    """Return the results of checks (`CheckResult`) as parts of a description."""
-    return [
-        CheckAbout(
-            number=c.number, text=c.text, verdict=c.verdict.value, t_ns=c.t_ns, since_ns=c.since_ns, expected=c.expected,
-            got=c.got, reason=c.reason, where=c.where, names=list(c.names),
-        )
-        for c in checks
-    ]  # fmt: skip

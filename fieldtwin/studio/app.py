@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
 from fieldtwin.studio.access import Access, AccessMiddleware
-from fieldtwin.studio.api import faults, frames, instances, plc, scenarios, tags
+from fieldtwin.studio.api import faults, frames, instances, plc, scenarios, tags, traces
 from fieldtwin.studio.api.common import INSTANCE
 from fieldtwin.studio.api.errors import on_error
 from fieldtwin.studio.api.openapi import describe
@@ -25,6 +25,7 @@ from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api.stream import stream
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.live.launching import Launcher
+from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.scenarios.recordings import Recordings
 from fieldtwin.studio.scenarios.runner import ScenarioRunner
 
@@ -36,11 +37,14 @@ OPERATIONS: tuple[Operation, ...] = (
     *plc.OPERATIONS,
     *faults.OPERATIONS,
     *scenarios.OPERATIONS,
+    *traces.OPERATIONS,
 )
 
 
-def application(access: Access, clock: Clock, folder: Path) -> Starlette:
-    """Return the application for one server. `folder` is searched for systems that can be started."""
+def application(access: Access, clock: Clock, folder: Path, known: Traces | None = None) -> Starlette:
+    """Return the application for one server. `folder` is searched for systems that can be started, and for traces unless `known`
+    has those to show.
+    """
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -49,9 +53,11 @@ def application(access: Access, clock: Clock, folder: Path) -> Starlette:
             Gallery(clock) as gallery,
             Recordings() as recordings,
             ScenarioRunner() as runner,
+            known or Traces(folder) as shown,
         ):
             app.state.launcher, app.state.gallery, app.state.folder = launcher, gallery, folder
             app.state.recordings, app.state.runner = recordings, runner
+            app.state.traces = shown
             yield
 
     return Starlette(

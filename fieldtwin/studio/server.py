@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
+from urllib.parse import quote
 
 import uvicorn
 
@@ -18,6 +19,7 @@ from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.studio.access import Access, allowed_hosts, new_token
 from fieldtwin.studio.app import STATIC, application
+from fieldtwin.studio.replay.traces import Traces
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 CLOSES_WITHIN_S = 2
@@ -45,6 +47,12 @@ class StudioOptions:
     """A system whose prototype is started with the server; empty for none."""
     instance: str = ""
     """A running instance that the page shows first, if no system is started."""
+    trace: Path | None = None
+    """A trace that the page shows first, or a folder with traces."""
+    trace_system: str = ""
+    """The system of a trace without a description."""
+    at_s: float | None = None
+    """The instant of the trace that the page shows first, in seconds since the start of the run."""
 
     def check(self) -> None:
         """Raise `UsageError` for a combination that would let others operate a plant."""
@@ -100,7 +108,8 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
     names = {options.host, *options.names} | (set(LOOPBACK) if options.is_loopback else set())
     operate = "" if options.no_token else options.operate_token or new_token()
     access = Access(allowed_hosts(names, port), operate, options.view_token)
-    app = application(access, WallClock(), Path.cwd())
+    traces = Traces(Path.cwd(), () if options.trace is None else (options.trace,), options.trace_system)
+    app = application(access, WallClock(), Path.cwd(), traces)
     config = uvicorn.Config(
         app,
         log_config=None,
@@ -133,13 +142,29 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
         instance = await app.state.launcher.start(options.system) if options.system else options.instance
         if instance:
             await app.state.gallery.attached(instance)  # its history begins now, not when a page first asks
-        url = (f"{address}?token={operate}" if operate else address) + (f"#/{instance}" if instance else "")
+        place = f"#/{instance}" if instance else await _first_trace(traces, options)
+        url = (f"{address}?token={operate}" if operate else address) + place
         on_ready(Serving(url, address, access))
         await running
     finally:
         server.stop()
         await asyncio.gather(running, return_exceptions=True)
         listener.close()
+
+
+async def _first_trace(traces: Traces, options: StudioOptions) -> str:
+    """Return the part of the address that shows the trace which the user named. A folder with several traces shows the list."""
+    if options.trace is None:
+        return ""
+    within = options.trace.resolve()
+    named = [trace for trace in traces.known() if within in (trace.path, trace.path.parent)]
+    if not named or (options.trace.is_dir() and len(named) != 1):
+        return ""
+    await traces.opened(
+        named[0].name
+    )  # an unreadable trace is reported at once, and the others are indexed from now on
+    at = "" if options.at_s is None else f"?t={options.at_s:g}"
+    return f"#/{quote(f'trace:{named[0].name}')}/overview{at}"
 
 
 def open_browser(url: str) -> bool:

@@ -10,7 +10,7 @@ import click
 
 from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
-from fieldtwin.cli.options import Secret
+from fieldtwin.cli.options import Duration, Secret
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.installation import install_hint
@@ -54,27 +54,51 @@ class ServerOptions:
     )
 
 
+@dataclass(frozen=True)
+class TraceOptions:
+    """How a trace is shown."""
+
+    at_s: float | None = option(
+        "--at", type=Duration(), default=None, metavar="TIME", help="Show this instant of the TRACE first."
+    )
+    system: str = option(
+        "--system", default="", metavar="SYSTEM", help="The system of a TRACE without a description beside it."
+    )
+
+    def check(self, trace: Path | None) -> None:
+        """Raise `UsageError` for options of a trace without one."""
+        if trace is None and (self.at_s is not None or self.system):
+            raise UsageError("--at and --system need a trace", expected="fieldtwin studio TRACE --at 12.5s")
+
+
 @click.command("studio", cls=GroupedCommand)
-@click.argument("system", required=False, default="", shell_complete=systems)
+@click.argument("shown", metavar="[SYSTEM|TRACE]", required=False, default="", shell_complete=systems)
 @click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
 @click.option("--instance", default="", metavar="NAME", help="Show this running instance first.")
+@group("Trace of a virtual run", trace=TraceOptions)
 @group("Server", server=ServerOptions)
-def command(system: str, no_browser: bool, instance: str, server: ServerOptions) -> int:
+def command(shown: str, no_browser: bool, instance: str, trace: TraceOptions, server: ServerOptions) -> int:
     """Serve a page that shows and operates the running systems of this computer: values, frames, PLC, trends and faults.
 
     With SYSTEM its prototype is started first, and stopped at the end. Without it the page lists the running instances, the
     shipped systems and those in the working directory.
 
+    With TRACE, a file that simulate --trace or test --trace has written, or a folder with such files, the page shows the run
+    as of any instant: values, frames, PLC and trends, with faults and failed checks marked.
+
     The page is for this computer only, unless --listen names another address. Its address contains a token; everyone who has the
     token can operate the systems.
     """
     try:
+        from fieldtwin.studio.replay.traces import is_trace
         from fieldtwin.studio.server import Serving, StudioOptions, check_pages, open_browser, serve
     except ModuleNotFoundError as e:
         raise UsageError(f"Studio needs {e.name}", hint=install_hint("studio")) from e
     host, _, port = server.listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
         raise UsageError("--listen", expected="HOST:PORT, such as 127.0.0.1:8080", got=server.listen)
+    path = Path(shown) if shown and (is_trace(Path(shown)) or (trace.system and Path(shown).is_file())) else None
+    trace.check(path)
     options = StudioOptions(
         host=host.strip("[]"),
         port=int(port),
@@ -85,8 +109,11 @@ def command(system: str, no_browser: bool, instance: str, server: ServerOptions)
         no_token=server.no_token,
         operate_token=server.operate_token,
         view_token=server.view_token,
-        system=system,
+        system="" if path is not None else shown,
         instance=instance,
+        trace=path,
+        trace_system=trace.system,
+        at_s=trace.at_s,
     )
     options.check()
     check_pages()

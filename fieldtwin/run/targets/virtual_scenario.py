@@ -17,11 +17,11 @@ from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
-from fieldtwin.results.trace_about import TraceAbout, checks_about, write_results
+from fieldtwin.results.trace_about import TraceAbout, write_results
 from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.run_checks import RunJudge
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
-from fieldtwin.run.virtual.trace_description import begin_description
+from fieldtwin.run.virtual.trace_description import begin_description, described_checks
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario
@@ -63,7 +63,12 @@ def run_virtual(
             async with kind.virtual(group, loop, Path(folder), trace, chosen, None, scenario.probes) as running:
                 if trace_file is not None:
                     about = begin_description(
-                        trace_file, group, running, seed=chosen, profiles=scenario.profiles, title=scenario.form.scenario
+                        trace_file,
+                        group,
+                        running,
+                        seed=chosen,
+                        profiles=scenario.profiles,
+                        title=scenario.form.scenario,
                     )
                 return await _judged(ScenarioRunner(scenario, running.bench, by_chance), judge, running)
 
@@ -81,7 +86,7 @@ def run_virtual(
         checks = (gone(error, events[-1].t_ns if events else 0),)
         result = result_of(scenario, "virtual", Verdict.ERROR, checks=checks, reason=str(error), trace=events)
     if trace_file is not None:
-        checks_of = checks_about(result.checks)
+        checks_of = described_checks(result.checks)
         write_results(trace_file, about, verdict=result.verdict.value, reason=result.reason, checks=checks_of)
     return replace(
         result,

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
+
 from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.plc.runtime.about import describe_programs
-from fieldtwin.results.trace_about import VERSION, TraceAbout, write_about
+from fieldtwin.results.model import CheckResult
+from fieldtwin.results.trace_about import VERSION, CheckAbout, ProgramAbout, TraceAbout, write_about
 from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.twin.prototype.group import SystemGroup
 
@@ -31,6 +35,7 @@ def begin_description(
     system = bench.system
     about = TraceAbout(
         version=VERSION,
+        run=os.urandom(8).hex(),
         system=system.name,
         system_path=str(system.path.absolute()),
         system_hash=system.hash,
@@ -38,10 +43,23 @@ def begin_description(
         title=title,
         target=bench.target,
         seed=seed,
-        programs=describe_programs(bench.run.plc.programs, bench.run.plc.sources),
+        programs=msgspec.convert(
+            describe_programs(bench.run.plc.programs, bench.run.plc.sources), dict[str, ProgramAbout]
+        ),
         stale_after_ms={
             tag: limit for driver in bench.run.gateway.drivers.values() for tag, limit in stale_limits(driver).items()
         },
     )
     write_about(trace, about)
     return about
+
+
+def described_checks(checks: Iterable[CheckResult]) -> list[CheckAbout]:
+    """Return the results of checks as parts of a description."""
+    return [
+        CheckAbout(
+            number=c.number, text=c.text, verdict=c.verdict.value, t_ns=c.t_ns, since_ns=c.since_ns, expected=c.expected,
+            got=c.got, reason=c.reason, where=c.where, names=list(c.names),
+        )
+        for c in checks
+    ]  # fmt: skip

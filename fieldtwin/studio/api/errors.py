@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.errors import (
     WireError,
 )
 from fieldtwin.studio.live.gallery import NoInstance
+from fieldtwin.studio.replay.traces import NoTrace
 
 
 class NotFound(UsageError):
@@ -26,6 +27,7 @@ class NotFound(UsageError):
 STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
     (NotFound, 404),
     (NoInstance, 404),
+    (NoTrace, 404),
     (CheckFailed, 409),
     (NotAllowed, 403),
     (UsageError, 400),

@@ -22,7 +22,7 @@ from fieldtwin.studio.api.common import INSTANCE, attached
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, Parameter, whole, yes
 from fieldtwin.studio.live.attachment import Attachment
-from fieldtwin.studio.live.effects import effects_of
+from fieldtwin.studio.live.effects import Changes, effects_of
 from fieldtwin.studio.live.frame_log import FrameFilter, FrameLog, FrameRow
 from fieldtwin.twin.site.system import System
 
@@ -57,7 +57,12 @@ def _wanted(request: Request) -> FrameFilter:
 
 async def list_frames(request: Request) -> dict[str, Any]:
     """Return frames from a position on, among those that the filter accepts, and how many there are."""
-    frames, wanted = _frames(await attached(request)), _wanted(request)
+    return page_of(request, _frames(await attached(request)))
+
+
+def page_of(request: Request, frames: FrameLog) -> dict[str, Any]:
+    """Return the frames that a request asks for."""
+    wanted = _wanted(request)
     total, count = frames.count(wanted), whole(request, "count", 100, 1, MOST_ROWS)
     if (at := request.query_params.get("at_ns")) is not None:
         start = max(0, frames.position_at(int(at) if at.isdigit() else 0, wanted) - count // 2)
@@ -70,7 +75,12 @@ async def list_frames(request: Request) -> dict[str, Any]:
 async def get_frame(request: Request) -> dict[str, Any]:
     """Return one frame with its fields, the frames that it belongs to, and the changes of tags after it."""
     attachment = await attached(request)
-    frames, text = _frames(attachment), request.path_params["number"]
+    return frame_of(request, _frames(attachment), attachment.system, attachment.history)
+
+
+def frame_of(request: Request, frames: FrameLog, system: System, history: Changes) -> dict[str, Any]:
+    """Return the frame that a request names. Raises `NotFound`."""
+    text = request.path_params["number"]
     number = int(text) if text.isdigit() else -1
     try:
         row = frames.row(number)
@@ -80,7 +90,7 @@ async def get_frame(request: Request) -> dict[str, Any]:
     return shown(frames, number, row) | {
         "linked": [shown(frames, n, frames.row(n)) for n in linked],
         "fields": frames.fields(number),
-        "effects": [effect._asdict() for effect in effects_of(attachment, frames, number)],
+        "effects": [effect._asdict() for effect in effects_of(system, history, frames, number)],
     }
 
 
@@ -92,7 +102,14 @@ async def list_services(request: Request) -> list[str]:
 async def export_frames(request: Request) -> Response:
     """Return a selection of frames as a file: pcap or recording (one bus), or candump (CAN buses)."""
     attachment = await attached(request)
-    frames, wanted = _frames(attachment), _wanted(request)
+    record = attachment.record
+    offset_ns = record.started_utc_ns - record.started_ns
+    return await file_of(request, _frames(attachment), attachment.system, offset_ns, prototype=record.prototype)
+
+
+async def file_of(request: Request, frames: FrameLog, system: System, offset_ns: int, *, prototype: bool) -> Response:
+    """Return the frames that a request selects as a file. `offset_ns` makes a time of the frames a UTC time."""
+    wanted = _wanted(request)
     kind = request.query_params.get("format", "pcap")
     if kind not in FORMATS:
         raise UsageError("the format", expected=", ".join(FORMATS), got=repr(kind[:20]))
@@ -108,13 +125,12 @@ async def export_frames(request: Request) -> Response:
     for start in range(0, len(numbers), AT_ONCE):
         captured += frames.captured(numbers[start : start + AT_ONCE])
         await asyncio.sleep(0)  # other requests are answered in between
-    offset_ns = attachment.record.started_utc_ns - attachment.record.started_ns
     if kind == "candump":
         content = await asyncio.to_thread(_candump, captured, offset_ns)
         return _file(content, "frames.log", "text/plain")
-    endpoint = _only_endpoint(captured, attachment.system)
+    endpoint = _only_endpoint(captured, system)
     if kind == "recording":
-        content = await asyncio.to_thread(_recording, captured, endpoint, attachment.record.prototype)
+        content = await asyncio.to_thread(_recording, captured, endpoint, prototype)
         return _file(content, "frames.jsonl", "application/jsonl")
     content = await asyncio.to_thread(_pcap, captured, endpoint, offset_ns)
     return _file(content, "frames.pcap", "application/vnd.tcpdump.pcap")

@@ -5,10 +5,11 @@ That a change followed a frame does not prove that the frame caused it; the page
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.live.frame_log import FrameLog
+from fieldtwin.studio.live.tag_history import Point
+from fieldtwin.twin.site.system import System
 
 WITHIN_NS = 500_000_000
 MOST_CHANGES = 200
@@ -26,7 +27,14 @@ class Effect(NamedTuple):
     program: str
 
 
-def effects_of(attachment: Attachment, frames: FrameLog, number: int) -> list[Effect]:
+class Changes(Protocol):
+    """The history of tags, of a running instance or of a trace."""
+
+    def changes(self, name: str, from_ns: int, to_ns: int) -> list[tuple[Point | None, Point]]:
+        """Return the changes of a tag in an interval, each with the point before it."""
+
+
+def effects_of(system: System, history: Changes, frames: FrameLog, number: int) -> list[Effect]:
     """Return the changes from a frame's request until `WITHIN_NS` after the frame, at most `MOST_CHANGES`, oldest first."""
     row = frames.row(number)
     from_ns = row.t_ns if row.request is None else frames.row(row.request).t_ns
@@ -34,10 +42,8 @@ def effects_of(attachment: Attachment, frames: FrameLog, number: int) -> list[Ef
     carried = {f"{row.device}.{name}": "" for name in row.tags}
     if reply is not None:
         carried |= {f"{row.device}.{name}": "" for name in frames.row(reply).tags}
-    written = {
-        tag: program for program, form in attachment.system.plc.programs.items() for tag in form.outputs.values()
-    }
-    history, found = attachment.history, []
+    written = {tag: program for program, form in system.plc.programs.items() for tag in form.outputs.values()}
+    found = []
     for tag, program in (written | carried).items():
         for before, point in history.changes(tag, from_ns, row.t_ns + WITHIN_NS):
             old = before.value if before is not None else None

@@ -24,10 +24,11 @@ import msgspec
 from fieldtwin.capture.decoding.decoder import Decoder, frame_event
 from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.capture.decoding.fields import FieldSpan
-from fieldtwin.capture.formats.pcap import captured_of
+from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, captured_of
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.results.trace import TraceEvent
 from fieldtwin.twin.site.system import System
 
@@ -116,7 +117,7 @@ class FrameLog:
         self._system = system
         self._decoder = Decoder(system)
         try:
-            self._capture = capture.open("rb")
+            self._capture = open_input(capture)
         except OSError as e:
             raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(capture)) from e
         self._rows = tempfile.TemporaryFile(prefix="fieldtwin-frames-")  # noqa: SIM115
@@ -159,6 +160,9 @@ class FrameLog:
         before, at = len(self), self._read_to - len(self._rest)
         self._read_to += len(chunk)
         *lines, self._rest = (self._rest + chunk).split(b"\n")
+        if len(self._rest) > MAX_LINE_BYTES:
+            self.is_full = True
+            self.invalid_lines += 1
         for line in lines:
             self._add_line(line, at)
             at += len(line) + 1
@@ -218,7 +222,7 @@ class FrameLog:
         found = []
         for number in numbers:
             self._capture.seek(self._raw_at[number])
-            found.append(captured_of(json.loads(self._capture.readline())))
+            found.append(self._captured_of(self._capture.readline()))
         self._capture.seek(self._read_to)
         return found
 
@@ -261,18 +265,27 @@ class FrameLog:
     # -- indexing ---------------------------------------------------------------------------------------------------------
 
     def _add_line(self, line: bytes, at: int) -> None:
-        if not line.startswith(b'{"t_ns"'):
-            return  # the head of the file
         try:
-            read = json.loads(line)
-            if "refused" in read:
-                return
-            seen, bus = captured_of(read), self._bus_of(read["endpoint"])
-        except (ValueError, KeyError, TypeError, FieldtwinError):
+            event = self._event_of(line)
+        except (ValueError, KeyError, TypeError, RecursionError, FieldtwinError):
             self.invalid_lines += 1
             return
-        if bus:
-            self._add(frame_event(seen, bus), at)
+        if event is not None:
+            self._add(event, at)
+
+    def _event_of(self, line: bytes) -> TraceEvent | None:
+        """Return the frame of a line of the file; None for a line without a frame of a bus of the system."""
+        if not line.startswith(b'{"t_ns"'):
+            return None  # the head of the file
+        read = json.loads(line)
+        if "refused" in read:
+            return None
+        seen, bus = captured_of(read), self._bus_of(read["endpoint"])
+        return frame_event(seen, bus) if bus else None
+
+    def _captured_of(self, line: bytes) -> Captured:
+        """Return the traffic of a line of the file that holds a frame."""
+        return captured_of(json.loads(line))
 
     def _bus_of(self, endpoint: str) -> str:
         """Return the bus at an endpoint, "" without one. Kept, because writing an endpoint as text takes longer than decoding."""

@@ -79,10 +79,10 @@ class TagHistory:
         found.reverse()
         if len(found) <= points:
             return found, False
-        return _thinned(found, from_ns, to_ns, max(1, points // 4)), True
+        return thinned(found, from_ns, to_ns, max(1, points // 4)), True
 
 
-def _thinned(points: list[Point], from_ns: int, to_ns: int, parts: int) -> list[Point]:
+def thinned(points: list[Point], from_ns: int, to_ns: int, parts: int) -> list[Point]:
     """Return at most about four points for each of `parts` equal parts of the interval, and all changes of quality."""
     width_ns = max(1, (to_ns - from_ns) // parts)
     kept: list[Point] = []

@@ -5,6 +5,7 @@ import { address } from "./lib/address.js";
 import { remove } from "./lib/api.js";
 import { Failure, useAction } from "./lib/parts.js";
 import { Store, useStore } from "./lib/store.js";
+import { PREFIX, TraceStore } from "./lib/trace_store.js";
 import { Home } from "./views/home.js";
 import { Overview } from "./views/overview.js";
 import { Devices } from "./views/devices.js";
@@ -13,6 +14,7 @@ import { Plc } from "./views/plc.js";
 import { Trends } from "./views/trends.js";
 import { Faults } from "./views/faults.js";
 import { Scenario } from "./views/scenario.js";
+import { FailedChecks, Timeline } from "./views/timeline.js";
 
 const VIEWS = {
   overview: { title: "Overview", view: Overview },
@@ -21,7 +23,7 @@ const VIEWS = {
   plc: { title: "PLC", view: Plc },
   trends: { title: "Trends", view: Trends },
   faults: { title: "Faults", view: Faults, prototype: true },
-  scenario: { title: "Scenario", view: Scenario },
+  scenario: { title: "Scenario", view: Scenario, live: true },
 };
 
 function readAddress() {
@@ -45,7 +47,7 @@ function App() {
 }
 
 function Instance({ place }) {
-  const [store] = useState(() => new Store(place.instance));
+  const [store] = useState(() => (place.instance.startsWith(PREFIX) ? new TraceStore(place.instance, place.query.has("t") ? Number(place.query.get("t")) : null) : new Store(place.instance)));
   useEffect(() => {
     store.open();
     return () => store.close();
@@ -59,13 +61,13 @@ function Instance({ place }) {
     if (!first.current) main.current.focus();
     first.current = false;
   }, [place]);
-  return html`<div class="frame">
+  return html`<div class="frame ${store.isTrace ? "trace" : ""}">
     <${Top} store=${store} />
     <${Banners} store=${store} />
     <nav class="nav" aria-label="Views">
       ${Object.entries(VIEWS).map(
-        ([name, { title, prototype }]) =>
-          (!prototype || store.isPrototype) &&
+        ([name, { title, prototype, live }]) =>
+          (!prototype || store.isPrototype) && !(live && store.isTrace) &&
           html`<a href=${address(place.instance, name)} aria-current=${name === place.view ? "page" : null}>
             ${title} <${Count} store=${store} view=${name} />
           </a>`,
@@ -92,14 +94,14 @@ function Top({ store }) {
   const states = Object.keys(store.programs).filter((name) => store.programs[name].machine);
   return html`<header class="top">
     <a class="brand" href="#/">fieldtwin Studio</a>
-    <strong>${store.name}</strong>
+    <strong class="name">${store.isTrace ? store.about?.title || store.name.slice(PREFIX.length) : store.name}</strong>
     ${mode && html`<span class="chip ${mode === "plant" ? "warn" : "accent"}">${mode}${writes ? `, ${writes}` : ""}</span>`}
     ${store.status?.plc &&
     states.map((name) => html`<span class="chip">${name}: ${store.word(name, "state", store.variable(name, "state"))}</span>`)}
     <span class="grow"></span>
-    ${store.about?.role === "view" && html`<span class="chip">view only</span>`}
+    ${!store.isTrace && store.about?.role === "view" && html`<span class="chip">view only</span>`}
     ${store.dropped > 0 && html`<span class="chip warn" title="This page was too slow to take them">${store.dropped} updates lost</span>`}
-    <span class="chip ${store.connected ? "good" : "bad"}" role="status">${store.connected ? "live" : "not connected"}</span>
+    <span class="chip ${!store.connected ? "bad" : store.isTrace ? "" : "good"}" role="status">${!store.connected ? "not connected" : store.isTrace ? "recorded, read-only" : "live"}</span>
     <${Theme} />
   </header>`;
 }
@@ -122,6 +124,7 @@ function Banners({ store }) {
   const set = Object.entries(field?.set ?? {});
   const troubles = Object.entries(store.status?.troubles ?? {}).filter(([what]) => what !== "tags" || !store.status.troubles.gateway);
   return html`<div class="banners">
+    ${store.isTrace && store.about && html`<${FailedChecks} store=${store} /><${Timeline} store=${store} />`}
     ${!store.connected && store.about && html`<div class="banner bad" role="alert">The connection to Studio's server is lost: values below are old.</div>`}
     ${troubles.map(([, text]) => html`<div class="banner bad" role="alert"><span class="grow">${text}</span></div>`)}
     ${plc?.error && html`<div class="banner bad" role="alert"><span class="grow">PLC: ${plc.error} ${plc.error_at}</span></div>`}
@@ -139,9 +142,9 @@ function Banners({ store }) {
           ...set.map(([tag, v]) => `${tag} set to ${store.wordOf(tag, v)}`),
         ].join(", ")}</span
       >
-      <a href=${address(store.name, "faults")}>Show</a>
+      ${!store.isTrace && html`<a href=${address(store.name, "faults")}>Show</a>`}
     </div>`}
-    ${gateway && !gateway.plc.alive && html`<div class="banner bad" role="alert">The gateway receives nothing from the PLC.</div>`}
+    ${gateway?.plc && !gateway.plc.alive && html`<div class="banner bad" role="alert">The gateway receives nothing from the PLC.</div>`}
     <${Failure} text=${error} />
   </div>`;
 }

@@ -154,6 +154,11 @@ export class Store {
     return this.status?.gateway?.tags ?? {};
   }
 
+  /** Whether this is a trace as of one instant (trace_store.js), and not a running instance. */
+  get isTrace() {
+    return false;
+  }
+
   get mayOperate() {
     return this.about?.role === "operate";
   }

@@ -16,7 +16,7 @@ export function Bus({ store, query }) {
   useStore(store);
   const [filter, setFilter] = useState({ bus: query.get("bus") ?? "", device: query.get("device") ?? "", service: "", problems: query.get("problems") ?? "" });
   const [selected, setSelected] = useState(null);
-  const [live, setLive] = useState(!query.get("at"));
+  const [live, setLive] = useState(!query.get("at") && !store.isTrace);
   const [services] = useFetched(() => (store.about.frames ? get(`${store.path}/frames/services`) : Promise.resolve([])), [store.frames.total > 0]);
   if (!store.about.frames)
     return html`<div class="empty">
@@ -35,7 +35,7 @@ export function Bus({ store, query }) {
   const selection = new URLSearchParams(Object.entries(filter).filter(([, v]) => v));
   return html`<h1 class="visually-hidden">Frames of the buses</h1>
     <div class="bar">
-      <button onClick=${() => setLive(!live)} aria-pressed=${live}>${live ? "Pause" : "Follow"}</button>
+      ${!store.isTrace && html`<button onClick=${() => setLive(!live)} aria-pressed=${live}>${live ? "Pause" : "Follow"}</button>`}
       ${choice("bus", "Bus", Object.keys(system.buses))} ${choice("device", "Device", Object.keys(system.devices))}
       ${choice("service", "Function", services ?? [])}
       <label><input type="checkbox" checked=${!!filter.problems} onChange=${change("problems")} /> only problems</label>
@@ -46,7 +46,7 @@ export function Bus({ store, query }) {
       <span class="soft">${store.frames.total.toLocaleString("en")} frames</span>
       <${Exports} path=${store.path} selection=${selection} key=${String(selection)} />
     </div>
-    <${Frames} store=${store} filter=${filter} live=${live} setLive=${setLive} selected=${selected} setSelected=${setSelected} at=${query.get("at")} />
+    <${Frames} store=${store} filter=${filter} live=${live} setLive=${setLive} selected=${selected} setSelected=${setSelected} at=${store.isTrace ? store.settled : query.get("at")} />
     ${selected !== null && html`<${Detail} store=${store} number=${selected} onClose=${() => setSelected(null)} onSelect=${setSelected} />`}`;
 }
 
@@ -145,7 +145,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
     return () => observer.disconnect();
   }, []);
   useEffect(() => {
-    if (at)
+    if (at !== null && at !== undefined)
       get(`${store.path}/frames?at_ns=${at}&count=${PAGE}&${search}`).then((a) => {
         setState((s) => ({ ...s, total: a.total }));
         requestAnimationFrame(() => (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
@@ -187,7 +187,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
           const bad = r.verdict !== "good" && r.verdict !== "";
           const tied = linked && (r.number === linked.request || r.number === linked.reply);
           return html`<button
-            class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""}"
+            class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""} ${store.isTrace && r.t_ns > store.now() ? "later" : ""}"
             key=${position}
             style=${{ top: `${top}px` }}
             tabindex=${live ? -1 : 0 /* rows that move would hold the tab key; an arrow key or Pause stops them */}

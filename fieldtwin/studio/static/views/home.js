@@ -3,15 +3,17 @@
 import { html, useEffect } from "../vendor/preact.js";
 import { get, post, remove } from "../lib/api.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
+import { PREFIX } from "../lib/trace_store.js";
 
 const AGAIN_MS = 2000;
 
 export function Home() {
   const [instances, error, again] = useFetched(() => get("/instances"), []);
   const [systems] = useFetched(() => get("/systems"), []);
+  const [traces, unread, look] = useFetched(() => get("/traces"), []);
   const [run, failed, busy] = useAction();
   useEffect(() => {
-    const timer = setInterval(again, AGAIN_MS);
+    const timer = setInterval(() => (again(), look()), AGAIN_MS);
     return () => clearInterval(timer);
   }, []);
   const start = (system) =>
@@ -23,12 +25,16 @@ export function Home() {
   const finished = (instances ?? []).filter((i) => !i.running);
   return html`<main style=${{ maxWidth: "1100px", margin: "0 auto" }}>
     <h1 style=${{ margin: "14px 0 18px" }}>fieldtwin Studio</h1>
-    <${Failure} text=${error || failed} />
+    <${Failure} text=${error || failed || unread} />
     <h2>Running</h2>
     <div class="cards" style=${{ margin: "10px 0 26px" }}>
       ${running.map((i) => html`<${Card} instance=${i} run=${run} again=${again} />`)}
       ${instances && !running.length && html`<p class="soft">Nothing runs on this computer. Start a prototype below, or with <code>fieldtwin run</code>.</p>`}
     </div>
+    ${traces?.length > 0 &&
+    html`<h2>Traces of virtual runs</h2>
+      <p class="soft">Runs that were recorded with <code>--trace</code>. Each is shown as of any instant.</p>
+      <div class="cards traces">${traces.map((t) => html`<${TraceCard} trace=${t} key=${t.name} />`)}</div>`}
     <h2>Start a prototype</h2>
     <p class="soft">The devices of the system are simulated; no real device is touched. ${busy && "Starting …"}</p>
     <div class="cards" style=${{ margin: "10px 0 26px" }}>
@@ -54,5 +60,18 @@ function Card({ instance: i, run, again }) {
     </header>
     ${i.trouble ? html`<${Failure} text=${i.trouble} />` : html`<p class="soft mono">${i.path}</p>`}
     ${i.started_here && html`<button onClick=${() => run(() => remove(`/instances/${encodeURIComponent(i.name)}`)).then(again)}>Stop</button>`}
+  </div>`;
+}
+
+const TONES = { passed: "good", failed: "bad", error: "bad" };
+
+function TraceCard({ trace: t }) {
+  return html`<div class="card">
+    <header>
+      <a href=${`#/${encodeURIComponent(PREFIX + t.name)}`}><strong>${t.title || t.name}</strong></a>
+      <span class="chip ${TONES[t.verdict] ?? ""}">${t.growing ? "running or cut off" : t.verdict || "no description"}</span>
+    </header>
+    ${t.trouble ? html`<${Failure} text=${t.trouble} />` : html`<p class="soft">${t.system}${t.seed !== null && `, seed ${t.seed}`}</p>`}
+    <p class="soft mono path">${t.path}</p>
   </div>`;
 }

@@ -47,8 +47,8 @@ function Controller({ store, height }) {
   const lines = programs.length
     ? [
         ["PLC", "name"],
-        [plc ? `${plc.state}, scan ${number(plc.cycle_ms)} ms` : "no answer", plc?.state === "running" ? "good-text" : "bad-text"],
-        [plc ? `${plc.scans} scans, late p99 ${late === undefined ? "–" : (late / 1000).toFixed(2)} ms` : "", "soft"],
+        [plc ? (store.isTrace ? `scan every ${number(plc.cycle_ms)} ms` : `${plc.state}, scan ${number(plc.cycle_ms)} ms`) : "no answer", store.isTrace ? "soft" : plc?.state === "running" ? "good-text" : "bad-text"],
+        [plc && !store.isTrace ? `${plc.scans} scans, late p99 ${late === undefined ? "–" : (late / 1000).toFixed(2)} ms` : "", "soft"],
         ...programs.map((name) => [`${name}: ${shownState(store, name)}`, ""]),
       ]
     : [["no PLC program", "soft"]];
@@ -58,9 +58,9 @@ function Controller({ store, height }) {
       <rect class="box" x="1" y="14" width=${LEFT - 2} height=${height - 14} rx="10" />
       <text class="name" x="16" y="40">gateway</text>
       <text class=${gateway ? "soft" : "bad-text"} x="16" y="60">
-        ${gateway ? `${gateway.published} values published` : "no answer"}
+        ${gateway ? (store.isTrace ? "as recorded" : `${gateway.published} values published`) : "no answer"}
       </text>
-      <text class="soft" x="16" y="80">${gateway ? (gateway.writes.allowed ? `${gateway.writes.done} writes` : "read-only") : ""}</text>
+      <text class="soft" x="16" y="80">${gateway?.writes ? (gateway.writes.allowed ? `${gateway.writes.done} writes` : "read-only") : ""}</text>
       ${lines.map(([text, cls], n) => html`<text class=${cls} x="16" y=${116 + n * 20}>${text}</text>`)}
       ${served.map(
         ([name, front], n) =>
@@ -82,7 +82,7 @@ function BusLine({ store, bus, seen, columns, box }) {
   const rate = store.rates[bus.name];
   const errors = seen ? (seen.counters.timeouts ?? 0) + (seen.counters.crc_errors ?? 0) + (seen.counters.aborts ?? 0) : 0;
   const rows = Math.max(1, Math.ceil(bus.devices.length / columns));
-  const line = `line${store.isPrototype ? " emulated" : ""}${seen?.error ? " bad" : ""}`;
+  const line = `line${store.isPrototype || store.isTrace ? " emulated" : ""}${seen?.error ? " bad" : ""}`;
   const lineY = bus.y + 46;
   const last = Math.min(bus.devices.length, columns);
   return html`<g>
@@ -110,7 +110,7 @@ function BusLine({ store, bus, seen, columns, box }) {
 function Device({ store, name, device, x, y, width, line }) {
   const halves = width >= WIDE ? 2 : 1;
   const half = width / halves;
-  const seen = store.status?.gateway?.devices[name];
+  const seen = store.status?.gateway?.devices?.[name];
   const tags = Object.keys(device.tags).map((tag) => store.tags[`${name}.${tag}`]).filter(Boolean);
   const good = tags.filter((t) => t.quality === "good").length;
   const oldest = Math.max(0, ...tags.filter((t) => t.age_s !== null && t.quality === "good").map((t) => t.age_s));

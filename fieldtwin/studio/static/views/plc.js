@@ -14,28 +14,30 @@ export function Plc({ store }) {
   const plc = store.status?.plc;
   const [run, error] = useAction();
   const [open, setOpen] = useState(null); // the open dialog: [component, its properties]
-  const [transitions] = useFetched(() => get(`${store.path}/plc/transitions`), [JSON.stringify(store.status?.transitions ?? {})]);
+  const [transitions] = useFetched(() => get(`${store.path}/plc/transitions${store.isTrace ? `?at_ns=${store.settled ?? 0}` : ""}`), [store.settled, JSON.stringify(store.status?.transitions ?? {})]);
   if (!plc) return html`<p class="empty">The PLC does not answer.</p>`;
   const act = (path, body) => () => run(() => post(`${store.path}/plc/${path}`, body));
   const programs = Object.keys(store.about.system.programs);
   const [Opened, properties] = open ?? [];
+  const tags = html`<${Tags} store=${store} plc=${plc} onOpen=${(...dialog) => setOpen(dialog)} />`;
   return html`<h1 class="visually-hidden">PLC</h1>
     <${Failure} text=${error} />
     <div class="bar">
-      <span class="chip ${plc.state === "running" ? "good" : "warn"}">${plc.state}</span>
+      ${!store.isTrace && html`<span class="chip ${plc.state === "running" ? "good" : "warn"}">${plc.state}</span>`}
       ${store.mayOperate &&
       html`${plc.state === "paused"
         ? html`<button class="primary" onClick=${act("continue")}>Continue</button><button onClick=${act("step", { count: 1 })}>Step one scan</button>`
         : html`<button onClick=${act("pause")}>Pause</button>`}`}
       <span class="grow"></span>
-      <span class="soft">scan every ${number(plc.cycle_ms)} ms · ${plc.scans} scans · ${plc.missed_periods} missed periods · ${plc.overruns} overruns</span>
+      <span class="soft">scan every ${number(plc.cycle_ms)} ms${!store.isTrace && ` · ${plc.scans} scans · ${plc.missed_periods} missed periods · ${plc.overruns} overruns`}</span>
     </div>
     <div class="columns plc">
       <div class="stack">
         ${programs.map((name) => html`<${Program} key=${name} store=${store} name=${name} plc=${plc} changes=${transitions?.[name] ?? []} />`)}
-        <${Tags} store=${store} plc=${plc} onOpen=${(...dialog) => setOpen(dialog)} />
+        ${!store.isTrace && tags}
       </div>
       <div class="stack">
+        ${store.isTrace && tags}
         <${Durations} title="Duration of scans" spread=${plc.duration_us} buckets=${plc.duration_buckets} most=${plc.cycle_ms} of="the cycle time" />
         <${Durations} title="Lateness of scans" spread=${plc.lateness_us} buckets=${plc.lateness_buckets} most=${plc.late_ms} of="the permitted delay" />
       </div>
@@ -95,7 +97,7 @@ function Tags({ store, plc, onOpen }) {
             <td class="number">${word(force ? force.value : v.value)}${unit && html` <span class="soft">${unit}</span>`}</td>
             <td>${force ? html`<span class="chip warn">forced</span>` : v.quality && html`<${Quality} quality=${v.quality} why=${v.reason} />`}</td>
             <td>
-              <button class="quiet" onClick=${() => onOpen(Why, { tag: name, input: "quality" in v, word })}>Why?</button>
+              ${!store.isTrace && html`<button class="quiet" onClick=${() => onOpen(Why, { tag: name, input: "quality" in v, word })}>Why?</button>`}
               ${store.mayOperate &&
               (force
                 ? html`<button class="quiet" onClick=${() => onOpen(ReleaseDialog, { name, words })}>Release …</button>`

@@ -59,7 +59,7 @@ export function Transitions({ store, name, changes }) {
           .map(
             (c) => html`<tr key=${c.t_ns}>
               <td class="mono">${clock(c.t_ns - store.about.started_ns)}</td><td>${word(c.before)}</td><td><strong>${word(c.after)}</strong></td>
-              <td class="number">${c.scan}</td><td class="soft">${c.forced ? "a force" : c.place || "the program"}</td>
+              <td class="number">${c.scan ?? "–"}</td><td class="soft">${c.forced ? "a force" : c.place || "the program"}</td>
             </tr>`,
           )}
       </tbody>

@@ -25,7 +25,8 @@ export function Trends({ store, query }) {
     const fetchAll = async () => {
       try {
         const from = span ? Math.max(0, Math.round(store.now() - span * 1e9)) : 0;
-        const found = await Promise.all(chosen.map(async (tag) => [tag, await get(`${store.path}/tags/${tag}/history?from_ns=${from}`)]));
+        const to = store.isTrace ? `&to_ns=${span ? store.now() : store.about.end_ns}` : "";
+        const found = await Promise.all(chosen.map(async (tag) => [tag, await get(`${store.path}/tags/${tag}/history?from_ns=${from}${to}`)]));
         if (current) setData(Object.fromEntries(found));
         if (current) setError("");
       } catch (e) {
@@ -33,12 +34,12 @@ export function Trends({ store, query }) {
       }
     };
     fetchAll();
-    const timer = setInterval(fetchAll, AGAIN_MS);
+    const timer = store.isTrace ? 0 : setInterval(fetchAll, AGAIN_MS);
     return () => {
       current = false;
       clearInterval(timer);
     };
-  }, [chosen.join(), span, frozen]);
+  }, [chosen.join(), span, frozen, store.settled]);
   const byUnit = new Map();
   for (const tag of chosen) {
     const unit = store.tagOf(tag)?.unit ?? "";
@@ -57,18 +58,23 @@ export function Trends({ store, query }) {
       </div>
       <span class="grow"></span>
       ${SPANS.map(([title, s]) => html`<button aria-pressed=${s === span} class=${s === span ? "primary" : ""} onClick=${() => setSpan(s)}>${title}</button>`)}
-      <button onClick=${() => setFrozen(!frozen)} aria-pressed=${frozen}>${frozen ? "Continue" : "Hold"}</button>
+      ${!store.isTrace && html`<button onClick=${() => setFrozen(!frozen)} aria-pressed=${frozen}>${frozen ? "Continue" : "Hold"}</button>`}
       <button onClick=${() => save(store, data)}>CSV</button>
     </div>
     <${Failure} text=${error} />
     ${[...byUnit].map(([unit, tags]) => html`<${Chart} key=${tags.join()} store=${store} unit=${unit} tags=${tags} data=${data} />`)}
     ${!chosen.length && html`<p class="empty">Add a tag to see it over time.</p>`}
-    <p class="soft">Recorded since ${clock(Math.max(0, store.about.history_from_ns - store.about.started_ns))} after the start of the run. Gaps are times without a good value.</p>`;
+    <p class="soft">
+      ${store.isTrace ? "The vertical line is the present instant." : `Recorded since ${clock(Math.max(0, store.about.history_from_ns - store.about.started_ns))} after the start of the run.`}
+      ${" "}Gaps are times without a good value.
+    </p>`;
 }
 
 /** Join the series of several tags on one axis of time: each value holds until the next one, and bad values are null. */
 function joined(tags, data, started) {
-  const times = [...new Set(tags.flatMap((t) => (data[t]?.points ?? []).flatMap(([at]) => [at])))].sort((a, b) => a - b);
+  // A value ends 1 ns before a bad one begins; with one point only it would not be drawn.
+  const of = (t) => (data[t]?.points ?? []).flatMap(([at, , quality]) => (quality === "good" ? [at] : [at - 1, at]));
+  const times = [...new Set(tags.flatMap(of))].sort((a, b) => a - b);
   const now = Math.max(0, ...tags.map((t) => data[t]?.now_ns ?? 0));
   if (now) times.push(now);
   const columns = tags.map((tag) => {
@@ -97,6 +103,7 @@ function Chart({ store, unit, tags, data }) {
         width: place.current.clientWidth,
         height: 220,
         cursor: { sync: { key: "trends" }, drag: { x: true, y: false } },
+        hooks: store.isTrace ? { draw: [(u) => drawInstant(u, (store.now() - started) / 1e9, ink())] } : {},
         scales: { x: { time: false } },
         axes: [{ ...axis, values: (_, ticks) => ticks.map((t) => clock(t * 1e9).replace(/\.000$/, "")) }, { ...axis, label: unit, size: 70 }],
         series: [
@@ -130,6 +137,21 @@ function Chart({ store, unit, tags, data }) {
     <div ref=${place}></div>
     ${bad.map(([t, s]) => html`<p class="soft">${t}: ${s.quality}, ${reason(s.reason)}</p>`)}
   </section>`;
+}
+
+/** A vertical line at the instant of a trace. */
+function drawInstant(u, seconds, colour) {
+  const { min, max } = u.scales.x;
+  if (seconds < min || seconds > max) return;
+  const x = Math.round(u.valToPos(seconds, "x", true));
+  u.ctx.save();
+  u.ctx.strokeStyle = colour;
+  u.ctx.setLineDash([4, 3]);
+  u.ctx.beginPath();
+  u.ctx.moveTo(x, u.bbox.top);
+  u.ctx.lineTo(x, u.bbox.top + u.bbox.height);
+  u.ctx.stroke();
+  u.ctx.restore();
 }
 
 function save(store, data) {

@@ -1,0 +1,101 @@
+"""The frames of a trace, with the index that Studio has for captures."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left, insort
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.capture.decoding.exchange import DecodedExchange
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.results.trace import TraceEvent, TraceKind
+from fieldtwin.studio.live.frame_log import FrameLog, FrameRow
+from fieldtwin.studio.replay.trace_log import AfterCheck
+from fieldtwin.twin.site.system import System
+
+_decoder = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]])
+_FRAME, _STEP = (f'"{kind.value}"'.encode() for kind in (TraceKind.FRAME, TraceKind.STEP))
+HEAD_BYTES = 40
+"""The beginning of a line that holds time and kind."""
+
+
+class TraceFrames(FrameLog):
+    """The index of the frames of one trace. Times count from the start of the run. Raises `FileInvalid`."""
+
+    def __init__(self, path: Path, system: System) -> None:
+        super().__init__(path, system)
+        self._after_check = AfterCheck()
+        self._of_bus = {name: array("L") for name in system.buses}
+        self._of_device = {name: array("L") for name in system.devices}
+        self._failed_ns = {name: array("q") for name in system.buses}
+        """By bus: when exchanges failed, ordered by time."""
+
+    def count_of_bus(self, bus: str, t_ns: int) -> int:
+        """Return how many frames a bus had before an instant."""
+        return bisect_left(self._of_bus[bus], t_ns, key=self._times.__getitem__)
+
+    def failures_of_bus(self, bus: str, t_ns: int) -> int:
+        """Return how many exchanges of a bus had failed before an instant."""
+        return bisect_left(self._failed_ns[bus], t_ns)
+
+    def latest_of_device(self, device: str, t_ns: int) -> Iterator[FrameRow]:
+        """Yield the frames of a device before an instant, the latest first."""
+        numbers = self._of_device[device]
+        for position in range(bisect_left(numbers, t_ns, key=self._times.__getitem__) - 1, -1, -1):
+            yield self.row(numbers[position])
+
+    def _append(
+        self, event: TraceEvent, at: int, text: str, sent: bool, of: DecodedExchange | None, answered: DecodedExchange | None,
+        request: int | None,
+    ) -> None:  # fmt: skip
+        number = len(self)
+        super()._append(event, at, text, sent, of, answered, request)
+        self._of_bus[event.where].append(number)
+        if (device := self._names.names[self._devices[number]]) in self._of_device:
+            self._of_device[device].append(number)
+        if answered is not None and answered.problem and request is None:
+            self._failed(answered)
+
+    def _conclude(self, row: int, exchange: DecodedExchange, reply: int | None) -> None:
+        super()._conclude(row, exchange, reply)
+        if exchange.problem:
+            self._failed(exchange)
+
+    def _failed(self, exchange: DecodedExchange) -> None:
+        if exchange.bus in self._failed_ns:
+            insort(self._failed_ns[exchange.bus], exchange.end_ns)
+
+    def _event_of(self, line: bytes) -> TraceEvent | None:
+        if _FRAME not in line[:HEAD_BYTES] and _STEP not in line[:HEAD_BYTES]:
+            return None
+        t_ns, kind, where, data = _decoder.decode(line)
+        t_ns = self._after_check.time_of(t_ns, TraceKind(kind), data)
+        event = TraceEvent(t_ns, TraceKind(kind), where, data)
+        if event.kind is not TraceKind.FRAME or where not in self._system.buses:
+            return None
+        if self._times and t_ns < self._times[-1]:
+            raise ValueError("the time goes back")
+        self._item(event)  # a frame that cannot be read is not listed
+        return event
+
+    def _captured_of(self, line: bytes) -> Captured:
+        t_ns, kind, where, data = _decoder.decode(line)
+        event = TraceEvent(t_ns, TraceKind(kind), where, data)
+        direction = Direction.SENT if data.get("dir") == "sent" else Direction.RECEIVED
+        return Captured(t_ns, self._system.buses[where].endpoint, direction, self._item(event))
+
+    def _item(self, event: TraceEvent) -> bytes | CanFrame:
+        data = event.data
+        raw = bytes.fromhex(str(data["bytes"]))
+        if "id" not in data:
+            return raw
+        if not isinstance(data["id"], int):
+            raise ValueError("the id of a CAN frame is not a number")
+        return CanFrame(
+            data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")), error=bool(data.get("err"))
+        )

@@ -148,7 +148,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
     if (at !== null && at !== undefined)
       get(`${store.path}/frames?at_ns=${at}&count=${PAGE}&${search}`).then((a) => {
         setState((s) => ({ ...s, total: a.total }));
-        requestAnimationFrame(() => (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
+        requestAnimationFrame(() => view.current && (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
       });
   }, [at]);
   const scrolled = (e) => {

@@ -150,7 +150,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
         setState((s) => ({ ...s, total: a.total }));
         requestAnimationFrame(() => view.current && (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
       });
-  }, [at]);
+  }, [at, key]);
   const scrolled = (e) => {
     const { scrollTop, clientHeight, scrollHeight } = e.target;
     // While it follows, the page itself only scrolls down. A fast bus adds rows between that and this event, so the distance to the end proves nothing.

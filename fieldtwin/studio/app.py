@@ -17,12 +17,14 @@ from starlette.staticfiles import StaticFiles
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
 from fieldtwin.studio.access import Access, AccessMiddleware
-from fieldtwin.studio.api import faults, frames, instances, plc, scenarios, tags, traces
+from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces
 from fieldtwin.studio.api.common import INSTANCE
 from fieldtwin.studio.api.errors import on_error
 from fieldtwin.studio.api.openapi import describe
 from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api.stream import stream
+from fieldtwin.studio.commissioning.jobs import Jobs
+from fieldtwin.studio.commissioning.work_folder import WorkFolder
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.live.launching import Launcher
 from fieldtwin.studio.replay.traces import Traces
@@ -38,6 +40,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *faults.OPERATIONS,
     *scenarios.OPERATIONS,
     *traces.OPERATIONS,
+    *commissioning.OPERATIONS,
 )
 
 
@@ -54,9 +57,10 @@ def application(access: Access, clock: Clock, folder: Path, known: Traces | None
             Recordings() as recordings,
             ScenarioRunner() as runner,
             known or Traces(folder) as shown,
+            Jobs(WorkFolder(folder)) as jobs,
         ):
             app.state.launcher, app.state.gallery, app.state.folder = launcher, gallery, folder
-            app.state.recordings, app.state.runner = recordings, runner
+            app.state.recordings, app.state.runner, app.state.jobs = recordings, runner, jobs
             app.state.traces = shown
             yield
 
@@ -78,6 +82,7 @@ def _routes() -> list[BaseRoute]:
     return [
         *api,
         WebSocketRoute(f"{PREFIX}{INSTANCE}/stream", stream),
+        WebSocketRoute(f"{PREFIX}{commissioning.GUIDE}/stream", commissioning.stream_jobs),
         Route(f"{PREFIX}/openapi.json", _openapi),
         Mount("/static", StaticFiles(directory=STATIC)),
         Route("/", _page),

@@ -132,6 +132,19 @@ def test_no_view_has_an_error_or_a_violation_of_the_policy_in_the_console(page: 
     assert page.complaints() == []
 
 
+def test_every_step_of_the_commissioning_guide_is_drawn_and_shows_its_command_line(page: Window) -> None:
+    page.click(".brand")
+    page.click("a", "Open the guide")
+    page.type("#field-endpoint", "tcp://192.0.2.1:502")
+    for step in ("Listen", "Scan", "Identify", "Dump", "Check"):
+        page.click(".steps a", step)
+        page.sees("h1", step)
+        command = "check modbus" if step == "Check" else "line" if step == "Listen" else step.lower()
+        page.sees("#command-line", f"fieldtwin {command} tcp://192.0.2.1:502")
+    page.click(".steps a", "Edit")
+    page.sees("main", "No profile yet")
+
+
 def test_a_violation_of_the_policy_is_a_complaint(page: Window) -> None:
     page.script("const s = document.createElement('script'); s.textContent = 'window.bad = 1'; document.body.append(s)")
     assert any("Content Security Policy" in text for text in page.complaints())

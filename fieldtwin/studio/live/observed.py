@@ -47,7 +47,7 @@ def _tag(tag: Tag, writable: bool) -> dict[str, Any]:
     return {
         "unit": tag.unit,
         "type": tag.type,
-        "at": _place(tag),
+        "at": place(tag),
         "values": {str(number): name for number, name in tag.values},
         "range": list(tag.range) if tag.range else None,
         "writable": writable,
@@ -56,7 +56,8 @@ def _tag(tag: Tag, writable: bool) -> dict[str, Any]:
     }
 
 
-def _place(tag: Tag) -> str:
+def place(tag: Tag) -> str:
+    """Return where a tag is in its device: an object of CANopen, or registers."""
     if tag.object is not None:
         return f"{tag.object[0]:04X}h:{tag.object[1]:02X}"
     return str(tag.at) if tag.at is not None else ""

@@ -15,6 +15,7 @@ import { Trends } from "./views/trends.js";
 import { Faults } from "./views/faults.js";
 import { Scenario } from "./views/scenario.js";
 import { FailedChecks, Timeline } from "./views/timeline.js";
+import { Guide } from "./commissioning/guide.js";
 
 const VIEWS = {
   overview: { title: "Overview", view: Overview },
@@ -26,9 +27,12 @@ const VIEWS = {
   scenario: { title: "Scenario", view: Scenario, live: true },
 };
 
+const GUIDE = "commissioning"; // an instance of this name is opened at commissioning/overview
+
 function readAddress() {
   const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
   const [instance = "", view = "overview"] = path.split("/").map(decodeURIComponent);
+  if (path === GUIDE) return { guide: new URLSearchParams(query ?? "").get("step") ?? "" };
   return { instance, view: view in VIEWS ? view : "overview", query: new URLSearchParams(query ?? "") };
 }
 
@@ -40,8 +44,9 @@ function App() {
     return () => removeEventListener("hashchange", changed);
   }, []);
   useEffect(() => {
-    document.title = place.instance ? `${place.instance}: ${VIEWS[place.view].title} · Studio` : "fieldtwin Studio";
+    document.title = place.guide !== undefined ? "Commissioning · Studio" : place.instance ? `${place.instance}: ${VIEWS[place.view].title} · Studio` : "fieldtwin Studio";
   }, [place]);
+  if (place.guide !== undefined) return html`<${Guide} step=${place.guide}><${Theme} /><//>`;
   if (!place.instance) return html`<${Home} />`;
   return html`<${Instance} key=${place.instance} place=${place} />`;
 }

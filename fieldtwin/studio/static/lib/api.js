@@ -41,15 +41,18 @@ export const of = (instance) => `/instances/${encodeURIComponent(instance)}`;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 10_000;
 
-/** Receive updates until the returned function is called. A lost connection is opened again after a growing pause. */
-export function follow(instance, onUpdate, onConnected) {
+/** Receive the updates of an instance until the returned function is called. */
+export const follow = (instance, onUpdate, onConnected) => followPath(`${of(instance)}/stream`, onUpdate, onConnected);
+
+/** Receive messages until the returned function is called. A lost connection is opened again after a growing pause. */
+export function followPath(path, onUpdate, onConnected) {
   let socket = null;
   let closed = false;
   let pause = FIRST_PAUSE_MS;
   let timer = 0;
   const open = () => {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    socket = new WebSocket(`${scheme}://${location.host}${BASE}${of(instance)}/stream`);
+    socket = new WebSocket(`${scheme}://${location.host}${BASE}${path}`);
     socket.onopen = () => {
       pause = FIRST_PAUSE_MS;
       onConnected(true);

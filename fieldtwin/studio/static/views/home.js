@@ -1,6 +1,7 @@
 // All instances on this computer, and the systems whose prototype can be started.
 
 import { html, useEffect } from "../vendor/preact.js";
+import { address } from "../lib/address.js";
 import { get, post, remove } from "../lib/api.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { PREFIX } from "../lib/trace_store.js";
@@ -19,7 +20,7 @@ export function Home() {
   const start = (system) =>
     run(async () => {
       const { instance } = await post("/instances", { system });
-      location.hash = `#/${encodeURIComponent(instance)}`;
+      location.hash = address(instance);
     });
   const running = (instances ?? []).filter((i) => i.running);
   const finished = (instances ?? []).filter((i) => !i.running);
@@ -46,6 +47,10 @@ export function Home() {
           </div>`,
       )}
     </div>
+    <h2>Commission a device</h2>
+    <p class="soft" style=${{ marginBottom: "26px" }}>
+      The first hour with a real device, step by step: find it, read it, describe it, record it, emulate it. <a href="#/commissioning">Open the guide</a>
+    </p>
     ${finished.length > 0 &&
     html`<h2>Finished</h2>
       <p class="soft">${finished.map((i) => i.name).join(", ")}</p>`}
@@ -55,7 +60,7 @@ export function Home() {
 function Card({ instance: i, run, again }) {
   return html`<div class="card">
     <header>
-      <a href=${`#/${encodeURIComponent(i.name)}`}><strong>${i.name}</strong></a>
+      <a href=${address(i.name)}><strong>${i.name}</strong></a>
       <span class="chip ${i.mode === "plant" ? "warn" : "accent"}">${i.mode}${i.mode === "plant" ? (i.allow_writes ? ", writes allowed" : ", read-only") : ""}</span>
     </header>
     ${i.trouble ? html`<${Failure} text=${i.trouble} />` : html`<p class="soft mono">${i.path}</p>`}

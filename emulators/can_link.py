@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 MOST_WAITING = 10_000
-"""Frames that wait for their time; further ones are lost and counted."""
+"""How many delayed frames may wait; further frames are lost and counted."""
 NMT, NO_NODE = 0x000, 0
 
 
@@ -91,7 +91,7 @@ class CanLink:
             self.passed[way] += 1
 
     def _appear(self, active: Active) -> None:
-        """Schedule the frames that the fault itself sends, on behalf of the node that it aims at."""
+        """Schedule the frames that the fault itself sends, in the name of the node that is its target."""
         if not isinstance(active.fault, CanFault) or active.aim.unit is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)

@@ -2,7 +2,7 @@
 
 A prototype run compares the requests that its gateway sent with those that its emulators received. A third-party
 program that reads an emulator must not disturb this comparison, so its traffic is counted separately, by the address
-that it connects from. It must never know protocols.
+that it connects from. This module knows no protocol.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The paper's virtual context: a collection of recordings from which an emulator answers (SPEC row Emulator).
 
-Ordered, time-stamped, bounded, with duplicates kept (rulings 2 and 3): the oldest recording of a command is returned
-first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` uses it with one command for
-each register that a request reads.
+The collection is ordered, time-stamped and bounded, and keeps duplicates (rulings 2 and 3): the oldest recording of a command
+is returned first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` uses it with one
+command for each register that a request reads.
 """
 
 from __future__ import annotations
@@ -123,7 +123,8 @@ class VirtualContext:
         self._held = 0  # number of recordings from `add` that were not replayed yet; at most `max_entries`
         self._fixed = commands is not None
         self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
-        self._order: deque[_Series] = deque()  # one entry for each added recording that is not known to be gone
+        # one entry for each added recording, unless it is known that the recording was removed
+        self._order: deque[_Series] = deque()
         self._origin: Mapping[bytes, _Series] | None = None
         for command, recorded in recordings:
             self.add(command, recorded)

@@ -29,7 +29,7 @@ class DeviceFaults:
         self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
     ) -> None:
         self.put_in: list[Active] = []
-        """The faults that were put in, once for each wire, with the number of times each has struck."""
+        """The injected faults, once for each connection, with the number of times that each took effect."""
         self._specs = [parse_fault(dict(one), number=number) for number, one in enumerate(said, 1)]
         self._profile = profile
         self._seed = seed
@@ -73,7 +73,7 @@ class DeviceFaults:
 
 
 def check_device(spec: FaultSpec, profile: DeviceProfile | None, framings: Iterable[Framing] = ()) -> None:
-    """Raise `WrongAim` for a fault that a single device cannot have, or that changes nothing on any of its wires."""
+    """Raise `WrongAim` for a fault that a single device cannot have, or that changes nothing on any of its connections."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:

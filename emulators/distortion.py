@@ -24,8 +24,9 @@ class Distortions:
 
     _puts: dict[str, _Put] = field(default_factory=dict)
     counts_given: bool = False
-    """Whether a fault strikes when `gave` reports the value. Otherwise it strikes with each number that `apply` changes, which
-    suits a device that computes its values when they are read."""
+    """Whether a fault counts as having taken effect when `gave` reports the value. Otherwise it counts with each number that
+    `apply` changes, which suits a device that computes its values when they are read.
+    """
 
     def __bool__(self) -> bool:
         return bool(self._puts)

@@ -62,7 +62,7 @@ class ModbusWire:
 
 
 class EmulatorHost:
-    """Opens connections and serves emulated devices on them until `aclose`.
+    """The host of emulated devices: it opens connections and serves the devices on them until `aclose`.
 
     The connections are made by `ports`. Serving begins with each call of a `serve` method; `run` waits, and raises the failure of
     a server.

@@ -60,7 +60,7 @@ class EmulatedConnection(TCPConnection):
         self.written_bytes = 0
         self.read_bytes = 0
         self.dropped_write_bytes = 0
-        """Bytes from the near side that were lost: there was no carrier, or it broke while sending them."""
+        """Bytes from the near side that were lost, because there was no carrier or it was lost while they were sent."""
         self.dropped_read_bytes = 0
         """Bytes from the far side that were lost because the near side did not accept them."""
 
@@ -79,7 +79,7 @@ class _Plug(ABC):
     """A side of the link: how it is prepared once and connected repeatedly."""
 
     stays: bool
-    """Whether it stays open across sessions: a serial port does not disappear when the carrier does."""
+    """Whether it stays open between sessions: a serial port remains when the TCP connection (the carrier) is lost."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -378,8 +378,7 @@ async def run_link(
     on_ready: Callable[[EmulatedLink], None] | None = None,
     faults: WireFaults | None = None,
 ) -> None:
-    """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` strike the
-    passing bytes.
+    """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` change the forwarded bytes.
 
     Raises `UsageError` for endpoints that cannot be linked, `EndpointBusy` if the port to listen on is taken. A far
     side that cannot be reached yet is not an error: the link retries.

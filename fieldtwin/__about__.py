@@ -1,3 +1,3 @@
-"""The version, and nothing else: read without importing anything."""
+"""The version of fieldtwin. Other tools read this file without importing the package."""
 
 __version__ = "0.1.0"

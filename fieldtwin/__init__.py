@@ -1,6 +1,6 @@
 """fieldtwin: run a plant's own control software without the plant.
 
-The public Python API, loaded when it is first used: importing this package costs nothing.
+Each name of the public Python API is loaded when it is first used, so that importing this package takes no time.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 import sys
 
-if sys.hexversion < 0x030B0000:  # no installer has checked the Python version of a checkout
+if sys.hexversion < 0x030B0000:  # a checkout runs without an installer that would check the Python version
     sys.exit("fieldtwin needs Python 3.11 or newer; this is " + sys.version.split()[0])
 
 from fieldtwin.cli.main import main

@@ -16,13 +16,16 @@ from fieldtwin.gateway.core.escaping import escape_controls
 
 class _Console(Console):
     def on_broken_pipe(self) -> NoReturn:
-        """rich ends the program with exit code 1. That is not an error for `| head`: see `LazyGroup.invoke`."""
+        """Do nothing, because rich would end the program with exit code 1. For `| head` a broken pipe is not an error: see
+        `LazyGroup.invoke`.
+        """
         self.quiet = True
         raise BrokenPipeError
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """As rich does, but control characters in a text are shown and never sent: a name in a stranger's file could otherwise
-        clear the screen or retitle the terminal."""
+        """Render as rich does, but show control characters in a text instead of sending them. Otherwise a name in an untrusted
+        file could clear the screen or change the title of the terminal.
+        """
         for segment in super().render(renderable, options):
             text = segment.text if segment.control is not None else escape_controls(segment.text)
             yield segment if text is segment.text else Segment(text, segment.style)

@@ -87,7 +87,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFi
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Requirements are properties of the test: JUnit XML has them, and xdist carries them."""
+    """Add the requirements as properties of the test, because JUnit XML contains properties and xdist transfers them."""
     for marker in item.iter_markers("requirement"):
         for id in marker.args:
             note = ("requirement", str(id))
@@ -116,7 +116,9 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
-    """Add a section to the text of a failure itself, which JUnit files have, too; where pytest made no such text, after it."""
+    """Add a section to the text of a failure, which JUnit files also contain. If pytest has made no such text, add the section
+    after it.
+    """
     add = getattr(report.longrepr, "addsection", None)
     if add is None:  # --tb=native, or a plugin with a text of its own
         report.sections.append((title, content))
@@ -128,7 +130,7 @@ def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
 
 
 def _runner(config: pytest.Config) -> WorkerProcess:
-    """The other process, started when it is first needed."""
+    """The worker process, which is started when a test first needs it."""
     if _RUNNER not in config.stash:
         from fieldtwin.testing.runner import WorkerProcess, command_of
 
@@ -150,7 +152,7 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 def _or_fail(make: Callable[[], Any]) -> Any:
-    """What `make` makes; where it cannot, the reason in one line."""
+    """Return the result of `make`. If it fails, fail the test with the reason in one line."""
     from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
 
     try:
@@ -159,7 +161,7 @@ def _or_fail(make: Callable[[], Any]) -> Any:
         why = str(e)
     pytest.fail(
         f"fieldtwin: {why}", pytrace=False
-    )  # outside of the handler, so that pytest shows no "during handling of"
+    )  # raised outside of the exception handler, so that pytest does not show "during handling of"
 
 
 @pytest.fixture

@@ -249,7 +249,7 @@ class CanopenNode:
         return self.tick(now_ns)
 
     def on_second_node(self, tell: Callable[[int], None]) -> None:
-        """Call `tell` with the identifier when another node sends on one of this node's, once until a reset."""
+        """Call `tell` with the identifier when another node sends on an identifier of this node; once until the next reset."""
         self._faults.tell = tell
 
     def overrun(self, now_ns: int) -> list[CanFrame]:

@@ -115,14 +115,14 @@ class _Shell:
         self._timer_ns = None
         try:
             self._do_at_once(self._node.tick(self._clock.monotonic_ns()))
-        except Exception as e:  # not lost: `tick` raises it, and so ends the node
+        except Exception as e:  # the error is not lost: `tick` raises it, which ends the node
             self._failed = e
             self._woken.set()
 
     # -- in the callback ------------------------------------------------------------------------------------------------
 
     def _may_do_at_once(self) -> bool:
-        """Return whether the lock is free and no frames are left over."""
+        """Return whether the lock is free and no frames of an earlier event are unsent."""
         return self._send_at_once is not None and not (self._left or self._overdue or self._turn.locked())
 
     def _do_at_once(self, frames: list[CanFrame]) -> None:

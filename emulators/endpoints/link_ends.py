@@ -123,7 +123,8 @@ class _Wire(asyncio.BufferedProtocol):
         return not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = transport  # type: ignore[assignment]  # a stream server and client make no other kind
+        # asyncio's stream servers and clients create no other kind of transport
+        self.transport = transport  # type: ignore[assignment]
         self.transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))
         if self._door is not None:

@@ -114,7 +114,7 @@ class ServedBus:
 
 
 class JoinedBus:
-    """A bus that others serve: a kernel interface, or the software bus of another process. Bit rate 0: any."""
+    """A bus that this process does not serve: a kernel interface, or the software bus of another process. Bit rate 0: any."""
 
     def __init__(self, endpoint: Endpoint, bitrate: int) -> None:
         self.bound = endpoint

@@ -161,7 +161,8 @@ class PtyEnd(ByteConnection):
         self._loop.add_reader(self._master, self._on_readable)
 
     def _on_readable(self) -> None:
-        now_ns = self._now_ns()  # taken first: processing in this process takes no time on the line
+        # the time is read first, because processing in this program must take no time on the line
+        now_ns = self._now_ns()
         try:
             data = os.read(self._master, READ_SIZE)
         except BlockingIOError:
@@ -232,7 +233,8 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()
-        remove_port(self.link, self.device)  # before the port is closed: another program may get its number at once
+        # the link must go before the port is closed, because another program may get its number immediately
+        remove_port(self.link, self.device)
         for descriptor in (self._master, self._spare, self._marker):
             os.close(descriptor)
         self._master = self._spare = self._marker = -1

@@ -61,7 +61,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
         self._answer = answer
         if pending := self.read_pending():
             self._give(pending)
-        await self.read()  # no data arrive any more, so the read ends only with the loss
+        await self.read()  # no data reach this read any more, so it ends only when the connection is lost
 
     def _give(self, data: bytes) -> None:
         assert self._answer is not None

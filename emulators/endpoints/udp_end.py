@@ -101,9 +101,8 @@ class UdpEnd(asyncio.DatagramProtocol):
     # -- called by asyncio ----------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(
-            asyncio.DatagramTransport, transport
-        )  # asyncio's own class does not declare that it is one
+        # asyncio's transport class does not declare that it is a datagram transport
+        self._transport = cast(asyncio.DatagramTransport, transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         if len(self._pending) >= self._max_pending:
@@ -119,7 +118,7 @@ class UdpEnd(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        self.dropped += 1  # the port of the reply's receiver is closed by now, which is the sender's problem
+        self.dropped += 1  # the port to which the reply went is closed, which does not concern this end
 
     def connection_lost(self, exc: Exception | None) -> None:
         reason = getattr(exc, "strerror", None) or "closed"

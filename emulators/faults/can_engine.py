@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 
 def struck(faults: WireFaults, way: FrameDirection, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
-    """Return the frames that replace `frame`, or None if no fault strikes it.
+    """Return the frames that replace `frame`, or None if no fault changes it.
 
     Several faults are applied one after the other.
     """

@@ -26,7 +26,7 @@ class CanPiece:
 
 
 class CanFault(Fault):
-    """A fault that strikes frames which a node sends (REPLY) or receives (REQUEST). `node` is the node ID."""
+    """A fault that changes frames which a node sends (REPLY) or receives (REQUEST). `node` is the node ID."""
 
     kind = InjectionPoint.CAN
     ways = frozenset((FrameDirection.REPLY,))

@@ -1,4 +1,4 @@
-"""Whether a fault can change anything at its target.
+"""Check whether a fault can change anything at its target.
 
 A fault that cannot is refused when its file is loaded, because it would test nothing.
 """

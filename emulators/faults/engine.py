@@ -18,12 +18,12 @@ class WireFaults:
         self.framing = framing
         self.active: dict[str, Active] = {}
         self.listeners: list[Callable[[Active], None]] = []
-        """Called with each fault that is put in, in the order of their subscription."""
+        """Called with each fault that is injected. The functions are called in the order in which they subscribed."""
         self.watch: Callable[[object, FrameDirection, bytes], None] | None = None
-        """Called with the bytes on the wire: the end that carries them, their direction, the bytes.
+        """Called with the bytes that the line or connection carries: the end, their direction, the bytes.
 
-        A reply that a fault holds back is not on the wire; a request is on the wire even if the emulator never receives
-        it. The callback may not raise.
+        A reply that a fault holds back is not carried; a request is carried even if a fault keeps it from the emulator. The
+        callback may not raise.
         """
 
     def put_in(self, active: Active) -> None:
@@ -42,7 +42,9 @@ class WireFaults:
         return [active for active in self.active.values() if active.from_ns <= now_ns]
 
     def refuses(self, now_ns: int) -> bool:
-        """Return whether a connection that is requested now is refused. Each fault that refuses it counts as having struck."""
+        """Return whether a connection that is requested now is refused. Each fault that refuses it counts as having taken
+        effect.
+        """
         refusing = [
             a for a in self.active.values() if isinstance(a.fault, WireFault) and a.fault.refuses and in_time(a, now_ns)
         ]
@@ -76,7 +78,7 @@ def in_time(active: Active, now_ns: int) -> bool:
 
 
 def _struck(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, active: Active) -> FaultEffect:
-    """Apply a fault, and count it as struck if it changed anything."""
+    """Apply a fault, and count that it took effect if it changed anything."""
     after = _joined(before, frame, fault, active)
     active.struck += after != (before or passed(frame.data))
     return after

@@ -1,4 +1,5 @@
-"""The classes of faults: a name, an aim, parameters, and the effect on a frame.
+"""The classes of faults. A fault has a name, an aim (the frames or values that it changes), parameters, and an effect on each
+of these frames.
 
 Pure: a fault receives a frame and its own random generator, and returns the effect; the engine carries it out. A fault
 never opens connections, waits or reads a clock.
@@ -64,7 +65,7 @@ LOST = FaultEffect()
 
 
 class Aim(BaseModel):
-    """The frames or values that a fault strikes. A key that is not given matches everything."""
+    """The frames or values that a fault changes. A key that is not given matches everything."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -121,7 +122,7 @@ class Fault(ABC):
     kind: ClassVar[InjectionPoint]
     form: ClassVar[type[Parameters]] = Nothing
     ways: ClassVar[frozenset[FrameDirection]] = frozenset((FrameDirection.REPLY,))
-    """The directions in which it strikes if its aim does not give one."""
+    """The directions of the frames that the fault changes if its aim does not name a direction."""
     codes: ClassVar[Mapping[int, str]] = {}
     """The meanings that the standard gives to its parameter `code`."""
 
@@ -130,7 +131,7 @@ class Fault(ABC):
 
 
 class WireFault(Fault):
-    """A fault that strikes frames on serial lines and sockets."""
+    """A fault that changes frames on serial lines and sockets."""
 
     kind = InjectionPoint.BYTES
 
@@ -163,10 +164,10 @@ class ValueFault(Fault):
     ways: ClassVar[frozenset[FrameDirection]] = frozenset()
 
     def learn(self, tags: Iterable[Tag]) -> None:
-        """Record the tags of the device into which the fault is injected, before it strikes."""
+        """Record the tags of the device into which the fault is injected, before the fault changes any value."""
 
     def on(self, tag: str) -> ValueFault | None:
-        """Return the instance of the fault that strikes `tag`, or None if the fault does not change that tag."""
+        """Return the instance of the fault that changes `tag`, or None if the fault does not change that tag."""
         return self
 
     @abstractmethod
@@ -176,7 +177,7 @@ class ValueFault(Fault):
 
 @dataclass
 class Active:
-    """An injected fault: its aim, its start and end, and the number of times that it has struck."""
+    """An injected fault: its aim, its start and end, and the number of times that it took effect (`struck`)."""
 
     id: str
     fault: Fault
@@ -194,7 +195,7 @@ class Active:
     """Function codes of the table that contains the addresses; empty: all."""
 
     def strikes(self, frame: FaultFrame, now_ns: int) -> bool:
-        """Return whether the fault strikes this frame, and count frames that match its aim.
+        """Return whether the fault is to change this frame, and count frames that match its aim.
 
         If the fault then changes the frame, the caller increases `struck`. A fault without an effect has tested nothing.
         """

@@ -35,9 +35,11 @@ class Framing(Enum):
     ASCII = "ascii"
     MBAP = "mbap"
     THREAD = "thread"
-    """A digital thread over TCP: each datagram follows its length in two bytes."""
+    """The datagrams of a digital thread over TCP. Two bytes before each datagram hold its length."""
     MQTT = "mqtt"
-    """MQTT packets. Only a PUBLISH with QoS 0 can be struck: all other packets belong to the session with the broker."""
+    """MQTT packets. A fault changes only a PUBLISH with QoS 0, because all other packets belong to the session with the
+    broker.
+    """
     RAW = "raw"
 
     @property

@@ -124,7 +124,7 @@ def parse_fault(
 
 
 Check = Callable[[FaultSpec], object]
-"""Raises `WrongAim` for a fault that cannot be put in at this place."""
+"""Raises `WrongAim` for a fault that cannot be injected at this target."""
 
 
 def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any], ...]:

@@ -130,7 +130,8 @@ class LineServer(ABC):
         if len(self.units) > 1:
             for (
                 unit
-            ) in self.units.values():  # the other units hear the reply too; the sender's receiver is off meanwhile
+                # the other units also receive the reply, while the receiver of the sending unit is switched off
+            ) in self.units.values():
                 if unit is not addressed:
                     unit.heard(messages=1)
         return ServedFrame(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

@@ -22,7 +22,7 @@ BESIDE = 32
 """Bytes that an exchange needs in addition to its reply."""
 
 _WORDS: dict[bytes, RECORDING] = {}
-"""One object for each content of a cell that was ever requested: at most 65,536."""
+"""One shared object for each content of a cell that was ever requested: at most 65,536."""
 
 
 class OutcomeColumn:

@@ -1,4 +1,5 @@
-"""Recorded counters: values in several registers, whose registers always come from one moment, and which never run backwards.
+"""Recorded counters: values in several registers. The registers of a counter are always read from the same moment, and a
+counter never decreases.
 
 Registers of a counter that come from different moments form a number that never existed. A counter's registers therefore advance
 together: a read gets the present value, and the counter advances to the next value only when a read contains a register that was

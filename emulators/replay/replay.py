@@ -165,7 +165,7 @@ class ExchangeReplay:
         return {function: max(lengths) for function, lengths in found.items() if len(lengths) == 1}
 
     def knows(self, unit_id: int, table: Table, address: int) -> bool:
-        """Return whether a cell was recorded, written or put."""
+        """Return whether a cell was recorded, written by a client, or set with `put`."""
         return self._knows(unit_id, self._units[unit_id], (table, address))
 
     def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
@@ -193,7 +193,8 @@ class ExchangeReplay:
             if request is None or requests.is_exception(pdu, reply):
                 return ReplayedReply(reply, outcome.latency_s)
             if request.values is None and requests.parse_values(request, reply) is None:
-                return ReplayedReply(reply, outcome.latency_s)  # the device's own mistake, replayed as recorded
+                # the device itself made this mistake, which is replayed as recorded
+                return ReplayedReply(reply, outcome.latency_s)
             if request.values is not None:
                 if requests.is_written(request, pdu, reply):
                     unit.write(request, request.values)

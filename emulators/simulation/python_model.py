@@ -10,7 +10,7 @@
             self.level += (inputs["inflow"] - 0.1 * self.level) * dt_s
             return {"level": self.level}
 
-It is the user's code and runs with the emulator's rights: read a third party's model before you run it.
+The class is the user's code and runs with the emulator's rights: read a model of a third party before you run it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PythonModel:
             )
         try:
             self._model: Model = made(dict(start))
-        except Exception as e:  # an error in the user's code, reported as such
+        except Exception as e:  # an error in the user's code is reported with its file and line
             raise FileInvalid(f"{name}(start) failed: {type(e).__name__}: {e}", path=str(path)) from e
 
     def step(self, t_s: float, dt_s: float, inputs: Mapping[str, float]) -> dict[str, float]:

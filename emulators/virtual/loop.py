@@ -274,7 +274,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
                     self._stopping = False
                     with suppress(
                         KeyboardInterrupt, SystemExit
-                    ):  # what ended the run also ends each task that it reaches
+                    ):  # the exception that ended the run also ends each task that receives it
                         self._run_instant()
         finally:
             self._stopping = self._stopped = self._running = False

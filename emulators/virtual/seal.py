@@ -1,4 +1,4 @@
-"""Prevent a virtual run from using clocks, sleep, sockets, threads and processes of the outside.
+"""Prevent a virtual run from using the computer's clocks, sleep, sockets, threads and processes.
 
 The loop itself refuses asyncio's operations; this module covers the operations that bypass the loop. Clocks are
 attributes of ``time`` and ``datetime``, which are replaced, also in modules that imported them by name

@@ -1,1 +1,1 @@
-"""Models of what carries frames: a serial line, a CAN bus with arbitration and errors, an acoustic channel."""
+"""Models of the media that carry frames: a serial line, a CAN bus with arbitration and errors, an acoustic channel."""

@@ -22,9 +22,9 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 QUEUE = 4
-"""Packets that wait in a modem to be sent; it accepts no more."""
+"""How many packets may wait in a modem to be sent; the modem accepts no more."""
 HEARD = 64
-"""Packets that were received and not yet taken; the oldest are dropped and counted."""
+"""How many received packets may wait until they are taken; the oldest are dropped and counted."""
 PAUSE_NS = 200 * NS_PER_MS
 """The longest additional random wait of a modem that could not transmit."""
 
@@ -90,7 +90,7 @@ class _Modem:
         """Waiting packets, each with the earliest time of its transmission."""
         self.heard: deque[bytes] = deque()
         self.hearing: list[Reception] = []
-        """Packets that arrive here now or are on their way."""
+        """Packets that are arriving at this modem or will arrive later."""
         self.speaks_until_ns = 0
         self.spoke_from_ns = 0
         self.due_ns: int | None = None

@@ -30,7 +30,8 @@ MAX_NOTICES = 4096
 
 
 class Attempts:
-    """The nodes of one bus, and `attempt`. The results are collected in `done`, `notices` and `faults`, each in its order.
+    """The nodes of one bus, and the method `attempt`, which carries out one attempt. The results are collected in `done`,
+    `notices` and `faults`, each in its order.
 
     `instant` and `monitored` are those of `CanBus`. `waiting` are the nodes on the bus that have something to send,
     `off` those in bus-off; `free_ns` is when the interframe space of the last attempt ends.
@@ -158,7 +159,7 @@ class Attempts:
             self._fail(verdict, frame, start, by_age, self._receivers(start, by_age))
             return None
         at_ns = start.start_ns + self.frame_ns(frame, outcome.lost_bit + 1)
-        for number in outcome.losers:  # error-passive: they give way without destroying the frame
+        for number in outcome.losers:  # these nodes are error-passive: they stop sending without destroying the frame
             node = self.nodes[number]
             self.change(number, at_ns, node.faults.send_failed)
             node.errors += 1

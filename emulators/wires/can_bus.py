@@ -5,15 +5,15 @@ tasks or clocks, so the same model runs behind a TCP server and in virtual time.
 
 The model covers: bitwise arbitration among the heads of the nodes' transmit queues, the exact stuffed length of each
 frame, the interframe space, broadcast to every other node at the end of the frame; error frames and retransmission,
-each node's error counters, error-passive with its suspended transmission, bus-off and recovery. A frame on the wire is
+each node's error counters, error-passive with its suspended transmission, bus-off and recovery. A frame that is being sent is
 never interrupted by another frame. The outcome depends only on the times of submission, never on how often `advance` is
-called: an attempt is evaluated after the regular end of its frame, and only frames that were queued at its start take
-part in its arbitration.
+called: an attempt is evaluated after the regular end of its frame, and only frames that were queued at its start take part in
+its arbitration.
 
-Two nodes that send identical frames at the same start overlap bit by bit: there is one frame on the wire, and both have
-sent it (CiA 305 relies on that). The same arbitration field with different content is a bit error at the first bit that
-differs: an error frame and TEC + 8 for both, repeatedly, until the node that sends the recessive bit is error-passive
-and cannot object any more.
+Two nodes that send identical frames at the same start overlap bit by bit: the bus carries one frame, and both nodes have sent
+it (CiA 305 relies on that). The same arbitration field with different content is a bit error at the first bit that differs: an
+error frame and TEC + 8 for both, repeatedly, until the node that sends the recessive bit is error-passive and cannot object
+any more.
 
 A frame without an acknowledgement is retransmitted without end; its sender becomes error-passive and never bus-off. By
 default the bus itself acknowledges every frame (`monitored`), as on a test bench where an analyser always listens.
@@ -177,7 +177,7 @@ class CanBus:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> list[Delivery]:
-        """Return the frames that ended up to `now_ns`, in the order of the wire; each is returned once."""
+        """Return the frames that ended up to `now_ns`, in the order in which they were sent; each is returned once."""
         self._run(now_ns)
         done, self._wire.done = self._wire.done, []
         return done

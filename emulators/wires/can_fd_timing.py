@@ -1,4 +1,4 @@
-"""The duration of a CAN FD frame on the wire, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
+"""The duration of a CAN FD frame on the bus, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
 
 Pure arithmetic on one frame, like `can_timing` for classic frames. CAN FD differs in these points: a frame has up to 64 bytes;
 the checksum follows a count of the stuff bits, and has stuff bits at fixed positions instead of after five equal bits; with the

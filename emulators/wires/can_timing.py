@@ -1,4 +1,4 @@
-"""The duration of a CAN frame on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has the rules of
+"""The duration of a CAN frame on the bus, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has the rules of
 CAN FD.
 
 Pure arithmetic on one frame: this module knows no bus, no time and no other frame.

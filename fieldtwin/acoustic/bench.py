@@ -1,7 +1,7 @@
 """A scenario's bench for several running systems and the acoustic channel between them. Names are ``SYSTEM.DEVICE.TAG``.
 
 Each system has its own bench, which does not know the other systems; this bench passes each query on by name and merges
-their events into one trace. It starts and ends nothing: its creator does that.
+their events into one trace. The code that creates this bench also starts and stops the systems.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class MemberTrace(Trace):
 
 @dataclass
 class Part:
-    """One system of the network: its bench, and where that notes."""
+    """One system of the network: its bench, and the trace in which that bench records its events."""
 
     bench: Bench
     trace: MemberTrace
 
 
 class NetworkBench:
-    """A `fieldtwin.scenarios.bench.WorkerBench`.
+    """A `fieldtwin.scenarios.bench.Bench`.
 
     `parts` by the names of the network's members; `topside` sends from the topside modem.
     """
@@ -95,7 +95,7 @@ class NetworkBench:
         return next(iter(self.parts.values())).bench.now_s()
 
     async def sleep_until_s(self, t_s: float) -> None:
-        for part in self.parts.values():  # the first call waits; the others return at once
+        for part in self.parts.values():  # the first call waits, and the other calls return immediately
             await part.bench.sleep_until_s(t_s - part.trace.offset_ns / NS_PER_S)
 
     def names(self) -> list[str]:

@@ -1,6 +1,6 @@
 """The faults of a network's acoustic channel: packets that are sent and do not arrive.
 
-Aimed by the network file, and written like those of a bus.
+They name modems of the network file as their target, and are written like the faults of a bus.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class AcousticFaults:
         self._numbers = {name: number for number, name in enumerate(places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
-        """Return whether a fault strikes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
+        """Return whether a fault removes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
         return self._wire.decide(FaultFrame(FrameDirection.REPLY, Framing.RAW, payload, listener), t_ns) is not None
 
     def inject(self, said: Mapping[str, Any]) -> str:
@@ -77,7 +77,7 @@ class AcousticFaults:
         self._wire.take_away(id)
 
     def active(self) -> list[ActiveFaultStatus]:
-        """Return the active faults, and how often each struck."""
+        """Return the active faults, and how often each took effect."""
         return [
             ActiveFaultStatus(id=id, name=active.fault.name, bus=WATER, device=active.aim.device, struck=active.struck)
             for id, active in self._wire.active.items()

@@ -62,7 +62,7 @@ async def virtual(
 ) -> AsyncIterator[VirtualSystems]:
     from fieldtwin.acoustic.virtual import VirtualNetwork
 
-    assert not probes  # the scenario language refuses them for a group
+    assert not probes  # the scenario language refuses these keys for a group of systems
     async with VirtualNetwork(_network(group), loop, folder, trace, seed=seed, commands=commands or ()) as running:
         yield running
 

@@ -47,7 +47,7 @@ class AcousticPath:
 
 @dataclass(frozen=True, slots=True)
 class Map:
-    """A network's places, the ways between them, and a description of the acoustic channel."""
+    """The positions of a network's systems, the acoustic paths between them, and a description of the acoustic channel."""
 
     network: str
     water: str
@@ -77,7 +77,7 @@ def network_map(network: Network) -> Map:
 
 
 def text(drawn: Map) -> str:
-    """Return a line for each place: what is there, and which members it hears."""
+    """Return a line for each position: the member that is there, and the members that it hears."""
     names = max(len(place.name) for place in drawn.places)
     systems = max(len(place.system) for place in drawn.places)
     lines = [f"{drawn.network} (network of prototypes)", f"water: {drawn.water}"]

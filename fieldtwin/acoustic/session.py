@@ -130,7 +130,7 @@ class NetworkSession(AsyncResource):
         return (self.clock.monotonic_ns() - self.started_ns) / 1e9
 
     def results(self) -> dict[str, Any]:
-        """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
+        """Return the counters of the acoustic channel, its faults, and the commands and responses of the topside modem."""
         ship = self.topside.describe() if self.topside is not None else None
         return {"water": self.counters(), "faults": msgspec.to_builtins(self.faults.history.struck()), "ship": ship}
 

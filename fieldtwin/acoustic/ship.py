@@ -1,4 +1,4 @@
-"""The topside modem of a network, on its own socket: it sends what the topside controller commands."""
+"""The topside modem of a network, on its own socket: it sends the commands of the topside controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict on a run of a network: those on its systems, and the events in the acoustic channel."""
+"""The verdict on a run of a network. It consists of the verdicts on its systems and the events in the acoustic channel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def summarise_network(
     """Return plain data for `--json` and for printing. `ok` if all systems are, and nothing else failed.
 
     `systems`: each system's own summary. `channel`: ``water`` (the counters of each modem), ``faults`` (of the channel)
-    and ``ship`` (what the topside modem sent and heard; None without one).
+    and ``ship`` (the commands and responses of the topside modem; None without one).
     """
     return {
         "fieldtwin": __version__,

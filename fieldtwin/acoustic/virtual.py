@@ -86,7 +86,7 @@ class VirtualNetwork(AsyncResource):
         return self.bench.topside
 
     def results(self) -> dict[str, Any]:
-        """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
+        """Return the counters of the acoustic channel, its faults, and the commands and responses of the topside modem."""
         return {
             "water": {name: counters.as_dict() for name, counters in self.medium.counters.items()},
             "faults": msgspec.to_builtins(self.faults.history.struck()),

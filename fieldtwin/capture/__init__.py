@@ -1,1 +1,1 @@
-"""Recorded traffic: the file formats it is kept in, its decoding, and recordings of devices."""
+"""Recorded traffic: its file formats, its decoding, and recordings of devices."""

@@ -1,1 +1,1 @@
-"""The command line, one module for each command: it parses and prints, and other packages do the work."""
+"""The command line, one module for each command: a command parses its options and prints results; other packages do the work."""

@@ -1,4 +1,5 @@
-"""Broken pipes: the reader of our output has gone, as in `fieldtwin ... | head`, or a service's log was restarted.
+"""Broken pipes: the program that read our output has ended, as in `fieldtwin ... | head`, or because the log of a service was
+restarted.
 
 A run continues when the reader of stderr goes away, and keeps its exit code. The loss of stdout's reader does not change a
 verdict either. Only a command that lists something ends when its reader goes away.

@@ -68,7 +68,7 @@ class FaultChoice:
                     "--fault-every, --fault-kinds and --fault-aims choose random faults", expected="--faults random"
                 )
             return None
-        # imported here, because it loads emulators, which a plant does not need
+        # this module is imported here, because it loads emulators, which a plant does not need
         from fieldtwin.run.virtual.fault_schedule import MEAN_S, RandomFaults
 
         every_s = MEAN_S if self.fault_every is None else self.fault_every

@@ -235,7 +235,7 @@ def main() -> None:
         click.echo(f"fieldtwin: {e.filename or 'a file or the output'}: {e.strerror}", err=True)
         _drop_what_is_unsaid()
         sys.exit(FileInvalid.exit_code)
-    except Exception as e:  # the outermost handler: any other exception is a bug of fieldtwin
+    except Exception as e:  # the outermost handler: an exception that arrives here is a bug of fieldtwin
         _bug(e)
 
 

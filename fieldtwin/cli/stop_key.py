@@ -45,7 +45,7 @@ class StopKey:
 
         try:
             signal.signal(signal.SIGINT, interrupted)
-        except ValueError:  # not in the main thread, which receives Ctrl-C
+        except ValueError:  # this code does not run in the main thread, which receives Ctrl-C
             yield
             return
         try:

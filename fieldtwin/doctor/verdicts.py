@@ -31,7 +31,7 @@ class DoctorCheck:
 
 @dataclass(frozen=True)
 class ClockState:
-    """The kernel's clock: whether it is synchronised, and its own estimate of its error."""
+    """The kernel's clock: whether it is synchronised, and the kernel's estimate of its error."""
 
     synchronised: bool
     error_s: float

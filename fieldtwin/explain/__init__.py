@@ -1,1 +1,1 @@
-"""Explanations of what fieldtwin and the protocols print as an ID, a code or a word, with the clause and what to do."""
+"""Explanations of the IDs, codes and words that fieldtwin prints: their meaning, the clause of the standard, and what to do."""

@@ -1,4 +1,4 @@
-"""An explanation: what an ID, a code or a word means, where it is defined, and what to do about it."""
+"""An explanation of an ID, a code or a word: its meaning, its source, and what to do about it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Explanation:
     """An entry of `fieldtwin explain`.
 
     `id` is what is printed elsewhere, such as ``MB-015`` or ``exception 02``. `also` are further spellings that find it.
-    `meaning` says in a few sentences what it is and how it comes about, `todo` what to do. `source` is the clause of the
+    `meaning` describes it and its causes in a few sentences, and `todo` states what to do. `source` is the clause of the
     standard, or the page of the documentation. `page` is the page of the book about this entry alone, if there is one.
     """
 

@@ -1,4 +1,4 @@
-"""Turns the wishes for devices into devices on buses: profiles, names, endpoints, addresses, supervised values and outputs.
+"""Converts the requested devices to devices on buses, with profiles, names, endpoints, addresses, supervised values and outputs.
 
 This module reads profiles and opens no connection.
 """

@@ -13,7 +13,7 @@ from pathlib import Path
 from fieldtwin.gateway.core.errors import UsageError
 
 EXAMPLE = "example"
-"""The profile that stands for the tank that `new` itself brings."""
+"""The profile name that stands for the example tank of `fieldtwin new`."""
 MOST_DEVICES = 64
 """The most devices of a new site."""
 LONGEST_NAME = 40
@@ -44,7 +44,7 @@ class DeviceWish:
     """A device as the user names it.
 
     `profile` is the name of a shipped profile or the path of a file. `profile_text` is the text of a draft without a file.
-    `name`, `endpoint` and `address` (unit ID or node ID) are empty or None if `new` shall choose them.
+    `name`, `endpoint` and `address` (unit ID or node ID) are empty or None if `fieldtwin new` has to choose them.
     """
 
     profile: str

@@ -45,7 +45,8 @@ def write_site(folder: Path, files: Mapping[str, str]) -> None:
             path = folder / name
             for parent in [*reversed(path.parents)]:
                 if not parent.exists():
-                    made.append(parent)  # noted first, so that an interruption leaves no folder behind
+                    # the folder is noted before it is created, so that it is also removed after an interruption
+                    made.append(parent)
                     parent.mkdir()
             made.append(path)
             path.write_bytes(text.encode("utf-8", "surrogateescape"))
@@ -61,4 +62,4 @@ def _remove(made: list[Path]) -> None:
         try:
             path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
         except OSError:
-            continue  # what cannot be removed stays, and the first error is the one to report
+            continue  # a file that cannot be removed stays, and the first error is reported

@@ -2,7 +2,7 @@
 
 A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check
 that failed, and its text contains all of them and the command that runs it again. INCONCLUSIVE is an ``error`` with its
-own type: JUnit has no word for a result that neither passed nor failed, and a build must not take it for one that passed.
+own type: JUnit has no result that neither passed nor failed, and a build must not take INCONCLUSIVE for a pass.
 
 `Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a
 file. That schema has no properties of test cases: they become lines at the beginning of ``system-out``.
@@ -83,7 +83,7 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
     ]
     if url := case_url(scenario.case):
         facts.append(("page", url))
-    if scenario.file:  # not an attribute, for which Jenkins' xUnit plugin skips the file
+    if scenario.file:  # this is not written as an attribute, because Jenkins' xUnit plugin skips a file with it
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
     if scenario.earlier:
         facts.append(("attempts", str(scenario.attempts)))

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from fieldtwin.results.trace import TraceEvent
 
-if TYPE_CHECKING:  # verdicts and results are also made where no system can be read
+if TYPE_CHECKING:  # verdicts and results are also created where no system can be read
     from fieldtwin.twin.site.system import System
 
 
 class Verdict(Enum):
-    """How something ended. Only the first one is a pass. The values are the words that users see."""
+    """The verdict on a test case or a scenario. Only PASSED is a pass. The values are the words that users see."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -26,7 +26,7 @@ class Verdict(Enum):
 
     @property
     def bad(self) -> bool:
-        """Whether a person has to look at it: FAILED and ERROR."""
+        """Whether the verdict needs the attention of a user: FAILED and ERROR."""
         return self in (Verdict.FAILED, Verdict.ERROR)
 
 
@@ -34,7 +34,7 @@ class Verdict(Enum):
 class CheckResult:
     """A step, an expectation or an always-on check of a scenario.
 
-    `number` identifies it for people (``3``, ``always 1``), `where` is its place (file:line). `since_ns` to `t_ns` is
+    `number` identifies it in reports (``3``, ``always 1``), `where` is its place (file:line). `since_ns` to `t_ns` is
     the time that it checked, in ns since the run's start; `t_ns` is when it was decided, None if it was not reached.
     `names` are the tags, variables and devices that it is about: the diagram shows these.
     """
@@ -50,14 +50,14 @@ class CheckResult:
     where: str = ""
     names: tuple[str, ...] = ()
     vacuous: bool = False
-    """Nothing happened that this check could have judged; another run of the scenario may judge it."""
+    """The check had nothing to check, because the event that it is about did not occur in this run. It may occur in another
+    run.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Struck:
-    """A fault that was injected: its device or bus, how often it struck, and whether it is permitted not to strike
-    (`optional`).
-    """
+    """A fault that was injected: its device or bus, how often it took effect, and whether it may have no effect (`optional`)."""
 
     id: str
     name: str
@@ -67,7 +67,7 @@ class Struck:
 
     @property
     def is_set(self) -> bool:
-        """Whether it is not a fault, but a value that a step has set; it strikes when the device sends that value."""
+        """Whether it is not a fault, but a value that a step has set. A set value takes effect when the device sends it."""
         return self.id == f"set {self.on}"
 
     @property
@@ -107,7 +107,7 @@ class ScenarioResult:
     write, disrupt), `basis` the reason for a conformance case (standard, robustness, field problem), `clause` its
     source.
 
-    `faults` says how often each fault struck that the scenario injected.
+    `faults` states how often each fault of the scenario took effect.
 
     `reproduce` is the command that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
     the events that are still in memory, `dropped` the number of those that are not; `trace_hash` is over all. `counts`
@@ -191,8 +191,8 @@ def key_of(system: System) -> SystemKey:
 class Report:
     """A run of one or many scenarios.
 
-    `requirements` are those to be covered, id to text; ids that only scenarios name are added. `versions` is other
-    useful information: fieldtwin, Python, platform. `started` is ISO 8601.
+    `requirements` are those to be covered, id to text; ids that only scenarios name are added. `versions` are the versions of
+    fieldtwin and Python, and the platform. `started` is ISO 8601.
     """
 
     title: str

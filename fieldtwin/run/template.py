@@ -1,4 +1,6 @@
-"""A template in place of a system file: unpacked where runs live, verified, and asked about before anything of it runs."""
+"""A template in place of a system file: it is unpacked into the folder of the runs and verified, and the user is asked before
+any of its code runs.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,7 @@ def system_file(
     here = FolderPackage(folder)
     here.verify()
     from fieldtwin.twin.template.check import (
-        examine,  # a template can only exist where its reader is installed
+        examine,  # the module that reads templates is only installed together with them
     )
 
     system = examine(folder, here.manifest, plant=plant, shown=path)

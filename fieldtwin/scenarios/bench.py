@@ -92,8 +92,9 @@ class Bench(Protocol):
 
     @property
     def allowed(self) -> Impact:
-        """The highest impact level that steps may have: `expect`, `wait` and `pause` observe, probes read, `send` and
-        `set` write, `fault` and `clear` disrupt."""
+        """The highest impact level that steps may have: `expect`, `wait` and `pause` only observe; probes read; `send` and
+        `set` write; `fault` and `clear` disrupt.
+        """
         ...
 
     @property
@@ -163,7 +164,7 @@ class Bench(Protocol):
         ...
 
     async def struck(self) -> list[Struck]:
-        """Return how often each fault struck that was injected through this bench, in the order of injection."""
+        """Return how often each fault of this bench took effect, in the order of injection."""
         ...
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:

@@ -1,7 +1,7 @@
 """A run as a service: its metrics page, systemd notifications and event log, all from statuses that the run polls anyway.
 
-The watchdog is fed only while both the gateway and the PLC have answered within the last half of its interval: a process that
-hangs is as bad as one that has ended, and systemd then stops all of them in order and restarts them.
+The watchdog is fed only while both the gateway and the PLC have answered within the last half of its interval: if one of them
+hangs or has ended, systemd stops all processes of the service in order and starts them again.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Events between two snapshots of a run, for a log that programs read.
 
-Pure: it writes nothing and sends no requests. Events never contain values of tags, like all texts for people.
+Pure: it writes nothing and sends no requests. Events never contain values of tags, like all texts of the service.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Prometheus exposition format 0.0.4, as text. It does not know what is measured.
+"""Prometheus exposition format 0.0.4, as text. This module does not know which values are measured.
 
 Source: https://prometheus.io/docs/instrumenting/exposition_formats/ (text-based format).
 """

@@ -14,7 +14,7 @@ from fieldtwin.run.processes.children import spawn
 from fieldtwin.twin.plant.child import command
 
 READY = "Studio  →  "
-"""What `fieldtwin studio` prints before its address as soon as it accepts connections."""
+"""The text that `fieldtwin studio` prints before its address as soon as it accepts connections."""
 STARTS_WITHIN_S = 30.0
 ENDS_WITHIN_S = 5.0
 LOOK_S = 0.05

@@ -109,7 +109,7 @@ def _kind(path: Path, data: Mapping[str, Any]) -> str:
 
 
 class _Site:
-    """One check. Each step adds its errors to `errors`, and goes on with what has none."""
+    """One check of a site. Each step adds its errors to `errors`, and continues with the parts that have no errors."""
 
     def __init__(
         self, by_kind: Mapping[str, list[Path]], profiles: tuple[Path, ...], errors: ErrorCollector, found: SiteCheck

@@ -1,4 +1,4 @@
-"""The JSON schemas of all kinds of files that users write, made from the forms that read these files.
+"""The JSON schemas of all kinds of files that users write, made from the pydantic models that read these files.
 
 The folder `SHIPPED` has them as files, for editors; ``scripts/schemas --write`` makes these files anew.
 """

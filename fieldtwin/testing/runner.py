@@ -99,7 +99,7 @@ class WorkerProcess:
                 stderr=self._said,
                 text=True,
                 encoding="utf-8",
-                start_new_session=True,  # Ctrl-C is for pytest: this process ends when its input does
+                start_new_session=True,  # Ctrl-C must reach only pytest: the worker process ends when its input ends
             )
         except OSError as e:
             self._said.close()
@@ -154,5 +154,5 @@ def _pump(process: subprocess.Popen[str], answers: Queue[str | None]) -> None:
         for line in process.stdout:
             answers.put(line)
     except (OSError, ValueError):
-        pass  # another thread closed the pipe: no further answer can come
+        pass  # another thread closed the pipe, so no further answer can arrive
     answers.put(None)

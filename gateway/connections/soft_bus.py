@@ -31,7 +31,7 @@ class SoftBus(can.BusABC):
     `bitrate` (bit/s) is checked against the bus's; 0 accepts any. With `fd` it also sends and receives CAN FD frames,
     and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames are received, with
     ``is_rx`` false, after they were sent on the bus. Time stamps are seconds since 1970, from the bus's exact end of
-    frame. `recv` takes exactly one record from the socket, so its descriptor stays readable while more wait; `fileno`
+    frame. `recv` takes exactly one record from the socket, so its descriptor stays readable while more records wait; `fileno`
     serves `can.Notifier` with a loop. Errors are those of python-can: `CanInitializationError` if the bus cannot be
     joined, `CanOperationError` if it is gone, `CanTimeoutError` if it accepts no more frames.
 
@@ -53,7 +53,9 @@ class SoftBus(can.BusABC):
         fd: bool = False,
         data_bitrate: int = 0,
         bus_errors: bool = False,
-        single_handle: bool = True,  # python-can's programs pass it to every interface; every handle is single here
+        # Programs of python-can pass this argument to every interface; a handle on this bus always belongs to one
+        # program.
+        single_handle: bool = True,
     ) -> None:
         if data_bitrate and not fd:
             raise can.CanInitializationError("a data bit rate needs CAN FD: fd=True")

@@ -150,7 +150,8 @@ class _TappedCan(CanConnection):
 
     @overruns.setter
     def overruns(self, value: int) -> None:
-        self._inner.overruns = max(value, self._inner.overruns)  # it only increases; the base class starts it at 0
+        # the counter only increases; the base class sets it to 0 first
+        self._inner.overruns = max(value, self._inner.overruns)
 
     def feed(self, item: CanFrame) -> bool:
         return self._inner.feed(item)

@@ -3,8 +3,8 @@
 `Connection` follows SPEC's schema exactly: a protocol type and a FIFO of data that is empty after Init, appended to by
 `write`, and read from its head. Drivers and devices hold a `ByteConnection` or a `CanConnection`: one end of a duplex
 medium (SPEC ruling 4), whose inbound direction is such a stream. An end of the operating system
-(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory end differ only in
-what feeds them.
+(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory end differ only in the
+source of their data.
 
 Only a `Connector` opens a port, socket or bus. The runtime receives a `Connector`, and no driver knows which kind it
 uses.
@@ -109,7 +109,7 @@ class _End(Generic[T]):
         return self._lost
 
     def feed(self, item: T) -> bool:
-        """Take an item that arrived. Return False if nothing more should be read from the medium for now."""
+        """Take an item that arrived. Return False if the receiver should stop reading from the medium for now."""
         if self.intercept is not None and self.intercept(item):
             return len(self._stream) < self.max_pending
         return self.feed_through(item)
@@ -134,7 +134,7 @@ class _End(Generic[T]):
         """Resume reading from the medium if it was paused. Called after a consumer took an item."""
 
     def _loss(self) -> FieldtwinError:
-        """Return a new error with the reason. Each `raise` needs its own, because a reused error collects tracebacks and
+        """Return a new error with the reason. Each `raise` needs a new error, because a reused one collects tracebacks and
         locations.
         """
         kept = self._lost or closed_locally(self.endpoint)

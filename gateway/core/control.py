@@ -2,7 +2,7 @@
 
 A request is one line ``{"v": 1, "id": 7, "command": "get", "args": {...}}``, its answer one line ``{"v": 1, "id": 7, "ok":
 true, "result": ...}`` or ``{"v": 1, "id": 7, "ok": false, "error": {"kind", "message", "exit_code"}}``. Each process
-registers its own commands: a plant's controller has no fault command because it registers none. The channel
+registers its own commands: a plant's controller does not register a fault command, so it has none. The channel
 uses a Unix socket in the instance's run directory (owner only), or TCP with a token if configured.
 
 A line has at most `MAX_LINE` bytes. This module handles text and JSON only; it does not know the state of the process.

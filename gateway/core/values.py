@@ -51,7 +51,7 @@ class RECORDING(RESPONSE):
 
 
 class Quality(IntEnum):
-    """How far a value can be trusted (the qualities of IEC 62541 reduce to these). Ordered: a larger number is worse."""
+    """The quality of a value, with the classes of IEC 62541 (good, uncertain, bad). A larger number is a worse quality."""
 
     GOOD = 0
     SUBSTITUTED = 1

@@ -1,6 +1,6 @@
 """The driver of a CANopen node: identity, configuration over SDO, values from TPDOs, state from the heartbeat.
 
-The node's values are good while its TPDOs arrive and it is OPERATIONAL; a lost heartbeat makes them bad at once. If
+The node's values are good while its TPDOs arrive and it is OPERATIONAL; a lost heartbeat makes them bad immediately. If
 writing is not allowed, the driver configures and starts nothing: it reads the PDO mapping from the node and listens.
 The driver writes nothing at all to a node whose identity is not the expected one. An output goes by RPDO if one of the
 node's RPDOs carries it and may be sent, otherwise by SDO.
@@ -133,7 +133,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def unbrought(self) -> tuple[str, ...]:
-        """Return the tags that TPDOs of the node carry and do not bring, because the node is not OPERATIONAL (7.3.2.2).
+        """Return the tags of the node's TPDOs that are not received, because the node is not OPERATIONAL (7.3.2.2).
 
         A node without a heartbeat counts as OPERATIONAL for the TPDOs that it has sent. The state of a node whose heartbeat was
         lost is unknown.

@@ -45,7 +45,7 @@ class Rpdo:
         return CanFrame(self.cob_id, self.mapping.pack(self._with(values)))
 
     def sent(self, values: Mapping[str, bytes]) -> None:
-        """Note that `frame(values)` was sent: these are the values that the node holds."""
+        """Note that `frame(values)` was sent, so that the node now holds these values."""
         self.held = self._with(values)
 
     def _with(self, values: Mapping[str, bytes]) -> list[bytes]:

@@ -1,7 +1,8 @@
 """SPEC row DeviceDriver: a driver with one concrete connection, an emitter and a consumer.
 
-Send is "consume, then write"; Receive is "read, then emit". A driver opens no connection: the runtime opens it through a
-Connector and attaches the driver. It uses only the clock that it is given, and cannot distinguish an emulator from the device.
+Its operation Send consumes a command and writes it; its operation Receive reads a message and emits it. A driver opens no
+connection: the runtime opens it through a Connector and attaches the driver. It uses only the clock that it is given, and
+cannot distinguish an emulator from the device.
 """
 
 from __future__ import annotations

@@ -162,7 +162,7 @@ class RegisterDriver(DeviceDriver):
         """Return the number of registers or bits that the first transaction of the group `what` reads: the cost of a failed
         attempt.
 
-        A group that reads nothing cannot show whether the device is present, so its cost is higher than any other.
+        A group without any reads cannot show whether the device is present, so its cost is higher than that of any other group.
         """
         plan = self.plans.get(what)
         return plan.reads[0].range.count if plan is not None and plan.reads else NOTHING_READ

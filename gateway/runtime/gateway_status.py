@@ -52,9 +52,9 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     online: bool
     """Whether it answers and is the expected device."""
     error: str
-    """Why it is not online, or what is wrong with it; empty if nothing is."""
+    """Why the device is not online, or which problem it has; empty if it has none."""
     identity_error: str
-    """In what it differs from the device of the system file; empty if it does not."""
+    """How the device differs from the one in the system file; empty if it does not differ."""
     polls: int
     errors: int
     """Polls that failed, and PDOs that were malformed."""
@@ -65,7 +65,9 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Of a CANopen node: replies from a second node with the same ID."""
     conflict: str | UnsetType = UNSET
     unstarted: str | UnsetType = UNSET
-    """Of a CANopen node that the gateway does not start: which tags have no value until another NMT master starts it."""
+    """For a CANopen node that the gateway does not start: the tags that have no value until a different NMT master starts the
+    node.
+    """
     boots: int | UnsetType = UNSET
     bring_ups: int | UnsetType = UNSET
     emcys: int | UnsetType = UNSET
@@ -95,7 +97,7 @@ class BusStatus(msgspec.Struct, frozen=True, kw_only=True):
     not_produced: int | UnsetType = UNSET
     """Of a CAN bus: SYNC, TIME and repeated RPDOs that could not be sent in their period."""
     sync_producers: str | UnsetType = UNSET
-    """Of a CAN bus: what is wrong with the producers of SYNC; empty if nothing is."""
+    """For a CAN bus: the problem with the producers of SYNC; empty if there is none."""
 
 
 class TagStatus(msgspec.Struct, frozen=True, kw_only=True):

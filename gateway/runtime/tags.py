@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagVal
 
 FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000
-"""How many published values are kept for the store to fetch; the oldest are dropped and counted."""
+"""The largest number of published values kept until the store fetches them. Older values are dropped and counted."""
 OnPut = Callable[[str, TagValue], None]
 """Called with a tag's name and its new value. It must not raise."""
 _GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an Enum's members is slow

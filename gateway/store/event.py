@@ -28,12 +28,12 @@ class Kind(IntEnum):
     COMMAND = 1
     """`value` is the payload of a command (bytes) as it was sent; `name` is its sender."""
     REFUSAL = 2
-    """`value` is why a command or plan was refused; `name` is what refused it."""
+    """`value` is the reason why a command or plan was refused; `name` is the part of the system that refused it."""
     STATE = 3
     """`value` is a STATUS: state and period (bytes, `fieldtwin.twin.model.status`); `name` is the owner of the state
     machine."""
     VERDICT = 4
-    """`value` is what an analysis found; `name` is what it analysed."""
+    """`value` is the result of an analysis; `name` is the tag or object that was analysed."""
     PAYLOAD = 5
     """`value` is a RESPONSE as it was received (bytes); `name` is the program or device that sent it."""
     LOSS = 6

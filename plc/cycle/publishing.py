@@ -61,8 +61,7 @@ class PublishedVariable:
 
 @dataclass(frozen=True, slots=True)
 class TagChange:
-    """A change of a tag: the program that made it, and what it saw, for the answer to "why". `inputs` are the
-    program's, as it read them."""
+    """A change of a tag, for the command `why`: the program that made it, and the inputs as the program read them."""
 
     tag: str
     t_ns: int

@@ -170,7 +170,7 @@ class PlcProcess:
                 tag, value, by, record=lambda old, new: self._note("force", args, tag=tag, old=old, new=new)
             )
         except UsageError as e:
-            with suppress(Unreachable):  # refused with or without a record
+            with suppress(Unreachable):  # the action is refused, whether or not it could be recorded
                 self._note("refuse", args, tag=tag, new=value, result=str(e))
             raise
         return {"forces": self._runner.forces.describe(monotonic_ns())}

@@ -6,7 +6,7 @@ among equals, the one that has waited longest. If one task stops by itself, all 
 a stop by the watchdog, or a scan that did not end, the programs are created anew and start warm, at most `max_restarts`
 times in a row. A program runs only after its inputs have been good once (fieldtwin.plc.cycle.start), also after a restart.
 
-The runner is driven like a `CyclicTask`, by `deadline_ns` and `run_once`. It cannot distinguish the wall clock from virtual time.
+Like a `CyclicTask`, the runner provides `deadline_ns` and `run_once`. It cannot distinguish the wall clock from virtual time.
 """
 
 from __future__ import annotations

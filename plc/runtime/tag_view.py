@@ -42,7 +42,8 @@ class TagView:
         return list(self._specs[INPUTS] | self._specs[OUTPUTS])
 
     def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
-        """Return the tags as data for JSON, in the order of `names`. A tag of both regions has two entries, the input first.
+        """Return the tags as data for JSON, in the order of `names`. A tag that is in both regions has two entries, the input
+        first.
 
         Raises `UsageError` for more than `MAX_AT_ONCE` tags, or for an unknown one. `now_ns` is monotonic, the tags'
         clock, and `utc_ns` the same instant.

@@ -239,7 +239,7 @@ def _described(kind: ty.Type) -> Any:
 
 
 def _most(kind: ty.Type, now: Any) -> int:
-    """Return the largest possible size in bytes, as MessagePack, of a value whose present data is `now`."""
+    """Return the largest size in bytes that a value can have as MessagePack. `now` is the present data of the value."""
     if isinstance(kind, ty.String):
         return 5 + 3 * kind.length
     if isinstance(now, list):

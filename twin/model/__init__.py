@@ -1,1 +1,1 @@
-"""The digital model, the shadow and the twin that are built on it, and the Monitor-Analyze-Plan-Execute loop."""
+"""The digital model, the digital shadow and the digital twin that are built on it, and the Monitor-Analyze-Plan-Execute loop."""

@@ -122,7 +122,7 @@ class KnowledgeWriter:
         except asyncio.CancelledError:
             with suppress(
                 Unreachable
-            ):  # cancelled while writing: wait for the outcome, so that no event is stored twice
+            ):  # the task was cancelled while it wrote: wait for the outcome, so that no event is stored twice
                 await writing
                 batch = []
             self._give_back(batch)

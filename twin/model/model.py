@@ -1,7 +1,7 @@
 """The digital model: one state machine and the variables that the system declares. It cannot reach the plant.
 
-Each twin has its own instance: the prototype, the shadow, and each run that judges its control logic. It changes by
-events alone, and must not depend on a connection, a clock or a store.
+Each twin has its own instance: the prototype, the shadow, and each run that checks its control logic. Only events change it.
+This module must not depend on a connection, a clock or a store.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The digital shadow: Monitor and Analyze process the events that arrive from the plant. It holds no object that could send.
+"""The digital shadow: Monitor and Analyze process the events that arrive from the plant. It has no object through which it
+could send.
 
 It receives from a queue (SPEC ruling 16). Filling that queue, acknowledging events and requesting missing ones is done
 outside this module; import contracts keep it free of connections, drivers, transmitters and threads.

@@ -1,7 +1,6 @@
 """The processes whose knowledge a digital thread shares: bounded queues of events of the physical or the digital twin.
 
-The shadow is built on these classes. This module must never depend on a connection, nor on anything that could send a
-command.
+The shadow is built on these classes. This module must never depend on a connection, or on code that can send a command.
 """
 
 from __future__ import annotations
@@ -85,8 +84,8 @@ class DTDigitalThreadProcess(DigitalThreadProcess):
 class ReceivingEnd(EventHandler):
     """A bounded queue of what arrives over a thread (ruling 2).
 
-    This is all that a shadow holds of a connection (ruling 16): the transmitter that polls, acknowledges and requests
-    missing events is assembled elsewhere.
+    A shadow has no other part of a connection (ruling 16): the sender that polls, acknowledges and requests missing events is
+    created elsewhere.
     """
 
     def __init__(self, event: str, capacity: int = KNOWLEDGE) -> None:

@@ -27,7 +27,7 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
         return
 
     libc = ctypes.CDLL(None, use_errno=True)
-    if linger_s <= 0:  # no timer: it would break the PLC's own use of it
+    if linger_s <= 0:  # no interval timer is used here, because the PLC uses it itself
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
         if os.getppid() != parent:  # the parent died before the request
             os.kill(os.getpid(), signal.SIGTERM)
@@ -63,7 +63,7 @@ def allow_open_files() -> None:
 
 def command(module: str, *args: str, linger_s: float = 0.0) -> list[str]:
     """Return the command line that runs `module` as a child of this process."""
-    # -P: do not import modules from the user's working folder, such as a yaml.py of theirs.
+    # -P: do not import modules from the user's working folder, such as a yaml.py of the user.
     return [sys.executable, "-P", "-m", "fieldtwin.twin.plant.child", str(os.getpid()), str(linger_s), module, *args]
 
 

@@ -53,7 +53,7 @@ MOST_COMMAND_BYTES = 64
 WRITE_WITHIN_S = 5.0
 MOST_CHANGES_TOLD = 20
 PUBLISHED_AT_ONCE = 20_000
-"""The most that fits into one line of the control channel."""
+"""The largest number of entries that fits into one line of the control channel."""
 
 
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -27,7 +27,7 @@ else:
 
 TEMPORARY = Path("/tmp")
 BULK = Path("/var/tmp")
-"""For captures: files of many megabytes, which do not fit where the run directories are (often memory)."""
+"""The folder for captures. They have many megabytes, and run directories are often on a file system in memory."""
 
 SOCKET_PATH_MAX = 100
 """Longest path of a run directory plus file name. A Unix socket's path is at most 107 bytes (sockaddr_un)."""

@@ -1,6 +1,6 @@
 """The only difference between a prototype and its plant: below the drivers, endpoints of emulators replace those of the plant.
 
-Emulators are unknown here: this is a Connector that wraps a Connector (DESIGN.md, "Who opens a wire").
+This module does not know emulators: it is a Connector that wraps a Connector (DESIGN.md, "Who opens a wire").
 """
 
 from __future__ import annotations

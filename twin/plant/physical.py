@@ -1,8 +1,8 @@
 """The physical twin: gateway and PLC of a system, and the memory that they share.
 
 This module creates, once, everything on which both processes must agree: the process image's layout from the system file, the
-file that holds the image, and the configuration of each process. Emulators are unknown here (`fieldtwin run --plant` works
-without that folder).
+file that holds the image, and the configuration of each process. This module does not know emulators (`fieldtwin run --plant`
+works without that folder).
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def gateway_config(
 
     With `free_ports` it serves and bridges on free ports, so that several gateways can run on one host. Without
     `true_silences` no line checks the pauses in RTU frames, because those of virtual ports carry no information;
-    `free_ports` implies this by default. The mailboxes of the transmitters in `lent` are left to a digital thread.
+    `free_ports` implies this by default. The mailboxes of the transmitters in `lent` are delegated to a digital thread.
     """
     true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)

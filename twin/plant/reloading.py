@@ -126,7 +126,8 @@ def _is_live_in_profile(before: DeviceProfile, after: DeviceProfile, at: Loc) ->
         return at[0] in PROFILE or at == ("sampled", "slack_ms")
     if len(at) < 3 or at[2] not in TAG:
         return False
-    tag = str(at[1])  # the process image stores the tag as an integer or not, which cannot change
+    # the process image stores the tag either as an integer or as a real number, which cannot change in a run
+    tag = str(at[1])
     return at[2] not in SCALING or before.tags[tag].is_integer == after.tags[tag].is_integer
 
 

@@ -16,7 +16,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 
 MOST = 50_000
 AT_ONCE = 10_000
-"""The most that fits into one line of the control channel."""
+"""The largest number of entries that fits into one line of the control channel."""
 Change = tuple[int, int, str, Any, str, str]
 """Number (from 1), monotonic ns, tag, value (bytes as hex), quality, reason."""
 

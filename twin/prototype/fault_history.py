@@ -1,4 +1,4 @@
-"""The number of strikes of each fault, also of cleared ones, because a fault that never took effect has tested nothing."""
+"""How often each fault took effect, also of cleared faults, because a fault that never took effect has tested nothing."""
 
 from __future__ import annotations
 

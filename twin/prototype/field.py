@@ -96,8 +96,9 @@ class FieldSimulator:
     """Builds every emulator of a prototype and runs them on their connections.
 
     Virtual serial ports get their links in `run_dir`. After `open`, `listening` holds the endpoint at which each
-    emulated bus listens (with the free ports that were chosen), and `far` those of the far modems. `water`: the
-    acoustic ends of transmitters that are in a network's acoustic channel and have no far modem of their own.
+    emulated bus listens (with the free ports that were chosen), and `far` those of the modems at the remote end of a link.
+    `water`: the acoustic connections of transmitters that are in a network's acoustic channel, and that therefore have no
+    separate remote modem.
     """
 
     def __init__(
@@ -181,7 +182,7 @@ class FieldSimulator:
             await self._open_far(device, wire.latency_s)
 
     async def _open_far(self, device: DeviceConfig, latency_s: float) -> None:
-        """Open the far modem of a transmitter, on its own socket."""
+        """Open the remote modem of a transmitter, on its own socket."""
         pair, emulated = self._pairs.get(device.name), self.prototype.devices[device.name]
         if pair is None or emulated.form.far is None:
             return
@@ -223,7 +224,7 @@ class FieldSimulator:
         return sampled_device(profile, kind, self._signals(emulated), form.identity, config.name, period_s)
 
     def _modem(self, config: DeviceConfig, emulated: EmulatedDevice) -> MailboxModem:
-        """Return a transmitter: in a network's acoustic channel, or with its own far modem and link."""
+        """Return a transmitter: in a network's acoustic channel, or with its own remote modem and link."""
         end, link = self._water.get(config.name), emulated.form.far_link
         if end is not None:
             return MailboxModem(emulated.profile, end, end, emulated.form.identity)

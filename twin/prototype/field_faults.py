@@ -66,7 +66,7 @@ class FieldFaults:
         self._disturb[bus], self._undisturb[bus] = disturb, undisturb
 
     def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
-        """Call `told` for the traffic on each line and socket from now on.
+        """Call `told` with the traffic on each line and socket from now on.
 
         Its arguments are the bus, the connection object, whether an emulator sent the bytes, and the bytes. CAN buses have their
         own listeners (`FieldSimulator.join`).
@@ -180,7 +180,7 @@ class FieldFaults:
         return list(self._active)
 
     def active(self) -> list[ActiveFaultStatus]:
-        """Return the active faults, and how often each struck."""
+        """Return the active faults, and how often each took effect."""
         return [
             ActiveFaultStatus(id=id, name=spec.kind.name, bus=bus, device=spec.aim.device, struck=active.struck)
             for id, (spec, active, bus) in self._active.items()

@@ -1,9 +1,10 @@
-"""Leases on the simulated field devices: the faults and values of a test runner stay only while it renews its lease.
+"""Leases on the simulated field devices. The faults and values that a test runner injects last only as long as it renews its
+lease.
 
 A test runner (a scenario on a running system; *judge* in messages) opens a lease on the control channel, injects faults and sets
 values under the lease's id, and renews it. Even after kill -9 or a lost network, everything that the test runner injected is
 removed when the lease ends: faults are cleared, and each device value is restored to that before the test runner's first `set`.
-Only one test runner at a time can hold the lease, because two would change each other's verdicts.
+Only one test runner at a time can hold the lease, because two test runners would falsify each other's verdicts.
 
 Pure: the time is passed in, in ns on the clock of the field process.
 """

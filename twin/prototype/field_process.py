@@ -123,7 +123,7 @@ class FieldProcess:
         self._field: FieldSimulator
         self._leases: FieldLeases
         self.control_port = 0
-        # Identity of these devices: devices that are made anew get a different one, and their counters restart.
+        # Identity of these devices. Devices that are created again get a different identity, and their counters start again.
         self._life = secrets.token_hex(8)
 
     async def run(self, on_ready: Callable[[FieldSimulator], None] | None = None) -> int:
@@ -221,7 +221,7 @@ class FieldProcess:
                 self._leases.expire(self._clock.monotonic_ns())
 
     async def _make_anew(self) -> None:
-        """Make the devices again from the same prototype, on the same endpoints. A failure ends the process."""
+        """Create all devices again from the same prototype, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
         prototype = _listening_as(self._twin.prototype, old)
         self._field = FieldSimulator(old.system, prototype, Path(self._config.run_dir), self._clock)
@@ -297,7 +297,7 @@ class FieldProcess:
         }
 
     async def _fresh(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Make all devices anew, and return when the new devices listen.
+        """Create all devices again, and return when the new devices listen.
 
         Raises `LeaseEnded` or `UsageError`, and changes nothing then.
         """
@@ -316,8 +316,8 @@ class FieldProcess:
 
 
 def _listening_as(prototype: Prototype, field: FieldSimulator) -> Prototype:
-    """Return `prototype` with every bus and every far modem at the endpoint that it has in `field`, so that ports stay
-    the same.
+    """Return `prototype` with every bus and every remote modem at the endpoint that it has in `field`, so that ports stay the
+    same.
     """
     buses = {
         name: replace(bus, listen=field.listening[name]) if name in field.listening else bus

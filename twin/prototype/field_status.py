@@ -81,7 +81,7 @@ class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     """All simulated devices of a system, and the faults on them."""
 
     life: str = ""
-    """The identity of these devices; devices that are made anew have a different one."""
+    """The identity of these devices. Devices that are created again have a different identity."""
     system: str
     system_hash: str
     devices: dict[str, SimulatedDeviceStatus]

@@ -198,8 +198,8 @@ class _Clash(NamedTuple):
 def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
     """Return the first clash between buses, if any.
 
-    Several CAN buses may share one software bus if all their nodes have different ids; a duplicate id is a fault, to be
-    injected as such (`duplicate-node`). A port or a socket belongs to one bus.
+    Several CAN buses may share one software bus if all their nodes have different ids; a duplicate ID is a fault, which has to
+    be injected (`duplicate-node`). A port or a socket belongs to one bus.
     """
     wires: dict[Endpoint, str] = {}
     nodes: dict[tuple[Endpoint, int], str] = {}

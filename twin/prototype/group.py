@@ -55,7 +55,7 @@ class SystemGroup(ABC):
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """Return the names of the shared resources, at which faults can be aimed as at a bus."""
+        """Return the names of the shared resources. A fault can name one of them as its target, like a bus."""
         return ()
 
     @abstractmethod
@@ -68,7 +68,7 @@ class SystemGroup(ABC):
 
     @abstractmethod
     def place(self, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
-        """Return the faults by system, under that system's own names, or by what the systems share.
+        """Return the faults by system, under that system's own names, or by the shared resource that they name.
 
         A system without a fault is not included. Raises `UsageError` for an unknown system.
         """

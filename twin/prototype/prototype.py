@@ -50,6 +50,6 @@ class DigitalTwinPrototype:
         """Return the emulators on their connections, not opened yet.
 
         The connections are the operating system's unless other `ports` are given. Virtual serial ports get their links
-        in `run_dir`. `water`: the acoustic ends of transmitters that are in a network.
+        in `run_dir`. `water`: the acoustic connections of transmitters that are in a network.
         """
         return FieldSimulator(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -48,7 +48,7 @@ class VirtualPrototype(AsyncResource):
     log and retained values; the exchange log is in memory.
 
     `seed` replaces the prototype file's. `taps` observe the gateway's connections. `prepare` is called when everything
-    is made and nothing has run yet. `water`: the acoustic ends of transmitters that are in a network. After entering,
+    is made and nothing has run yet. `water`: the acoustic connections of transmitters that are in a network. After entering,
     `field`, `gateway` and `plc` run.
     """
 

@@ -15,7 +15,8 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
-_HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link
+# the path is not resolved yet, because in a checkout fieldtwin/twin is a link
+_HERE = Path(__file__).absolute().parents[3].resolve()
 """site-packages where a wheel is installed, the checkout otherwise."""
 
 
@@ -73,8 +74,8 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
     """Return the file that `name` refers to: a path, or a bare name in the search path. `kind` is ``systems`` or
     ``devices``.
 
-    `beside` is the file that contains the reference: a relative path is tried in its folder first. A folder stands for the
-    only system file in it. Raises `UsageError`, which lists the available names.
+    `beside` is the file that contains the reference: a relative path is first looked up in the folder of that file. A
+    folder stands for the only system file in it. Raises `UsageError`, which lists the available names.
     """
     direct = Path(name)
     places = [beside.parent / direct] if beside else []

@@ -1,7 +1,7 @@
 """The registration point for kinds of files that describe several systems which run together.
 
-Each kind has a separate folder, which no other module imports. This module returns the kind's module for a file, and
-imports it only then, because it needs the emulators, which a plant does not have.
+Each kind has a separate folder, which no other module imports. This module finds the kind of a file and imports the kind's
+module only then, because that module needs the emulators, which a plant does not have.
 """
 
 from __future__ import annotations

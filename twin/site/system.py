@@ -85,7 +85,7 @@ def _resolve(
     for name, bus in form.buses.items():
         with errors.collect():
             buses[name] = _bus(file, name, bus)
-    known: dict[Path, DeviceProfile] = {}  # so that a profile used by a hundred devices is read once
+    known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices use is read only once
     devices: dict[str, DeviceConfig] = {}
     for name, device in form.devices.items():
         with errors.collect():

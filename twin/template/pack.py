@@ -1,9 +1,9 @@
 """Packs a template: all files that a system names, found where a run would find them, under paths that work anywhere.
 
 A package has ``systems/``, ``devices/``, ``recordings/``, ``documents/`` and ``software/``. A file that the system file
-names by a relative path keeps its position relative to it. A file that it names by a bare name is put where bare names
-are searched (`fieldtwin.twin.site.data_files`). The system file itself is never changed: plant, prototype and template
-have the same bytes.
+names by a relative path keeps its position relative to it. A file that it names by a bare name is packed into the folder in
+which bare names are looked up (`fieldtwin.twin.site.data_files`). The system file itself is never changed: plant, prototype
+and template have the same bytes.
 """
 
 from __future__ import annotations

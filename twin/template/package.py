@@ -79,7 +79,7 @@ class Package(ABC):
         return (*self.manifest.code, *self.caches)
 
     def read(self, file: TemplateFile) -> Iterator[bytes]:
-        """Yield a file in blocks. Raises `FileInvalid` at its end if it is not what the manifest says."""
+        """Yield a file in blocks. Raises `FileInvalid` at its end if the file differs from the manifest."""
         digest, size = hashlib.sha256(), 0
         try:
             with self.open(file.path) as source:
@@ -119,8 +119,8 @@ class Package(ABC):
     def contents(self) -> dict[str, Content]:
         """Return every file with the hash of its bytes, by path, in the manifest's order.
 
-        Reads all files once. Raises `FileInvalid` for the first file that is not what the manifest says: otherwise a
-        damaged file would be listed with the manifest's hash and seem unchanged.
+        Reads all files once. Raises `FileInvalid` for the first file that differs from the manifest. Otherwise a damaged file
+        would be listed with the manifest's hash and seem unchanged.
         """
         self.verify()
         return {file.path: Content(file.kind, file.bytes, file.sha256) for file in self.manifest.files}

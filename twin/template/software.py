@@ -23,8 +23,8 @@ HERE = Path(__file__).absolute().parents[3]
 MAX_MODULE_BYTES = 16 << 20
 MAX_MODULES = 10_000
 MAX_WHEEL_BYTES = 16 << 20
-"""Largest packed size; the largest unpacked size is sixteen times that. A fieldtwin wheel is a tenth of it, and an
-untrusted one may be a zip bomb.
+"""Largest packed size; the largest unpacked size is sixteen times that. A fieldtwin wheel has a tenth of this size, and an
+untrusted wheel may be a zip bomb.
 """
 _DATA = f"{PACKAGE}/_data/"
 _NO_SOURCE = re.compile(r"(^|/)__pycache__/|\.pyc$|(^|/)\.")

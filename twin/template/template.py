@@ -38,7 +38,7 @@ Kind = Literal[
 ]  # fmt: skip
 DocumentKind = Literal["", "blueprint", "technical-manual", "bill-of-materials", "generic"]
 CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth")
-"""Suffixes of files that Python would run when it imports something, or when given one as a simulation."""
+"""Suffixes of files that Python runs when a module is imported, or when the file is named as a simulation."""
 
 _BAD_CHARACTER = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 _DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
@@ -47,7 +47,7 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 
 
 def is_code(path: str) -> bool:
-    """Return whether Python would run the file if something named it."""
+    """Return whether Python would run the file when it is imported or named as a simulation."""
     return path.lower().endswith(CODE_SUFFIXES)
 
 

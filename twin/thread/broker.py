@@ -31,7 +31,7 @@ PASSWORD = "FIELDTWIN_MQTT_PASSWORD"
 
 
 def is_broker(place: str) -> bool:
-    """Return whether `place` is the URL of a broker."""
+    """Return whether the address `place` is the URL of a broker."""
     return place.startswith(SCHEMES)
 
 

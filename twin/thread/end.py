@@ -57,7 +57,7 @@ class ThreadEnd:
         self.connected = False
         self.links = 0
         self.trouble = ""
-        """Why nothing gets through now, or what the other side reported; empty if all is well."""
+        """Why no frames are exchanged now, or the problem that the other side reported; empty if there is no problem."""
         self._refused_by_store = ""
         """Why this side's store refused the last request."""
         self._store = store
@@ -69,7 +69,7 @@ class ThreadEnd:
         self._on_events = on_events
         self._insists = insists
         self.silent = "there was no link"
-        """Explanation if nothing has ever been received; empty once something has."""
+        """A possible reason if nothing was ever received; empty as soon as anything was received."""
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
@@ -183,7 +183,7 @@ class ThreadEnd:
             try:
                 await self._take(frame)
                 self._refused_by_store = ""
-            # The store failed: what it did not store is not acknowledged, and will be sent again.
+            # The store failed. Events that it did not store are not acknowledged, so the other side sends them again.
             except Unreachable as e:
                 self._refused_by_store = str(e)
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)

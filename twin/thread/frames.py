@@ -1,9 +1,8 @@
 """The frames that the two ends of a thread exchange, and their encoding, small enough for an acoustic modem.
 
-A stream is one origin's log on its way to the other twin. Frames identify it by a tag of two bytes, which a HELLO
+A stream is the log of one origin, as it is sent to the other twin. Frames identify it by a tag of two bytes, which a HELLO
 defines. An event takes 8 to 10 bytes: names are numbers in a schema that both ends derive from the system file, times
-are differences, and a value takes only the bytes that it needs. Nothing is rounded: the received event equals the
-logged one.
+are differences, and a value takes only the bytes that it needs. Values are not rounded: the received event equals the logged one.
 
     HELLO    tag, schema id, origin, first and last number of the log, whether from a prototype
     DATA     tag, first number, time, events with consecutive numbers

@@ -15,14 +15,16 @@ from fieldtwin.twin.thread.frames import Frame, FrameCodec, Schema
 
 
 class Unwelcome(Unreachable):
-    """The other side refuses this one, because of its password, certificate or permissions. Waiting does not help."""
+    """The other side refuses this one, because of its password, certificate or permissions. A later attempt would be refused
+    too.
+    """
 
 
 class Link(ABC):
     """A connection to the other side, until it is lost. It has one reader and one writer."""
 
     trouble = ""
-    """Why nothing gets through now although the link is not lost; empty if all is well."""
+    """Why no frames are exchanged now although the link is not lost; empty if there is no problem."""
     quiet = "nothing came"
     """Explanation for the user if nothing is ever received over this link."""
     ack_delay_ns = 0

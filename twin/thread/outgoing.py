@@ -33,7 +33,7 @@ Fit = Callable[[bytes, Sequence[Event]], int]
 class _Slot:
     event: Event
     sent_ns: int = -1
-    """Time at which it was last sent; -1: it is yet to be sent."""
+    """Time at which it was last sent; -1 if it was not sent yet."""
     tries: int = 0
 
 
@@ -81,7 +81,7 @@ class OutgoingLog:
         self.linger_ns = 0
         """How long events wait for more events that fill the frame. The carrier sets it."""
         self.contradicted = False
-        """The other side has more of this log than this side: the store went back in time, for example from a backup.
+        """The other side has more of this log than this side: the store was replaced by an older copy, for example from a backup.
         New events would have numbers that the other side already has.
         """
         self._schema = schema
@@ -156,7 +156,7 @@ class OutgoingLog:
         self._loaded = self.through
 
     def on_ask(self, now_ns: int) -> None:
-        """Send HELLO, because the other side lost what it knew about this stream."""
+        """Send HELLO, because the other side no longer knows this stream."""
         if self._hello_ns is None or now_ns - self._hello_sent_ns > self._rto.now_ns:
             self._hello_ns = now_ns
         self._known = False
@@ -292,7 +292,7 @@ class OutgoingLog:
         oldest = next(iter(self._window.values()), None)
         if oldest is None or oldest.sent_ns < 0 or now_ns < oldest.sent_ns + self._rto.now_ns:
             if oldest is None and not self._lost and self.through < self._loaded and self._tail_due(now_ns):
-                self.connected(now_ns)  # a LOST frame was lost: start again from what is confirmed
+                self.connected(now_ns)  # a LOST frame did not arrive: start again after the last confirmed event
             return
         due_ns = now_ns - self._rto.now_ns
         for number, slot in self._window.items():

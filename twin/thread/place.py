@@ -1,7 +1,7 @@
 """The address of a thread as a URL: ``tcp://127.0.0.1:PORT`` on one computer;
 ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between two (the plant listens, its twin connects, and both present a
 certificate); a broker with Sparkplug B (`fieldtwin.twin.thread.broker`); or the modems of the system: ``modem:`` or
-``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the far
+``modem:DEVICE`` on the plant, which delegates its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the remote
 modem, at its twin.
 """
 
@@ -29,7 +29,7 @@ MODEM_POLL_MS = 200
 
 
 def lent_transmitter(place: str, system: System) -> str:
-    """Return the transmitter whose mailboxes the plant lends to a thread at `place`; empty for other carriers.
+    """Return the transmitter whose mailboxes the plant delegates to a thread at `place`; empty for other carriers.
 
     Raises `UsageError` if there is no transmitter, or if several and none is named.
     """

@@ -148,7 +148,7 @@ class _Side:
         try:
             return Data(tag, tuple(event_of(m, sequence + i, names, types) for i, m in enumerate(rest)))
         except Desync:
-            return Data(tag, ())  # the birth was missed: the receiver will ask for one
+            return Data(tag, ())  # this side did not receive the birth message, and will request one
 
 
 class EdgeNode(_Side):

@@ -23,7 +23,7 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     resent: int
     duplicates: int
     silent: str
-    """Why nothing arrives although the link is open; empty if something does."""
+    """Why nothing arrives although the link is open; empty if data arrive."""
     trouble: str
     """Why events cannot be sent or stored; empty if they can."""
 
@@ -37,6 +37,6 @@ class PlantThreadStatus(ThreadStatus, frozen=True, kw_only=True):
     dropped: int
     """Events that its log lost."""
     store_trouble: str
-    """Why its log cannot be stored; empty if it can."""
+    """Why its log cannot be stored; empty if it is stored."""
     commands_taken: int
     commands_refused: int

@@ -1,9 +1,9 @@
 """A thread over TCP: one side listens, the other connects. Each datagram is preceded by its length in two bytes.
 
-A thread has one follower. A connecting side sends an identifier that it chose, so that it is recognized after a lost
-link and gets its place back at once. A different follower is admitted if the first one no longer answers; otherwise it
-is told that the place is taken. These control messages begin with F0h, which no frame of a thread does, and stay
-between the two links.
+A thread has one follower. A connecting side sends an identifier that it chose, so that the listening side recognises it after
+a lost link and admits it again immediately. A different follower is admitted if the first one no longer answers; otherwise the
+listening side answers that the place is taken. These control messages begin with F0h, which no frame of a thread does, and
+stay between the two links.
 """
 
 from __future__ import annotations

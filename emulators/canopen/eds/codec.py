@@ -24,7 +24,7 @@ _REAL = {REAL32: struct.Struct("<f"), REAL64: struct.Struct("<d")}
 _LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
 """The `struct` letter of signed integers by size in bytes; the capital letter is the unsigned one."""
 _TIME_BYTES = {0x0C: 6, 0x0D: 6}
-"""TIME_OF_DAY and TIME_DIFFERENCE: 48 bits on the wire, opaque here."""
+"""TIME_OF_DAY and TIME_DIFFERENCE: 48 bits as sent; this module does not interpret them."""
 
 # By data type, because they are needed for every value.
 _INTEGER_BYTES = {BOOLEAN: 1} | {data_type: bits // 8 for data_type, bits in (_SIGNED | _UNSIGNED).items()}

@@ -29,7 +29,7 @@ class BusFaults(NodeService):
         self._react = react
         self.state = CanErrorState.ACTIVE
         self.tell: Callable[[int], None] | None = None
-        """Called with the identifier when a second node sends on one of this node's, once until a reset."""
+        """Called with the identifier when a second node sends on an identifier of this node; called once until the next reset."""
         self._told = False
 
     def reset(self, now_ns: int) -> None:
@@ -57,7 +57,7 @@ class BusFaults(NodeService):
             self._raise(PASSIVE, now_ns)
 
     def overrun(self, now_ns: int) -> None:
-        """Report that frames were lost because they came faster than the node took them."""
+        """Report that frames were lost because they arrived faster than the node read them."""
         self._emergency.report(OVERRUN, now_ns, register=emcy.COMMUNICATION)
 
     def heard(self, frame: CanFrame, now_ns: int) -> bool:

@@ -126,7 +126,8 @@ class HeartbeatConsumer(NodeService):
         if len(frame.data) != 1 or frame.data[0] not in set(NmtState):
             self._core.counters.ignored += 1
         elif frame.data[0] == NmtState.INITIALISING:
-            watched.deadline_ns = NEVER  # a boot-up is no heartbeat: watching starts anew with the first one
+            # a boot-up message is not a heartbeat: monitoring starts again with the first heartbeat
+            watched.deadline_ns = NEVER
         else:
             watched.deadline_ns = now_ns + watched.period_ns
             watched.lost = False

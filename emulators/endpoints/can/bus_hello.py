@@ -6,9 +6,9 @@ frame's record has, so a reader of fixed-size records needs no second framing. N
     0  u8   80h
     1  u8   protocol version: 1, or 2 for records that carry CAN FD (80 bytes each); the answer has that of the request
     2  u8   status (answer): 0 welcome, 1 wrong bit rate, 2 unknown version, 3 bus full
-    3  u8   options (request): bit 0, confirm each frame of the client once it was on the wire; bit 1, error frames when the
+    3  u8   options (request): bit 0, confirm each frame of the client once it was sent on the bus; bit 1, error frames when the
             state of the client's controller changes or frames for the client were lost; bit 2, an error frame for each error
-            on the wire in which the client took part
+            on the bus in which the client took part
     4  u32  bit rate: requested (0: that of the bus), in the answer that of the bus
     8  u64  monotonic clock of the bus in ns (answer)
     16 4s   "ftcb"

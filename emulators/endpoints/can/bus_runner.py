@@ -1,7 +1,7 @@
 """The CAN bus model on an event loop: it advances time, delivers frames to ports and holds senders back.
 
-It knows the loop's clock (wall or virtual) and no sockets: the TCP server is one kind of port, an attached connection
-of the same process a different one.
+It knows the loop's clock (wall or virtual) and no sockets: the TCP server is one kind of port, and a connection inside the
+same process is another kind.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class BusPort(Protocol):
         ...
 
     def on_confirmed(self, frame: CanFrame) -> None:
-        """Note that a frame of this node was on the wire; its place in the transmit queue is free."""
+        """Note that a frame of this node was sent on the bus; its place in the transmit queue is free."""
         ...
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
@@ -142,7 +142,7 @@ class BusRunner:
         return taken
 
     def withdraw(self, node: int, can_ids: Collection[int]) -> list[CanFrame]:
-        """Withdraw frames of the node with `can_ids` that are queued and not on the wire yet, and return them."""
+        """Withdraw frames of the node with `can_ids` that are queued and not sent yet, and return them."""
         taken = self._bus.withdraw(node, can_ids, self.now_ns())
         self._schedule()
         return taken
@@ -211,7 +211,7 @@ class BusRunner:
         self._schedule()
 
     def _hand_out(self) -> None:
-        # The loop may fire a timer one clock resolution early; the end of the frame counts as reached all the same.
+        # The loop may fire a timer one clock resolution early; the end of the frame still counts as reached.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
         told = self._told() if self._bus.has_news else None
         touched: dict[int, BusPort] = {}
@@ -294,7 +294,7 @@ class AttachedConnection(TellsOverrun):
             self._held_back -= 1
 
     def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
-        """Withdraw frames sent with `can_ids` that are not on the wire yet, as a controller aborts its mailboxes."""
+        """Withdraw queued frames with `can_ids` that are not sent yet, as a controller aborts its mailboxes."""
         if self.lost is not None:
             return []
         taken = self._runner.withdraw(self._node, can_ids)

@@ -49,7 +49,9 @@ SDO_REPLY, SDO_REQUEST = 0x580, 0x600
 SDO_ABORT = b"\x80"
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 64 * 1024
-"""The kernel's buffer per client. By default it grows to megabytes: minutes of frames that a slow client reads late."""
+"""The kernel's buffer per client. By default it grows to megabytes: it would hold minutes of frames, which a slow client would
+read late.
+"""
 RECEIVE_BUFFER_BYTES = 16 * 1024
 """The receive buffer: a sender that waits for no confirmations is held back after some hundred frames."""
 
@@ -183,7 +185,7 @@ class _Client(asyncio.Protocol):
         self._max_outbound_bytes = bus._max_outbound_bytes
         self._lost_since_ns = 0  # start of a loss of frames that has not been reported to this client
         self._reading = True
-        self._flooded = False  # it asked for confirmations and does not read them
+        self._flooded = False  # the client asked for confirmations and does not read them
 
     # -- transport ------------------------------------------------------------------------------------------------
 

@@ -121,7 +121,7 @@ class _Client(asyncio.Protocol):
         return True
 
     def on_confirmed(self, frame: CanFrame) -> None:
-        """Do nothing: this protocol confirms queued frames, not frames on the wire."""
+        """Do nothing: this protocol confirms that a frame was queued, not that it was sent."""
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
         self._session.controller(frame)

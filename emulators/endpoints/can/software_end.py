@@ -149,7 +149,7 @@ class SoftBusEnd(TellsOverrun):
             try:
                 await asyncio.wait_for(self._all_sent.wait(), CLOSE_TIMEOUT_S)
             except TimeoutError:
-                pass  # a slow bus: it sends the rest after this node has left
+                pass  # the bus is slow: it sends the rest after this node has left
         self._end(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         self._task.cancel()
@@ -175,7 +175,7 @@ class SoftBusEnd(TellsOverrun):
     def _end(self, reason: FieldtwinError) -> None:
         self.feed_lost(reason)
         self._all_sent.set()
-        self._slots.release()  # one waiter wakes, finds the end, and wakes the next
+        self._slots.release()  # each waiting task that wakes and finds the end wakes the next one
 
 
 async def _hang_up(writer: asyncio.StreamWriter) -> None:

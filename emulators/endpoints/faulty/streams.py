@@ -52,7 +52,7 @@ class FaultyEnd(ByteConnection):
         self._flush: asyncio.TimerHandle | None = None
         inner.intercept = self._heard
         faults.listeners.append(self._put_in)
-        for active in faults.active.values():  # faults that were put in before this connection was opened
+        for active in faults.active.values():  # faults that were injected before this connection was opened
             self._put_in(active)
 
     # -- connection interface -------------------------------------------------------------------------------------------

@@ -33,7 +33,9 @@ class Reorder(WireFault):
         )
 
     def _went(self, frame: FaultFrame) -> bool:
-        """Return whether the held frame has already been sent after a later frame. If not, its time is over: release it."""
+        """Return whether the delayed frame has already been sent after a later frame. If not, its time is over and it is sent
+        now.
+        """
         if self._held is not frame:
             return True
         self._held = None

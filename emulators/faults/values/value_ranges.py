@@ -22,7 +22,7 @@ _MOST_SENTINELS = 64
 
 
 def numbers(tags: Iterable[Tag]) -> list[Tag]:
-    """Return the tags that a value fault can strike: readable tags that are numbers."""
+    """Return the tags that a value fault can change: readable tags that are numbers."""
     return [tag for tag in tags if tag.readable and not tag.is_text]
 
 
@@ -85,7 +85,7 @@ def beyond(tag: Tag, name: str) -> float:
 def check_fault(fault: Fault, register: str, tags: Iterable[Tag], device: str = "") -> None:
     """Raise `WrongAim` for a fault that would give tags of `device` a value which they cannot hold.
 
-    `register` is the name of the tag that the fault is aimed at; "" means that it strikes all `tags` of the device.
+    `register` is the name of the tag that the fault is aimed at; "" means that it changes all `tags` of the device.
     """
     if not isinstance(fault, ValueFault) or "value" not in fault.form.model_fields:
         return

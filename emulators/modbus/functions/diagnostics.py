@@ -1,7 +1,7 @@
 """The counters of a unit, and the functions that read and clear them: 07, 08, 0B and 0Ch (AP 6.7 to 6.10; SL appendix A).
 
-There are two views of the same numbers: `UnitCounters` only grow (they are evidence); the client's view starts at its
-last clear.
+The same numbers are counted in two ways: `UnitCounters` only increase, because runs are checked against them; the counters
+that a client reads start again when the client clears them.
 """
 
 from __future__ import annotations

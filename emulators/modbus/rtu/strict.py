@@ -1,4 +1,4 @@
-"""RTU frames recognised only by the pauses of the line, as a directly connected UART hears them (SL 2.5.1.1).
+"""RTU frames recognised only by the pauses of the line, as a directly connected UART receives them (SL 2.5.1.1).
 
 Pure. A pause of t3.5 ends a frame, and a pause of more than t1.5 inside a frame spoils it; lengths are not used. It
 suits media that deliver every byte in time. Ptys, sockets and USB adapters do not preserve the pauses: use

@@ -56,7 +56,7 @@ class DistortedObjects:
         distortions.counts_given = True
 
     def given(self, keys: Iterable[Key], now_ns: int) -> None:
-        """Note that the node has sent the values of the objects `keys`: each fault that distorts one of them has struck."""
+        """Note that the node has sent the values of the objects `keys`: each fault that distorts one of them has taken effect."""
         if not self.distortions:
             return
         for key in keys:

@@ -55,7 +55,7 @@ class MailboxModem(RegisterBank):
         self._pending: bytes | None = None
         for name, text in (identity or {}).items():
             self._state(name, text)
-        for tag in self._tags.values():  # tags without an identity are empty or 0, and are read as such
+        for tag in self._tags.values():  # tags without an identity are read as empty or 0
             if tag.readable and tag.name not in (identity or {}):
                 self._note(tag, 0)
 
@@ -132,7 +132,7 @@ class MailboxModem(RegisterBank):
         at = self._outbox.at
         sequence, length = self._cells.peek("holding", at.address), self._cells.peek("holding", at.address + 1)
         if sequence == self._accepted:
-            return  # the same message again: its sender did not receive the reply
+            return  # the client sends the same message again, because it did not receive the reply
         first = at.address + 2
         words = [self._cells.peek("holding", a) for a in range(first, first + (length + 1) // 2)]
         self._accepted = sequence

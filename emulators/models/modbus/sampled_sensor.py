@@ -27,7 +27,7 @@ MAX_CATCH_UP = 3600
 """Most samples taken at one access after a long time without one; older samples are skipped, but counted."""
 
 OWN = ("status", "instrument_time")
-"""Tags that the model fills itself, besides the sample counter and the period."""
+"""Tags whose values the model provides itself, in addition to the sample counter and the period."""
 
 
 def sampled_tags(profile: DeviceProfile, identity: Iterable[str]) -> list[Tag]:
@@ -66,7 +66,7 @@ class SampledSensor(RegisterBank):
             self._put(tag, 0, player.start_ns)
         for name, text in identity.items():
             self._put(self._tag(name, profile), text, player.start_ns)
-        for tag in profile.tags.values():  # a text without an identity is empty, and is read as such
+        for tag in profile.tags.values():  # a text without an identity is read as an empty text
             if tag.is_text and tag.readable and tag.name not in identity:
                 self._note(tag, player.start_ns)
         if period_s:

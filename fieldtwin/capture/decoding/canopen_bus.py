@@ -74,7 +74,7 @@ class CanopenBusDecoder:
         return f"{frame}: not a CANopen identifier", []
 
     def finish(self) -> list[DecodedExchange]:
-        """Conclude the trace: the remaining open requests get no answer."""
+        """End the trace: requests that are still open count as unanswered."""
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 
@@ -179,7 +179,8 @@ class CanopenBusDecoder:
         if seen.stray:
             done.append(self._stray(node, seen.text, data, t_ns))
             return done[-1].text, done
-        opened = watch.open  # its segments are only reported as received, and those of a secret without their content
+        # the text of a segment only reports that it was received; the content of a secret is not shown
+        opened = watch.open
         hidden = opened is not None and self._secrets(node, (_span(opened),))
         return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
 

@@ -61,11 +61,11 @@ class Decoder:
         return Decoded(text, fields, tuple(done))
 
     def feed(self, event: TraceEvent) -> list[DecodedExchange]:
-        """Return the exchanges that an event ended: by an answer, by the next request, or as a message."""
+        """Return the exchanges that an event ended: with an answer, with the next request, or as a message without an answer."""
         return self._frame(event)[1] if event.kind is TraceKind.FRAME else []
 
     def finish(self) -> list[DecodedExchange]:
-        """Conclude the trace: requests that still wait have no answer."""
+        """End the trace: requests that are still open count as unanswered."""
         wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
 

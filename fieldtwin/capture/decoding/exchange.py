@@ -50,11 +50,11 @@ class DecodedExchange:
     kind: ``read holding registers``, ``SDO upload``, ``TPDO1``. `tags` are the values that the exchange carried, in
     engineering units, None for those that were requested but not returned; `registers` the words, or for bits 0 and 1.
 
-    `problem` is the reason why there is no good answer, "" for a good one: ``no reply``, ``check sum``, ``exception``,
+    `problem` is the reason why there is no good answer, "" for a good answer: ``no reply``, ``check sum``, ``exception``,
     ``abort``, ``stray`` (a frame that answers no request), ``malformed``; ``pending`` while the answer may still come,
     which only `Decoder.pending` gives. `transaction` is the transaction ID on Modbus TCP, None elsewhere. `latency_ns`
     is from the request to the last byte of the answer, None without one. `t_ns` is when the request was seen, `end_ns`
-    when the last byte of all was. `text` describes the request, `reply_text` the answer. `value` is the value of an SDO
+    the time of its last byte. `text` describes the request, `reply_text` the answer. `value` is the value of an SDO
     transfer (engineering units where it is a tag, hex where its type is not known), an EMCY's code, a heartbeat's
     state.
     """

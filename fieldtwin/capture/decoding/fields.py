@@ -37,7 +37,7 @@ class FieldReader:
     def take(self, size: int, name: str, value: Callable[[bytes], str] | str = "", note: str = "") -> bytes:
         """Make the next `size` bytes a field and return them.
 
-        With fewer bytes left, the value states that the field is incomplete; with none left, no field is made.
+        With fewer bytes left, the value states that the field is incomplete; if no bytes are left, no field is created.
         """
         piece = self.data[self._at : self._at + max(0, size)]
         if len(piece) < size:

@@ -47,7 +47,7 @@ class LssWatch:
         return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
 
     def finish(self) -> list[DecodedExchange]:
-        """Conclude the trace: a request that still waits has no answer."""
+        """End the trace: a request that is still open counts as unanswered."""
         now, self._open = self._open, None
         if now is None:
             return []

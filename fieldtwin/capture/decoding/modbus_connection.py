@@ -72,7 +72,7 @@ class ModbusConnectionDecoder:
         return self._take_requests(data, t_ns) if sent != self.served else self._take_replies(data, t_ns)
 
     def finish(self) -> list[DecodedExchange]:
-        """Conclude the trace: requests that still wait have no answer."""
+        """End the trace: requests that are still open count as unanswered."""
         texts: list[str] = []
         done: list[DecodedExchange] = []
         self._settle(texts, done)
@@ -191,7 +191,7 @@ class ModbusConnectionDecoder:
             texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
 
     def _older(self, answered: _Open) -> list[DecodedExchange]:
-        """End older requests: the gateway sends one request at a time, so it gave them up."""
+        """End older requests: the gateway sends one request at a time, so it has given up the older ones."""
         older = [t for t, o in self._open.items() if o.frame.t_ns <= answered.frame.t_ns]
         self._given_up.extend(older)
         return [self._unanswered(self._open.pop(t)) for t in older]
@@ -287,7 +287,7 @@ def _values(tags: TagMap | None, span: TouchedSpan, data: bytes, t_ns: int) -> s
 
 
 def _shown(tags: TagMap | None, span: TouchedSpan, found: dict[str, Scalar | None], registers: tuple[int, ...]) -> str:
-    """Return the tags as text if there are any, else the words."""
+    """Return the tags as text; without tags, return the register words."""
     if tags is not None and found:
         return tags.show(found)
     if tags is not None and tags.secret(span):

@@ -69,7 +69,7 @@ class Splitter(ABC):
         return self._split(expected, False)
 
     def flush(self, expected: Expected | None = None) -> list[ModbusFrame]:
-        """Conclude the frame: no further bytes belong to it, and the remaining ones are a frame, or noise."""
+        """End the present frame: no further bytes belong to it. The bytes so far are a complete frame, or noise."""
         return self._split(expected, True) if self._buffer else []
 
     @abstractmethod
@@ -118,7 +118,9 @@ class RtuSplitter(Splitter):
         return found
 
     def _frame_at(self, at: int, expected: Expected | None, settled: bool) -> tuple[int, str]:
-        """Return the size of the frame at `at` and its fault; 0: no frame; -1: more bytes are needed."""
+        """Return the size of the frame at position `at` and its fault. The size is 0 if no frame begins there, and -1 if more
+        bytes are needed.
+        """
         head = self._buffer[at:]
         if head[0] > _LAST_UNIT:
             return 0, ""

@@ -1,7 +1,7 @@
 """The knowledge about a CANopen node without querying it: its tags, its objects' types, and the content of its PDOs.
 
-It comes from the profile, its EDS and the system file at first; then from the observed transfers, so that a mapping
-written over SDO applies from then on. Pure except for reading the EDS.
+At first it comes from the profile, its EDS and the system file. Observed transfers then update it, so that a mapping applies
+as soon as it was written over SDO. Pure except for reading the EDS.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class NodeMap:
         return f"{number} {name}".rstrip()
 
     def said(self, index: int, subindex: int, data: bytes, t_ns: int) -> str:
-        """Return the value in words: a tag with its unit, a PDO's identifiers and mappings in their own form."""
+        """Return the value as text: a tag with its unit, and identifiers and mappings of a PDO in their usual notation."""
         word = int.from_bytes(data, "little")
         if len(data) == 4 and index in _PARAMETERS:
             if index not in _MAPPINGS and subindex == 1:

@@ -69,7 +69,7 @@ class SdoWatch:
         self.open: Transfer | None = None
 
     def drop(self) -> Transfer | None:
-        """Return the open transfer at the end of the trace; it has no answer."""
+        """Return the transfer that is still open at the end of the trace, as unanswered."""
         now, self.open = self.open, None
         return now
 
@@ -135,7 +135,7 @@ class SdoWatch:
         return Seen(f"{now.service} {now.name}" + (" in blocks" if now.block else ""), dropped=dropped)
 
     def _upload_reply(self, now: Transfer, data: bytes) -> Seen:
-        now.answered, now.block = True, False  # a node may answer a block upload with a plain one
+        now.answered, now.block = True, False  # a node may answer a block upload with an ordinary upload
         if data[0] & 2:
             _keep(now, _expedited(data))
             return self._over(now)

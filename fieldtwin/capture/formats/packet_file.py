@@ -110,7 +110,7 @@ class PacketFile:
         major, _, _, _, _, link = struct.unpack(f"{order}HHiIII", head)
         if major != 2:
             raise self._invalid("a different version of the format", expected="2", got=str(major), at=4)
-        link &= 0xFFFF  # above it: whether frames end with a check sum
+        link &= 0xFFFF  # the bits above show whether frames end with a check sum
         read, unpack = self._read, struct.Struct(f"{order}IIII").unpack
         while head := read(16):
             if len(head) < 16:

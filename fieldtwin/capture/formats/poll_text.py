@@ -106,7 +106,7 @@ def read_polls(lines: Iterable[str], path: str = "") -> Iterator[RecordedExchang
             yield asked.exchange(polls, cells, failed)
         except (ValueError, KeyError, struct.error, OverflowError) as e:
             if len(cells) == asked.count:
-                raise _invalid(path, number, e) from e  # otherwise the file was truncated in its last poll
+                raise _invalid(path, number, e) from e  # the file ends inside its last poll
 
 
 def _read_head(asked: _Asked, text: str) -> None:

@@ -278,7 +278,7 @@ class Conversations:
         flags, payload = data[at + 13], data[at + (data[at + 12] >> 4) * 4 : end]
         if flags & 0x10:
             self._acknowledged(sender, other, int.from_bytes(data[at + 8 : at + 12]), t_ns)
-        if flags & 0x07 == 0x02:  # together with FIN or RST it opens no connection
+        if flags & 0x07 == 0x02:  # a SYN together with FIN or RST does not open a connection
             self._opened(sender, other, data[at + 4 : at + 8], acknowledged=bool(flags & 0x10))
             return
         if payload:

@@ -1,7 +1,7 @@
 """Find the position at which a live dialogue continues a recorded one, cell by cell.
 
 An emulator of a recording gives each register and bit its recorded values one after the other. If it was read before,
-its values come from further on in the recording; compared position by position, the same device would seem different.
+its values come from further on in the recording; a comparison by position would then report differences for the same device.
 So where exchanges differ, the live values are looked up in the recorded ones. A shifted match counts only if it is
 exact and contains at least two different values: a device with a constant value, or a different device, matches
 nothing. Values after the end of the recorded ones are not compared. Pure.
@@ -143,7 +143,7 @@ class Dialogue:
     def aligned(self, alike: Callable[[RecordedExchange, RecordedExchange], bool]) -> list[Aligned]:
         """Return all pairs, each with the recorded exchange at the position that was found; fills `shifts`.
 
-        Only exchanges that are not `alike` position by position are looked up elsewhere.
+        Exchanges that are equal at the same position (`alike`) are not searched for at other positions.
         """
         differ = {(one.unit, one.request) for one, other in self._pairs if not alike(one, other)}
         if self.is_full or not differ or not self._shift_all(differ):

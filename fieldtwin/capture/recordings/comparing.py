@@ -96,7 +96,7 @@ class LatencyRow:
 
 @dataclass(slots=True)
 class Comparison:
-    """The result of a comparison. `extra` counts exchanges that only the other side has; they have no verdict."""
+    """The result of a comparison. `extra` counts exchanges that only the other side has; they do not affect the verdict."""
 
     compared: int = 0
     alike: int = 0
@@ -107,7 +107,7 @@ class Comparison:
     after_left_out: int = 0
     """Number of differing exchanges that read a cell set by an omitted write."""
     not_compared: int = 0
-    """Number of repeated exchanges for which the recording has no value at the position that was found."""
+    """How many repeated exchanges could not be compared, because the recording has no value at the matching position."""
     shifts: list[Shift] = field(default_factory=list)
     extra: int = 0
     latency: list[LatencyRow] = field(default_factory=list)

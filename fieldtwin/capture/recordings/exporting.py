@@ -49,7 +49,7 @@ class TableColumn:
 
 
 def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, framing: str = "mbap", url: str = "") -> int:
-    """Write the recording, log or capture at `path` as `out`; how many records. `out` must not be there.
+    """Write the recording, log or capture at `path` as `out`, and return the number of records. `out` must not exist.
 
     With `profile`, a table of exchanges has a column for each tag. `framing` (mbap or rtu) is how exchanges are framed in a
     pcap file. `url`: of a capture with several endpoints this one.
@@ -268,7 +268,8 @@ def _start_ns(header: RecordingHeader) -> int:
     try:
         return round(datetime.fromisoformat(header.start_utc).timestamp() * 1e9)
     except (ValueError, OverflowError):
-        return NS_PER_S  # unknown: a second after 1970 began, so that a handshake before it has a time too
+        # the time is unknown: one second after the start of 1970, so that an earlier handshake can be dated too
+        return NS_PER_S
 
 
 def _is_capture(path: Path) -> bool:

@@ -71,7 +71,7 @@ class Pairer(ABC):
 
     @abstractmethod
     def finish(self) -> list[RecordedExchange]:
-        """Conclude the connection: requests that still wait have no answer."""
+        """End the connection: requests that are still open count as unanswered."""
 
     def lost(self, sent: bool) -> None:  # noqa: B027 - only a stream can lose its place
         """Note that bytes of one direction are missing (a capture dropped packets): an open frame stays incomplete."""
@@ -152,7 +152,9 @@ class MbapPairer(Pairer):
         self._open[transaction] = (t_ns, unit, pdu)
 
     def _give_up(self, found: list[RecordedExchange]) -> None:
-        """Complete the oldest request: it has no answer, or its answer has waited for its turn in order."""
+        """Complete the oldest request, either without an answer or with an answer that was kept until all older requests were
+        complete.
+        """
         transaction = next(iter(self._open))
         t_ns, unit, request = self._open.pop(transaction)
         done = self._done.pop(transaction, None)
@@ -254,7 +256,9 @@ class SerialPairer(Pairer):
         self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], size), frame.t_ns)
 
     def _settle(self, found: list[RecordedExchange]) -> None:
-        """Conclude the exchange at the next request or at the end: remaining bytes are a complete reply, or noise."""
+        """End the exchange at the next request or at the end of the recording. The remaining bytes are a complete reply, or
+        noise.
+        """
         if self._replies.pending:
             self._take_replies(self._replies.flush(self._expected), found)
         if (asked := self._asked) is not None:

@@ -69,7 +69,8 @@ class LineSink:
 
     def saw(self, direction: Direction, t_ns: int, data: bytes) -> None:
         """Write `data` that passed in that direction: SENT is towards the device."""
-        if self._head is not None:  # written with the first bytes: a tap that was never connected leaves no file
+        # the file is created with the first bytes, so a tap that was never connected leaves no file
+        if self._head is not None:
             head, self._head = self._head, None
             self._line(t_ns, head)
         self.bytes[direction] += len(data)

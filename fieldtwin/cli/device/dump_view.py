@@ -94,7 +94,7 @@ def unknown_text(dump: Dump) -> str:
 
 
 def _lengths_text(line: dict[str, Any]) -> str:
-    """Return what a sampled dump cannot guarantee for a register table; "" if nothing."""
+    """Return a sentence about the limits of a sampled dump of a register table; "" for a dump without such limits."""
     if line["map"] not in ("holding", "input") or line.get("function_refused") or not line.get("sampled"):
         return ""
     missing = [n for n in (1, 2) if n not in line.get("lengths", [])]

@@ -334,13 +334,13 @@ def _allow_writes(recording: Path, url: str, sending: LiveOptions) -> None:
 
 
 def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
-    """Return the items with a limited number of write cycles: each is written once, never in a loop."""
+    """Return the items with a limited number of write cycles. Each is written once, and never repeatedly."""
     tags = profile.tags.values() if profile is not None else ()
     return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}
 
 
 def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:
-    """Run until the comparison is done or a signal ends it; what has been compared by then counts."""
+    """Run until the comparison is done or a signal ends it. The result then covers the exchanges that were compared so far."""
 
     async def main() -> None:
         stop = stop_signal()
@@ -396,7 +396,7 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
 
 
 def _show_shifts(result: Comparison) -> None:
-    """Print where the dialogue continued the recorded one, and what the recording does not cover."""
+    """Print at which positions the live dialogue continued the recorded one, and which exchanges the recording does not cover."""
     for shift in result.shifts[:SHOWN]:
         stdout.print(
             f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",

@@ -117,7 +117,7 @@ class LiveView:
             open_ports = self._tell_once(open_ports)
             now = [*troubles(self._session), *_waiting_once(self._session)]
             for trouble in now:
-                if trouble not in told:  # once, and again only after it had disappeared
+                if trouble not in told:  # a problem is printed once, and again only after it had disappeared
                     stderr.print(f"! {trouble}", soft_wrap=True, markup=False)
             told = set(now)
             stderr.print(line(self._session), soft_wrap=True, markup=False)
@@ -260,7 +260,7 @@ def render(session: RunSession) -> RenderableType:
     parts: list[RenderableType] = [head, _devices(session), _foot(session)]
     parts += [Text(text, style="bold yellow") for text in interference(session)]
     parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
-    parts.append(_tags(session))  # last, so that a low terminal cuts off only the end of the list
+    parts.append(_tags(session))  # this table comes last, so that a low terminal cuts off only the end of the list
     return Group(*parts)
 
 
@@ -289,7 +289,8 @@ def _devices(session: RunSession) -> Table:
         good = device.online
         table.add_row(
             name,
-            Text("good", "green") if good else Text("bad", "red"),  # the reason is shown below, where there is room
+            # the reason is shown below the table, where there is more room
+            Text("good", "green") if good else Text("bad", "red"),
             f"{device.bus}:{device.address}",
             str(counters.get("requests", counters.get("sdo_requests", 0))),
             str(counters.get("replies", counters.get("sdo_replies", 0))),
@@ -457,7 +458,7 @@ def _thread_text(thread: dict[str, Any]) -> str:
 
 
 def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
-    """Return what was learnt about a device; the last line is the one for its profile, ready to be copied."""
+    """Return the gaps that were learnt about a device. The last line is ready to be copied into its profile."""
     parts = []
     if learnt["missing"]:
         parts.append(f"does not have {', '.join(learnt['missing'])}")

@@ -262,7 +262,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, studio: str
         nonlocal interrupted
         interrupted = True
         session.stopped.set()
-        if not started:  # on a busy computer this takes a while, and the user has asked to stop
+        if not started:  # on a busy computer stopping takes a while, and the user should see that it has begun
             me.cancel()
 
     loop = asyncio.get_running_loop()

@@ -157,7 +157,7 @@ def run_many(
 
 
 def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
-    """Return how many faults all runs had, and how often they struck, by name."""
+    """Return how many faults all runs had, and how often they took effect, by name."""
     if not faults:
         return "none was injected"
     of = {name: [(put_in, struck) for other, put_in, struck in faults if other == name] for name, _, _ in faults}
@@ -190,7 +190,9 @@ def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
 
 
 def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
-    """Return in words which faults the failure of a seed needs, and what happens without any of them."""
+    """Return sentences that name the faults which are needed for the failure of a seed, and the result of a run without
+    faults.
+    """
     if not count:
         return [f"seed {seed} also fails without faults, so the faults are not the cause"]
     what = f"{count} fault{'s' if count > 1 else ''}"

@@ -209,7 +209,7 @@ def _print_files(manifest: Manifest) -> None:
         f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True
     )
     stdout.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
-    for file in manifest.files:  # the path is last and unwrapped, so that it can be copied
+    for file in manifest.files:  # the path is printed last and not wrapped, so that it can be copied
         words = f"  {file.sha256[:12]}  {file.bytes:13,}  {file.document or file.kind:17}  {escape(file.path)}"
         stdout.print(words, soft_wrap=True, highlight=False)
 

@@ -45,7 +45,7 @@ class ShadowTalk:
         stderr.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
 
     def trouble(self, where: str, text: str) -> None:
-        """Print the problems of thread or store once, and their end."""
+        """Print each problem of the thread or the store once, and its end."""
         if not self._quiet:
             self.line(f"[bold yellow]{where:10}[/]", text or "recovered")
 

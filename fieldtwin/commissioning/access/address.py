@@ -136,7 +136,9 @@ def _by_name(item: str, tags: Mapping[str, Tag]) -> list[Tag]:
 
 
 def with_care(tag: Tag, profile: DeviceProfile | None) -> Tag:
-    """Give a raw address the danger and the wear of the profile's tags there, so that an address does not bypass them."""
+    """Mark a raw address as dangerous or nonvolatile if a tag of the profile at that address is, so that a raw address does
+    not bypass these checks.
+    """
     if profile is None or tag.name in profile.tags or tag.at is None:
         return tag
     at = tag.at

@@ -129,7 +129,8 @@ def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
         kind = f"uint{8 * len(data)}" if len(data) in (1, 2, 4) else "string" if text else "bytes"
         tag = replace(tag, type=kind)
     size = OBJECT_BYTES.get(tag.type, None if tag.is_text else 8)
-    if size is not None and len(data) != size:  # not the stated type: shown, and never decoded as another type
+    # the bytes do not have the length of the stated type: they are shown, and not decoded as a different type
+    if size is not None and len(data) != size:
         return TagValue(data, Quality.UNCERTAIN, Reason.NOT_A_NUMBER, t_ns, data)
     return decode_little(tag, data, t_ns)
 

@@ -19,9 +19,9 @@ STATE_NAMES = ("not asked", "readable", "refused", "no reply", "invalid reply")
 """The names for users; the keys of a dump file are `STATE_KEYS`."""
 STATE_KEYS = ("not_asked", "readable", "refused", "silent", "invalid")
 SHORT = 2
-"""A read of more values than this does not decide the state of an address that it could not bring."""
+"""A refused read of more values than this does not show the state of a single address."""
 GRID = 8
-"""A stretch of fewer addresses than this between two definite answers counts as sampled, not as unknown."""
+"""A range of fewer addresses than this between two definite answers counts as sampled and not as unknown."""
 ADDRESSES = 65536
 
 Spans = Sequence[tuple[int, int]]

@@ -161,7 +161,8 @@ class Dumper:
             await self._functions()
         if not result.answered:
             raise Unreachable("nobody answers", where=f"{self._job.target.url} address {self._job.target.address}")
-        for sweep in sweeps:  # only after the first reads, so that a missing device is reported soon
+        # the functions are tested after the first reads, so that a missing device is reported soon
+        for sweep in sweeps:
             if isinstance(sweep, Sweep):
                 await self._follow(sweep, beyond_silence(sweep), total, total)
                 await self._follow(sweep, other_lengths(sweep), total, total)
@@ -229,7 +230,9 @@ class Dumper:
             self._progress(i + 1, len(reads), self.result.requests)
 
     async def _read_again(self, asked: RegisterRange | ObjectKey) -> None:
-        """Repeat a read, and halve it if it is refused: there may be a border where two sweeps' reads met."""
+        """Repeat a read, and halve it if it is refused: the device may not accept a read across the border between two earlier
+        sweeps.
+        """
         outcome = await self._outcome(asked)
         if isinstance(outcome, RefusedRead) and isinstance(asked, RegisterRange) and asked.count > 1:
             half = asked.count // 2

@@ -7,7 +7,7 @@
     {"read": "holding:0..124", "hex": "...", "us": 3120}        answered after 3120 us
     {"read": "holding:125..249", "code": 2, "us": 1800}         refused; an SDO abort has its code here too
     {"read": "holding:125", "silent": "...", "us": 3000000}     no reply
-    {"read": "holding:126", "invalid": "...", "us": 9000}       something came that is no valid reply; `values` as in `Invalid`
+    {"read": "holding:126", "invalid": "...", "us": 9000}       the received bytes are not a valid reply; `values` as in `Invalid`
     {"map": "holding", "readable": ["holding:0..124"], "refused": [], "silent": [...], "not_asked": [...], "max_read": 125, ...}
     {"function": 17, "hex": "..."}                              likewise `code`, `silent`, `invalid`
     {"latency": {"03": {...}}}
@@ -244,7 +244,7 @@ def _header(line: dict[str, Any]) -> dict[str, Any]:
 
 
 def _take(dump: Dump, line: dict[str, Any]) -> int:
-    """Put a line where it belongs; how many cells it brought."""
+    """Add a line of the file to the dump, and return the number of cells whose values it holds."""
     if "pass" in line:
         at = datetime.fromisoformat(line["at"])
         dump.passes.append(Pass(round(at.timestamp() * 1000) * 1_000_000))
@@ -264,7 +264,9 @@ def _take(dump: Dump, line: dict[str, Any]) -> int:
 
 
 def take_read(dump: Dump, line: dict[str, Any]) -> int:
-    """Put an answer into the last pass, and into the coverage if that is the first. Return how many values it brought."""
+    """Add an answer to the last pass, and also to the coverage if it is the first pass. Return the number of values in the
+    answer.
+    """
     current, outcome = dump.passes[-1], outcome_of(line)
     if dump.protocol == "canopen":
         key = ObjectKey.parse(line["read"])

@@ -99,7 +99,7 @@ async def identify_modbus(
         if "no answer" in result.clues.silence.values() or not result.answers:
             on_progress(
                 "register 0"
-            )  # a pause, also for servers that lose the request after one with an unknown function
+            )  # the pause also helps servers that lose the next request after a request with an unknown function
             await asker.ask("03", ReadRegisters("holding", 0, 1))
         if result.answers:
             for profile in profiles:
@@ -152,7 +152,7 @@ class _Asker:
                 self._result.clues.silence["2B"] = "no answer" if isinstance(e, ReplyTimeout) else e.message
                 break
             if len(objects) == before:
-                break  # the unit supports no higher level: it repeats its objects
+                break  # the unit does not support a higher level, and repeats the objects of the lower one
         if objects:
             self._result.answers = True
             self._result.clues.silence.pop("2B", None)

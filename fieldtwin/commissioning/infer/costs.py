@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.profile import REGISTERS_OF
 from fieldtwin.gateway.devices.codec import reorder
 
 IMPOSSIBLE = math.inf
-"""A reading that no device means: not a number, a magnitude beyond all physics."""
+"""The cost of a reading that no device can have, such as NaN or a number of an impossible size."""
 MOST_TEXT_REGISTERS = 24
 
 TYPE_COST = {

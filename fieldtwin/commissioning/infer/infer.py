@@ -69,7 +69,8 @@ def series_of(dumps: Sequence[Dump]) -> Series:
     passes = sorted((p for d in dumps for p in d.passes if p.cells), key=lambda p: p.utc_ns)
     if dumps and not all(d.ended for d in dumps) and len(passes) > 1:
         most = max(len(p.cells) for p in passes)
-        passes = [p for p in passes if len(p.cells) >= 0.9 * most]  # an interrupted pass would leave no common cells
+        # with an interrupted pass there may be no common cells
+        passes = [p for p in passes if len(p.cells) >= 0.9 * most]
     if not passes:
         raise FileInvalid("a dump without values", path=dumps[0].path if dumps else "")
     common = set(passes[0].cells)

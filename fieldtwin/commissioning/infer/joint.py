@@ -33,7 +33,7 @@ def carry_evidence(highs: Sequence[int], lows: Sequence[int]) -> float:
         if abs(whole) > min(HALF, 8 * usual + 64) or abs(low) < HALF:
             return 0.0
     if any(size > HALF for size in within):
-        return 0.0  # the low word wraps and the high word does not change
+        return 0.0  # the low word wraps around, and the high word does not change
     count = len(changes)
     ways = math.lgamma(len(steps) + 1) - math.lgamma(count + 1) - math.lgamma(len(steps) - count + 1)
     return ways + _CARRY_SIGN + (count - 1) * math.log(4)

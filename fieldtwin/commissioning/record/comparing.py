@@ -168,7 +168,7 @@ async def compare_node(
             try:
                 await master.sdo_upload(exchange.unit, span.address, span.subindex)
             except (SdoAborted, WireError):
-                pass  # a refusal or silence is compared too: the recorded frames contain it
+                pass  # a refusal or a missing reply is compared too, because the recorded frames contain it
             done += 1
             progress(done)
         if listen_s:

@@ -289,7 +289,7 @@ class CanScanner:
                 while not self._stop() and len(result.unconfigured) < MOST_UNCONFIGURED:
                     found = await lss.fastscan(
                         verify=not result.unconfigured
-                    )  # a node that was found does not answer further scans
+                    )  # LSS: a node that was found does not answer further fastscan requests
                     if found is None:
                         break
                     result.unconfigured.append(found)

@@ -23,7 +23,7 @@ HEALTHY = 0.97
 ENOUGH_TEXT = 12
 """Fewer readable bytes are chance."""
 _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
-"""Bytes that a receiver sees when the sender's bits are many times longer than its own."""
+"""The bytes that a receiver gets when the bits of the sender are many times longer than those of the receiver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def serial_causes(e: SerialEvidence) -> list[LikelyCause]:
 
 
 def _elsewhere(e: SerialEvidence) -> bool:
-    """Return whether traffic proved other settings."""
+    """Return whether the traffic proves that the line has different settings."""
     return e.verdict is not None and e.verdict.sure and e.settings not in (e.verdict.settings, *e.verdict.others)
 
 

@@ -1,4 +1,4 @@
-"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. Thin around `causes`.
+"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. It is a thin layer around `causes`.
 
 Nothing is sent, except one question if the user requested a probe: only a probe can show an echo. A probe is not sent
 into foreign traffic without permission.
@@ -162,7 +162,7 @@ class _Looker:
             while sweep.asked < 2 and (step := sweep.poll(clock.monotonic_ns())) is not None:
                 if isinstance(step, SendRequest):
                     if sweep.asked > 1:
-                        break  # one question only: it is not repeated if damaged
+                        break  # only one question is sent: it is not repeated if the answer is damaged
                     sent = step.data
                     await connection.write(sent)
                     sweep.handed_over(clock.monotonic_ns())
@@ -273,7 +273,7 @@ def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> ScanPro
 
 
 def _alike(sent: bytes, heard: bytes) -> bool:
-    """Return whether `heard` is `sent` with some bytes changed."""
+    """Return whether the bytes `heard` equal the bytes `sent`, apart from some changed bytes."""
     same = sum(a == b for a, b in zip(sent, heard, strict=False))
     return same * 2 >= len(sent)
 

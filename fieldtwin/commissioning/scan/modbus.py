@@ -1,7 +1,7 @@
 """`scan` of a Modbus endpoint: listen, then the likely settings, then every unit.
 
-The pure parts decide, this moves bytes. Nothing is sent before the line has been observed, and nothing at all if
-traffic was heard and the user did not allow sharing the bus.
+Pure modules decide which questions are sent; this module sends them. Nothing is sent before the line has been observed, and
+nothing at all if traffic was heard and the user did not allow sharing the bus.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class ScanOptions:
 
 @dataclass(frozen=True, slots=True)
 class FoundUnit:
-    """A unit and where it answers. `doubtful`: it did not when it was asked a second time."""
+    """A unit that was found, and the settings at which it answers. `doubtful`: it did not answer when it was asked a second
+    time.
+    """
 
     answer: UnitAnswer
     settings: SerialSettings | None
@@ -188,7 +190,7 @@ class ModbusScanner:
         steps = plan.quick_pass(self._quick, plan.likely_settings(self._endpoint), self._units, self._options.quick_s)
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:
-            done = []  # asked too quickly for some: they are asked again
+            done = []  # some units were asked too quickly, so they are asked again
         if self._options.quick_only:
             self.result.notes.append("only likely settings and units were tried; omit --quick to try all")
             return
@@ -208,7 +210,7 @@ class ModbusScanner:
         """Listen to the line, and return whether questions may follow."""
         options, result = self._options, self.result
         likely = [*plan.likely_settings(self._endpoint), *plan.likely_settings(replace(self._endpoint, params=()))]
-        first = said or likely[0]  # the stated settings may be wrong: traffic shows it
+        first = said or likely[0]  # the settings that the user stated may be wrong, which traffic shows
         audition = await self._audition(first, options.listen_s, whole=True)
         result.auditions.append(audition)
         result.heard = audition.heard
@@ -347,7 +349,8 @@ class ModbusScanner:
             if data:
                 sweep.feed(data, clock.monotonic_ns())
             if sweep.other_requests and not self._options.share_bus:
-                self._met_master = True  # the client was silent while the scan listened: stop as if it had been heard
+                # the other client was silent while the scan listened: stop as if its traffic had been received then
+                self._met_master = True
                 self.result.notes.append(
                     "another client started to send, so the scan stopped; --share-bus continues between its exchanges"
                 )
@@ -399,7 +402,9 @@ class ModbusScanner:
         self.result.units.sort(key=lambda f: f.answer.unit)
 
     async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> Alike | None:
-        """Ask all units again that answered differently: one device whose register changes, or many devices."""
+        """Ask all units again whose answers differed. This shows whether one device with a changing register answered, or many
+        devices.
+        """
         sweep = UnitSweep(
             self._framing, units, timeout_ns=round(self._pace.timeout_s * NS_PER_S),
             interval_ns=round(self._pace.interval_s * NS_PER_S),

@@ -1,7 +1,8 @@
 """Detect one device behind many unit IDs: a device on TCP often answers any unit ID. Pure.
 
-Units may be one device if they answer the same request with the same bytes. For a few units that proves little (new meters
-all read 0), for all of them it is conclusive: no installation has 32 devices at 32 IDs spread over the whole range.
+Units may be one device if they answer the same request with the same bytes. Equal answers of a few units prove little, because
+all new meters read 0. Equal answers of IDs over the whole range are conclusive, because no installation has 32 devices at such
+IDs.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ SPREAD = 32
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """`units` that give the same answer. `one_device`: they certainly are one device; otherwise they may be."""
+    """The `units` that give the same answer. `one_device`: they are certainly one device; if it is False, they may be one
+    device.
+    """
 
     units: tuple[int, ...]
     one_device: bool

@@ -1,7 +1,7 @@
 """Find the units that answer on one connection: one short question each, one after the other. Pure: no I/O and no clock.
 
-No quarantine after a silence, unlike the plant's client: every reply contains its unit ID, so a late one is still
-attributed to the right unit, and 247 silent units cost 247 timeouts and not twice that. A question with a damaged reply
+Unlike the plant's client, a sweep does not wait after a missing reply. Every reply contains its unit ID, so a late reply is
+still attributed to the right unit. So 247 silent units take 247 timeouts and not twice that. A question with a damaged reply
 is repeated once, at the end.
 """
 
@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 PROBE = ReadRegisters("holding", 0, 1)
-"""The question: a register that most devices have.
+"""The request: to read a register that most devices have.
 
 A device without it answers with an exception, which shows that it is present.
 """
@@ -48,7 +48,7 @@ class UnitAnswer:
 
 @dataclass(frozen=True, slots=True)
 class SendRequest:
-    """Write `data` now and say `handed_over`: the question to `unit`."""
+    """The step "write `data` now, which is the request to `unit`, and then call `handed_over`"."""
 
     unit: int
     data: bytes
@@ -225,7 +225,7 @@ class UnitSweep:
             self.other_requests += self._line and request
             if asked is not None and unit == asked.unit and not request:
                 asked.noise, asked.odd = True, frame.pdu
-                if not self._line:  # the transaction ID proves the reply: hardly any other bytes follow
+                if not self._line:  # the transaction ID shows that this is the reply, so hardly any other bytes follow
                     asked.deadline_ns = min(asked.deadline_ns, now_ns + REST_NS)
             return
         if asked is not None and unit == asked.unit:

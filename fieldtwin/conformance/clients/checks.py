@@ -104,7 +104,9 @@ def publishes_good_again(seen: Observation) -> Finding | None:
 
 
 def sees_all_values(seen: Observation) -> Finding | None:
-    """Check that every number that may be a published value was classified. Comes last: a failure outranks it."""
+    """Check that every number that may be a published value was classified. This check comes last, because a failure of
+    another check is more important.
+    """
     if not seen.probed:
         return passed(UNSEEN)
     for shown in seen.of(ValuePublished, seen.begun_ns):
@@ -131,7 +133,7 @@ def owes(*rules: Rule) -> CheckFunction:
 rejects = owes(needs_probe)
 """A bad frame that only the values betray."""
 survives = owes()
-"""An answer without values, so that the frames show everything."""
+"""Check a client after an answer without values, so that only its frames are examined."""
 
 
 # -- single cases -----------------------------------------------------------------------------------------------------
@@ -174,9 +176,9 @@ def keeps_waiting(seen: Observation) -> Finding | None:
 _TAKES: tuple[Rule, ...] = (took_odd_answer, publishes_good_again, sees_all_values)
 accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, *_TAKES)
 accepts_on_line = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, keeps_waiting, *_TAKES)
-"""As `accepts`, for a client that has one request at a time."""
+"""Check as `accepts`, for a client that sends one request at a time."""
 either = owes(needs_probe)
-"""Taken or discarded, both are right; a wrong value is not."""
+"""Check a reply that the client may either use or discard. Only a wrong value fails."""
 
 
 def answers_at_once(seen: Observation) -> Finding | None:
@@ -248,7 +250,7 @@ def quarantines(seen: Observation) -> Finding | None:
     late = next((t for t in seen.of(ReplySent, seen.begun_ns) if not t.good), None)
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if late is None and any(not left.by_us for left in seen.of(Left, seen.begun_ns)):
-        return None  # the connection was closed: a late reply cannot come
+        return None  # the connection was closed, so a late reply cannot arrive
     if late is None or first is None:
         return inconclusive("the late answer was never sent")
     again = next((a for a in seen.of(RequestSeen, first.t_ns + 1, late.t_ns) if a.target == first.target), None)

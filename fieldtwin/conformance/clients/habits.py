@@ -16,7 +16,9 @@ NO_DELAY_MS = 10
 MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
 """AP 6: how many bits or registers a request of each function may name."""
 MOST_CONNECTIONS = 4
-"""Number of simultaneous connections that is not a leak yet: old ones may need time to close."""
+"""The largest number of simultaneous connections that does not count as a leak, because old connections may need time to
+close.
+"""
 READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x17, 0x18, 0x2B})
 
 
@@ -63,7 +65,9 @@ def bounded_addresses(seen: Observation) -> Finding:
 
 
 def few_connections(seen: Observation) -> Finding:
-    """Check that a client that loses a connection closes its end: each one that stays open occupies one of the device's."""
+    """Check that a client that loses a connection also closes its end. An open end occupies one of the device's few
+    connections.
+    """
     count = most = 0
     for event in seen.events:
         count += isinstance(event, ObservedConnection) - isinstance(event, Left)

@@ -46,7 +46,9 @@ class Probe(Protocol):
 
 
 class Classifier:
-    """A classifier of readings. A reading is any text; the correct words are learnt, the poison is known by its number."""
+    """A classifier of readings. A reading is any text; it learns how the correct words look, and recognises the poison value
+    by its number.
+    """
 
     def __init__(self, poison: int, stands_for_none: frozenset[str] = frozenset()) -> None:
         self._poison = str(poison)
@@ -156,7 +158,9 @@ class OutputProbe:
         self.on_shown: OnShown = lambda word, text: None
 
     def learn(self, word: Word) -> bool:
-        """Return whether `word` was seen; learning ends with both words. The program prints them unchanged or never."""
+        """Return whether `word` was seen; learning ends with both words. The program has to print the words unchanged;
+        otherwise they are never found.
+        """
         if {Word.FIRST, Word.SECOND} <= self._seen:
             self._learns = False
         return word in self._seen

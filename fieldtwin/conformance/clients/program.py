@@ -1,4 +1,6 @@
-"""The program under test: started with the endpoint in its environment, listened to, and ended in the end."""
+"""The program under test. It is started with the endpoint in its environment, its output is read, and it is ended after the
+test.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ class ProgramUnderTest:
     """The program under test: ``async with Program(argv, endpoint, on_text, on_end)``.
 
     It and its children end on leaving. `on_text` receives its output, and whether that is its log (standard error);
-    `on_end` its exit code when it ends by itself. `said` are the last lines of both.
+    `on_end` its exit code when it ends by itself. `said` are the last lines of its output and of its log.
     """
 
     def __init__(
@@ -132,4 +134,4 @@ class ProgramUnderTest:
                 continue
         transport = getattr(self._process, "_transport", None)
         if transport is not None:
-            transport.close()  # its pipe would be closed by the collector, with a warning
+            transport.close()  # otherwise the garbage collector would close the pipe, with a warning

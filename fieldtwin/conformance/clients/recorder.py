@@ -1,4 +1,6 @@
-"""The events so far, and the polling behaviour that they show. Bounded: the oldest events are dropped and counted."""
+"""The recorder of a run's events, and the polling behaviour of the client that they show. Bounded: the oldest events are
+dropped and counted.
+"""
 
 from __future__ import annotations
 

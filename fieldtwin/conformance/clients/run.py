@@ -276,7 +276,8 @@ class ClientRun(Generic[C]):
         await self._until(done, self.plan.patience_s)
         stage.end()
         last = before if case.holds_good else after
-        if case.holds_good:  # at once: a correct answer must not hold the value that only faulty ones held
+        # this is done immediately, because no correct answer may hold the value that only faulty answers held
+        if case.holds_good:
             self._say(last)
         await self._until(lambda: stage.pending == 0, self.plan.patience_s)
         self._say(last)

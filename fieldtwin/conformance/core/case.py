@@ -92,7 +92,7 @@ def inconclusive(reason: str) -> Finding:
 
 
 CheckFunction = Callable[[Observation], Finding]
-"""Pure: the same observation, the same finding."""
+"""The check of a case. It is pure: the same observation always gives the same finding."""
 
 
 @dataclass(frozen=True, slots=True)

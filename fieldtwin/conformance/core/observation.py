@@ -78,7 +78,7 @@ class ObservedConnection:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """A connection ended; `by_us` if the case did it."""
+    """The end of a connection; `by_us` if the case closed it."""
 
     t_ns: int
     client: int
@@ -93,7 +93,7 @@ class Word(Enum):
     POISON = "poison"
     OTHER = "other"
     NONE = "none"
-    """No value, or a value that means none: bad quality, not a number."""
+    """No value, or a value that means "no value": bad quality, or not a number."""
     UNCLEAR = "unclear"
     """A number that the probe cannot distinguish from a published value."""
 

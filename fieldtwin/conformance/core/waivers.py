@@ -31,7 +31,7 @@ class WaiverForm(BaseModel):
 
     id: Annotated[str, Field(min_length=1)]
     owner: Annotated[str, Field(min_length=1, pattern=r"\S")]
-    """The person or team that answers for the failure."""
+    """The person or team that is responsible for the failure."""
     reason: Annotated[str, Field(min_length=3)]
     expires: date
 

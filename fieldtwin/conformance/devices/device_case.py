@@ -37,7 +37,9 @@ class DeviceCase(About, Generic[W]):
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """A chunk or a frame. `t_ns` counts from the case's beginning, `text` is hex, or a frame as candump writes it."""
+    """A chunk or a frame that was sent or received. `t_ns` counts from the start of the case, `text` is hex or a frame in
+    candump's notation.
+    """
 
     t_ns: int
     direction: Direction

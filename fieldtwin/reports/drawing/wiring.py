@@ -17,7 +17,9 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A device on its bus: its address, its poll period, its writable outputs. `plays`: what emulates it."""
+    """A device on its bus: its address, its poll period, its writable outputs. `plays`: its recording, simulation or model in
+    a prototype.
+    """
 
     name: str
     device: str

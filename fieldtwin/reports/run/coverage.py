@@ -1,8 +1,8 @@
 """The coverage of a run: registers and objects, refusals, transitions, faults in states.
 
 `Collector` listens to a trace (or is fed with one) and gives `AccessCounts`, which add up over scenarios. What is missing is
-derived from the profiles when the report is written. The counts are bounded by the contents of the system, and by
-`MOST` for everything else.
+derived from the profiles when the report is written. The number of counters is limited: those of the system by its contents,
+and all others by `MOST`.
 """
 
 from __future__ import annotations

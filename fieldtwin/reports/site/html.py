@@ -1,6 +1,6 @@
 """The site acceptance document: one HTML file to print and sign, without network access or scripts.
 
-It is designed for paper: A4, readable in black and white, with all content visible. Its text is in templates/site.html.j2.
+It is designed for paper: A4, readable in black and white, without hidden content. Its text is in templates/site.html.j2.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """The bench of a scenario for a system that runs in processes, reached by control channels, process image and capture file.
 
-This is a `fieldtwin.scenarios.bench.WorkerBench` for the targets `local`, `compose` and `real`. Its abilities depend on the
-parts that it can reach: without field simulator it has no faults, without capture it cannot see frames. It starts and
-ends only its own connections. Where no fieldtwin gateway runs, a scenario that uses only probes tests a third-party
-controller with the field simulator alone.
+This is a `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. Its abilities depend on the parts
+that it can reach: without a field simulator it cannot inject faults, and without a capture it cannot see frames. It starts and
+ends only its own connections. Where no fieldtwin gateway runs, a scenario that uses only probes tests a third-party controller
+with the field simulator alone.
 
-Everything that a scenario puts into the simulated devices is under a lease (`FieldLease`): it is removed when the bench
-is left, and also when this process is killed.
+All faults and values that a scenario injects into the simulated devices belong to a lease (`FieldLease`). They are removed
+when the scenario ends, and also when this process is killed.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ class Where:
     far: str = ""
     capture: Path | None = None
     plant: bool = False
-    """No device is emulated: no faults and no values are put in, whatever else is reachable."""
+    """The devices are real, so no faults and no values are injected, even if a field simulator can be reached."""
     own: bool = False
-    """The system was started for this scenario alone, so it is fresh."""
+    """The system was started for this scenario alone, so it is in its initial state."""
     foreign: bool = False
-    """The controller is a user's program: there is no fieldtwin gateway to query."""
+    """The controller is a user's program, so the bench cannot query a fieldtwin gateway."""
     env: Mapping[str, str] = field(default_factory=dict)
     """The environment variables that tell that program the endpoints; endpoints of probes may refer to them."""
     allowed: Impact = Impact.DISRUPT
@@ -142,7 +142,7 @@ class ControlBench(AsyncResource):
         self._plc_due_s = 0.0
         self._stopped: Stopped | None = None
         self._fault_numbers: set[int] = set()
-        """The field simulator's numbers of the faults that this bench put in."""
+        """The numbers that the field simulator gave to the faults of this bench."""
         self._not_started = ""
         self._gateway_seen = False
         self._worst_us = -1.0
@@ -196,7 +196,7 @@ class ControlBench(AsyncResource):
         self._updates.clear()
 
     async def _open_lease(self, nursery: Nursery) -> None:
-        """Open the lease, which limits the lifetime of everything that the bench puts into the simulated devices."""
+        """Open the lease, which limits the lifetime of all faults and values that the bench injects."""
         if self._field is None:
             return
         self.lease = FieldLease(await self._connect_field())
@@ -205,7 +205,7 @@ class ControlBench(AsyncResource):
         nursery.start(self.lease.run(), "lease")
 
     def _foreign(self) -> bool:
-        """True where no fieldtwin gateway runs on this instance and the scenario queries none."""
+        """Return whether this instance has no fieldtwin gateway and the scenario needs none."""
         if self._where.foreign:
             return True
         probed = {name for probe in self._probe for name in probe.names}
@@ -367,7 +367,7 @@ class ControlBench(AsyncResource):
                 return list(self._held.get(name, ()))
 
     async def _put(self, command: str, **args: Any) -> Any:
-        """Put something into the simulated devices, under the lease."""
+        """Inject a fault or a value into the simulated devices, under the lease."""
         if self.lease is None:
             raise UsageError("there are no simulated field devices", expected="a prototype")
         return await self.lease.call(command, **args)

@@ -1,7 +1,7 @@
 """A scenario's lease on the simulated field devices.
 
-`fieldtwin.twin.prototype.field_leases` is the other side. Everything that the scenario puts in is removed when the
-lease ends: at the end of the scenario, or `LEASE_S` seconds after the last renewal if the testing process died.
+`fieldtwin.twin.prototype.field_leases` is the other side. All faults and values of the scenario are removed when the lease
+ends: at the end of the scenario, or `LEASE_S` seconds after the last renewal if the testing process died.
 """
 
 from __future__ import annotations
@@ -39,12 +39,16 @@ class FieldLease:
         self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
         self.lost: LeaseLost | None = None
         self.before = ""
-        """The faults and values in place when the lease was opened, in words; the scenario did not put them in."""
+        """Descriptions of the faults and values that were already active when the lease was opened, and that do not belong to
+        the scenario.
+        """
         self._client = client
         self._life = ""
 
     async def open(self) -> None:
-        """Open the lease; wait `OPEN_WITHIN_S` seconds for the end of a different one. Raises `Unreachable` after that."""
+        """Open the lease. Wait at most `OPEN_WITHIN_S` seconds for the end of another test runner's lease. Raises
+        `Unreachable` after that.
+        """
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + OPEN_WITHIN_S
         while True:

@@ -32,7 +32,8 @@ async def make_fresh(lease: FieldLease, gateway: ControlClient, plc: ControlClie
         await plc.call("restart", cold=True, by=BY)
         made_ns = await lease.fresh()
         await _all_read(gateway, made_ns)
-        await plc.call("restart", cold=True, by=BY)  # this also clears the inputs that it received while it was paused
+        # this also clears the inputs that the PLC received while it was paused
+        await plc.call("restart", cold=True, by=BY)
     finally:
         await plc.call("go", by=BY)
     await programs_scan(plc)
@@ -41,7 +42,7 @@ async def make_fresh(lease: FieldLease, gateway: ControlClient, plc: ControlClie
 async def programs_scan(plc: ControlClient) -> None:
     """Wait until the programs have had the inputs that they need before their first scan, at most `SCANS_WITHIN_S` seconds.
 
-    A program that waits longer than that is a matter of the scenario.
+    The scenario decides whether a longer wait is an error.
     """
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + SCANS_WITHIN_S

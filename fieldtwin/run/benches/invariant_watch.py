@@ -20,8 +20,7 @@ Rule = AlwaysRule | WithinRule
 class InvariantWatch:
     """The invariants of `system`. `run` checks them until it is cancelled; `results` and `errors` are valid at any time.
 
-    Each invariant is checked until it is broken for the first time. Raises `FileInvalid` for an invariant without
-    meaning.
+    Each invariant is checked until it is broken for the first time. Raises `FileInvalid` for an invalid invariant.
     """
 
     def __init__(self, system: System) -> None:

@@ -1,6 +1,6 @@
-"""A scenario's bench for a prototype in virtual time: events are traced here, and checks query it.
+"""A scenario's bench for a prototype in virtual time: it records events in the trace, and answers the checks of the scenario.
 
-This is a `fieldtwin.scenarios.bench.WorkerBench` for the target `virtual`, inside one `VirtualLoop`.
+This is a `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class VirtualBench(AsyncResource):
     """A bench: ``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
     `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `has_topside` False omits
-    the client. `water`: the ends of transmitters that belong to a network's acoustic channel.
+    the client. `water`: the acoustic connections of transmitters that belong to a network's acoustic channel.
     """
 
     def __init__(
@@ -295,7 +295,8 @@ class _FrameTap:
         self._note(endpoint, direction, t_ns, data)
 
     def _note(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: dict[str, Any]) -> None:
-        known = self._known.get(id(endpoint))  # formatting an endpoint takes longer than everything else here
+        # the text is cached, because formatting an endpoint takes longer than the rest of this function
+        known = self._known.get(id(endpoint))
         if known is None or known[0] is not endpoint:
             known = self._known[id(endpoint)] = endpoint, self._bus.get(str(endpoint), str(endpoint))
         bus, bench = known[1], self._bench

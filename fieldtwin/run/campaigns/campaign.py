@@ -173,7 +173,7 @@ def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
 
 
 def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
-    """Return the check that a fault struck at all, with how often, by name."""
+    """Return the check that at least one fault took effect, with the number of times by name of the fault."""
     names = sorted({fault.name for result in results for fault in result.faults})
     struck = {n: [fault.struck for result in results for fault in result.faults if fault.name == n] for n in names}
     parts = [f"{name} {len(each)} (struck {sum(each)} times)" for name, each in struck.items()]

@@ -14,7 +14,9 @@ CONFIRMED = "confirmed: this scenario fails like the run"
 
 
 def confirm_run(path: Path, found: SeedResult, profiles: tuple[Path, ...]) -> str:
-    """Run the scenario in `path` and return in words whether it fails with an error of the run that it was written for."""
+    """Run the scenario in `path`, and return a sentence that states whether it fails with an error of the run for which it was
+    written.
+    """
     result = run_virtual(load_scenario(path, profiles))
     bad = [check for check in result.checks if check.verdict.bad]
     told = [part for check in bad for part in (*check.got.split("; "), f"{check.number}: {check.text}")]
@@ -25,7 +27,7 @@ def confirm_run(path: Path, found: SeedResult, profiles: tuple[Path, ...]) -> st
 
 
 def ended(result: ScenarioResult) -> str:
-    """Return in words how a scenario ended that should have failed in a certain way."""
+    """Return a sentence about the result of a scenario that was expected to fail in a certain way."""
     if result.verdict is Verdict.PASSED:
         return "this scenario passes"
     return f"this scenario has a different result ({result.verdict.value}: {result.reason})"

@@ -1,4 +1,4 @@
-"""One run in virtual time after the other, a seed each, in several processes: which seeds fail, and why."""
+"""Run a system in virtual time once for each seed, in several processes, and report which seeds fail and why."""
 
 from __future__ import annotations
 

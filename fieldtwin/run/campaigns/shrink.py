@@ -21,7 +21,7 @@ def smallest(
 ) -> tuple[list[T], bool]:
     """Return a part of `items` that still `fails`, and whether all its items are necessary.
 
-    The first test is without any item: a failure that needs none of them must not be blamed on one. After `most_runs`
+    The first test uses no item, so that a failure which occurs without any item is not attributed to one. After `most_runs`
     tests the smallest part found so far is returned. `items` as a whole must fail.
     """
     left, parts, runs = list(items), 2, 0

@@ -16,7 +16,7 @@ from fieldtwin.scenarios.judging.runner import fault_id
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
 _KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")
-"""Keys of a scenario that one that was shrunk from it has as they stand."""
+"""Keys of a scenario that are copied unchanged into the scenario that is shrunk from it."""
 
 
 @dataclass(frozen=True)

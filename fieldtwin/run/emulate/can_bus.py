@@ -34,7 +34,7 @@ async def open_bus(wire: Endpoint, bitrate: int | None) -> tuple[CanPort, str]:
         return JoinedBus(wire, bitrate or DEFAULT_BIT_RATE), str(wire)
     try:
         made = await SoftBusServer.open(wire, bitrate or DEFAULT_BIT_RATE)
-    except (EndpointBusy, Unreachable):  # another process listens there, or the address is another computer's
+    except (EndpointBusy, Unreachable):  # another process listens there, or the address belongs to another computer
         return JoinedBus(wire, bitrate or 0), f"{wire}, with others"
     host, port = made.bound.address
     look = f"python -m can.viewer -i fieldtwin -c {host}:{port}"

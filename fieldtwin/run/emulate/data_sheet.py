@@ -50,7 +50,7 @@ async def run_data_sheet(
     wires = [Endpoint.parse(url) for url in endpoints]
     wire = only_bus(wires)
     node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
-    if log is None or options.model is not None:  # a node of a log is known by its recorded behaviour
+    if log is None or options.model is not None:  # the behaviour of a node from a log comes from its recording
         print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
     report_second_node(node)
     host, stop = EmulatorHost(WallClock(), OsPorts()), stop_signal()
@@ -93,7 +93,7 @@ def print_remarks(name: str, found: Iterable[Remark]) -> None:
 
 
 def report_second_node(node: CanopenNode) -> None:
-    """Print it when another node on the bus has the node ID of `node`."""
+    """Print a message when another node on the bus has the node ID of `node`."""
 
     def tell(can_id: int) -> None:
         stderr.print(

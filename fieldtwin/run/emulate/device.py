@@ -229,7 +229,7 @@ async def serve_units(
 ) -> None:
     """Serve Modbus units on a serial port, real or virtual, a serial line over a socket, or Modbus over TCP, UDP or TLS.
 
-    A virtual port is made where there is no port at that path. A line accepts ``mode=ascii``, and ``echo=1`` if the
+    A virtual port is made if the path does not exist. A line accepts ``mode=ascii``, and ``echo=1`` if the
     client is to receive its own bytes.
     """
     if wire.is_can:
@@ -243,7 +243,7 @@ async def serve_units(
         listen = Endpoint("pty", path=wire.path)
     served = ModbusWire(str(wire), listen, plant, echo=wire.param("echo") == "1", any_unit=any_unit)
     on_wire = None if faults is None else faults.on_wire(framing_of(plant))
-    if listen.scheme in SERIAL_SCHEMES:  # an existing port: this process acts as a device on a real line
+    if listen.scheme in SERIAL_SCHEMES:  # the port exists: this process acts as a device on a real line
         host.serve_line(served, units, await OsConnector().open_bytes(wire), on_wire)
         stderr.print(f"{named} the port {wire.path} ({wire.serial.baudrate} {wire.serial.frame})", soft_wrap=True)
         return

@@ -1,4 +1,4 @@
-"""How often faults struck, for the end of a run: a fault that never struck has tested nothing."""
+"""How often faults took effect, for the end of a run. A fault that never took effect has tested nothing."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fieldtwin.emulators.faults.fault import Active
 
 
 def struck(active: Active) -> str:
-    """One fault: its id and name, and how many of the frames that matched it struck."""
+    """Return a line about one fault: its ID and name, and how often it took effect on frames that matched its aim."""
     named = active.id if active.id.startswith(active.fault.name) else f"{active.id} ({active.fault.name})"
     if active.struck and not active.matched:
         return f"{named}: {active.struck} times"

@@ -93,7 +93,7 @@ def instance_name(options: BridgeOptions) -> str:
 
 
 async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Run the bridge until SIGINT or SIGTERM and return its counters. `say` is called with each status message.
+    """Run the bridge until SIGINT or SIGTERM and return its counters. `say` is called with each status message for the user.
 
     Raises `UsageError` for endpoints that cannot form a bridge, `EndpointBusy` or `Unreachable` when it cannot listen.
     """

@@ -1,8 +1,8 @@
 """The check of a prototype run: the device held every value that was published as good.
 
 It fetches the values that the gateway published and those that the emulators held, by number, so that none is compared
-twice and memory stays bounded. A value is right when the device held those very bytes for that tag at some time not
-after the value's own.
+twice and memory stays bounded. A value is right if the device held exactly these bytes for this tag at or before the time of
+the value.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class Oracle:
         self._gap = False
 
     def begin_again(self) -> None:
-        """Handle a new process of the field simulator: its journals begin again, and the end of the old ones was not seen."""
+        """Handle a new process of the field simulator: its journals begin again, and the last entries of the old journals were
+        not read.
+        """
         self._held_numbers.clear()
         self._gap = True
 
@@ -78,7 +80,7 @@ class Oracle:
 
     def _judge(self, tag: str, raw: str, value: Any) -> None:
         if tag.split(".", 1)[0] not in self._emulated:
-            return  # a real device in a mixed prototype: its register values are not known
+            return  # in a prototype with real devices, the register values of a real device are not known
         if raw not in self._held[tag] and self._gap:
             self.unknown += 1
             return

@@ -91,7 +91,7 @@ class RunSession(AsyncResource):
         self._prototype: Prototype | None = None
         if options.prototype and not options.field_host:
             from fieldtwin.twin.prototype.field_process import (
-                resolve,  # here and below: a plant has no emulators installed
+                resolve,  # imported here and below, because a plant has no emulators installed
             )
 
             # errors in the files are reported before anything starts
@@ -409,7 +409,7 @@ class RunSession(AsyncResource):
         try:
             async with ControlBench(self.system, where, Trace(1), target="real", names=invariants.names) as bench:
                 await invariants.run(bench, INVARIANTS_S)
-        except FieldtwinError as e:  # the monitoring of the processes reports the one that ended
+        except FieldtwinError as e:  # the monitoring of the processes reports which process ended
             invariants.end(str(e))
             self.note_error(f"the invariants were not checked to the end: {e}")
 
@@ -505,10 +505,12 @@ class RunSession(AsyncResource):
             self._maybe_lost(client, e)
             if isinstance(e, ReplyTimeout) and name and not self._stood_still():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
-            return None  # it is ending or gone: _notice_deaths reports it with its reason
+            return None  # the process is ending or has ended: _notice_deaths reports it with its reason
 
     def _stood_still(self) -> bool:
-        """Return whether this process itself was stopped, or got no processor time: then it cannot tell if others answered."""
+        """Return whether this process itself was stopped, or got no processor time: then it does not know whether the other
+        processes answered.
+        """
         gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
         if self._looked_ns and gap_s > STILL_S:
             self._still_ns = self.clock.monotonic_ns()
@@ -534,7 +536,7 @@ class RunSession(AsyncResource):
         """Make the gateway read its files again (`fieldtwin.run.processes.reloading`); no poll is lost."""
         if "gateway" not in self._clients:
             raise Unreachable("the gateway has ended")
-        # own connection: statuses are queried meanwhile
+        # a separate connection is used, because statuses are queried meanwhile
         own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))
         try:
             return await reload(own, self._clients.get("plc"), by)

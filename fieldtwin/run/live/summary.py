@@ -32,7 +32,7 @@ class RunFacts:
     instance: str
     elapsed_s: float
     disturbed: bool
-    """Faults were injected, or the simulated field devices were away or made anew: the counts of both sides may differ."""
+    """Faults were injected, or the simulated field devices were lost or created again, so the counts of both sides may differ."""
     calm: bool
     """There were no faults, or the last one has been over for long enough that the system must have recovered."""
     errors: Sequence[str]
@@ -49,7 +49,7 @@ class RunFacts:
     published: Mapping[str, Any]
     """How many published values were checked against those that the devices held, and the first wrong ones."""
     wrong_messages: Sequence[str] = ()
-    """Commands that reached the gateway through a mailbox and should not have. A run of processes cannot see them."""
+    """Commands that reached the gateway through a mailbox and should not have. A run in real time cannot detect them."""
     invariants: Sequence[Mapping[str, Any]] = ()
     """The results of the system file's invariants, and the errors that follow from them."""
     invariant_errors: Sequence[str] = ()
@@ -295,7 +295,7 @@ def _refusal_checks(refusals: RefusalsStatus, expected: Collection[str], *, dist
 
 def _plc_checks(plc: PlcStatus | None) -> list[str]:
     if plc is None:
-        return []  # its death is in the run's errors already
+        return []  # the run's errors already contain the end of the PLC
     # A stopped PLC still lists the programs that never ran.
     failed = [
         f"PLC: program {program} has not started: it waits for {start.reason}" for program, start in plc.waiting.items()

@@ -53,7 +53,7 @@ class Child:
 
     @property
     def returncode(self) -> int | None:
-        """The exit code after its end, negative for a signal; None while it runs."""
+        """The exit code of the process after its end, negative for a signal; None while the process runs."""
         return self._process.poll()
 
     def failure(self) -> ChildFailed | None:

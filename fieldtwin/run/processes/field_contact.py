@@ -39,7 +39,7 @@ class FieldContact:
         self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
         """By bus and client: the counts of the field simulator before this run connected."""
         self.counted_before: dict[str, dict[str, int]] = {}
-        """By device: its counters before this run connected, because a field simulator may have served others before."""
+        """By device: its counters before this run connected, because the field simulator may have served other runs before."""
 
     async def aclose(self) -> None:
         await self.client.aclose()
@@ -63,7 +63,9 @@ async def connect_control(host_port: str, token: str) -> tuple[ControlClient, st
 
 
 async def contact_elsewhere(host_port: str, token: str, system: System, run_dir: Path) -> FieldContact:
-    """Return the contact with a field simulator that was started elsewhere; `host_port` is its control channel."""
+    """Return the contact with a field simulator that this run did not start; `host_port` is the address of its control
+    channel.
+    """
     client, host = await connect_control(host_port, token)
     try:
         return await _contact(client, system, host, run_dir)

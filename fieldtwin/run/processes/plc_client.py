@@ -108,7 +108,7 @@ def programs(system: System) -> dict[str, Program]:
 
 
 def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:
-    """Return the chosen program and the result of `has` for it. Raises `UsageError` when there is none, or more than one."""
+    """Return the chosen program and the result of `has` for it. Raises `UsageError` unless exactly one program has one."""
     found = {n: thing for n, p in programs(system).items() if (thing := has(p)) is not None}
     if name and name not in system.plc.programs:
         raise UsageError(f"no program {name!r}", expected=", ".join(system.plc.programs))

@@ -1,7 +1,7 @@
 """Keep the thread's process of a run alive: restart it when it dies.
 
 The thread only observes, and no control function depends on it, so a plant continues without it; events during the gap
-are in no log, so the gap is kept short. This module must not depend on what a thread is, nor on its destination.
+are in no log, so the gap is kept short. This module does not depend on the meaning of a digital thread or on its destination.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ThreadReturn:
             await self._another()
 
     async def _another(self) -> None:
-        """Run a new child until it ends, if it starts at all."""
+        """Start a new child, and wait until it ends."""
         self._child = self._start()
         client: ControlClient | None = None
         try:

@@ -36,7 +36,7 @@ FIELD_LINGER_S = 0.5
 END_WITHIN_S = 5.0
 """Time in seconds in which the program has to end after SIGTERM to this process, before it is killed."""
 OURS = ("RUN", "PROFILES", "TOKEN", "TRACEBACK", "JSON", "SYSTEM", "CONTROL", "FIELD")
-"""FIELDTWIN_ names with another meaning: a bus with such a name has only the longer variables."""
+"""Environment variables of fieldtwin that have another meaning. A bus with one of these names gets only the longer variables."""
 
 Tell = Callable[[dict[str, str]], None]
 
@@ -185,7 +185,7 @@ async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
             process.send_signal(number)
 
     def interrupted() -> None:
-        if process is None or not _has_terminal():  # else the terminal sent it to the program, too
+        if process is None or not _has_terminal():  # otherwise the terminal has sent the signal to the program too
             pass_on(signal.SIGINT)
 
     def to_end() -> None:

@@ -1,4 +1,4 @@
-"""Worker processes that share a task and end with it: after Ctrl-C none continues, and none prints a traceback.
+"""Worker processes that share a task and end with it: after Ctrl-C no worker continues, and no worker prints a traceback.
 
 A worker that receives Ctrl-C while it still imports would print one. SIGINT is therefore blocked in it until it can
 handle it.

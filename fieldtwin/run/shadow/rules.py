@@ -6,7 +6,7 @@ what_if: {horizon: 30min, require: ["quality(ctd.pressure) == 'good'"]}    # sim
 rules:
   - {when: outside, of: ctd.pressure, period_s: 1}      # an event: sample every second
   - {when: inside, of: ctd.pressure, period_s: 60}
-  - {when: stale, of: ctd.pressure, period_s: 60, what_if: false}      # nobody is asked
+  - {when: stale, of: ctd.pressure, period_s: 60, what_if: false}      # no prototype is asked
 ```
 """
 
@@ -149,7 +149,7 @@ class PythonPlanner:
                 sys.path.insert(0, folder)
         try:
             self._made: Any = getattr(importlib.import_module(module), kind)()
-        except Exception as e:  # a user's module can raise any exception; it is translated only here
+        except Exception as e:  # a user's module can raise any exception, which is translated here
             raise FileInvalid(f"the planner {source!r} cannot be created: {type(e).__name__}: {e}") from e
         if not callable(getattr(self._made, "plan", None)):
             raise FileInvalid("not a planner", expected="a class with plan(data, model)", got=source)

@@ -1,4 +1,5 @@
-"""A running digital twin: the shadow, and the way back. Its commands form a log that the thread delivers to the plant.
+"""A running digital twin: a digital shadow that also commands the plant. Its commands form a log, which the thread delivers to
+the plant.
 
 If configured, it first queries a prototype in a separate process (`fieldtwin.run.what_if.asking`).
 """

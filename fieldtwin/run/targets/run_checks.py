@@ -1,7 +1,7 @@
 """`judge: run` of a scenario in virtual time: the checks of `fieldtwin simulate`, in addition to the scenario's own.
 
 Every value published as good is compared with the values that its device held within its age; no exchange may be lost
-and no scan stopped; and once every fault has been over for a minute, everything must be well again.
+and no scan stopped; and once every fault has been over for a minute, all devices and programs must work again.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class RunJudge:
             name: SystemCheck(
                 member.system,
                 placed.get(name, ()),
-                disturbed=True,  # the scenario decides what a program should do
+                disturbed=True,  # the scenario states the expected behaviour of programs
                 may_refuse=_of_member(scenario.form.refused, member.prefix),
             )
             for name, member in group.members.items()

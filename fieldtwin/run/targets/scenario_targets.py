@@ -252,7 +252,7 @@ def _invariant_names(scenario: Scenario, where: Where) -> set[str]:
 
 
 def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioResult:
-    """Add to a result other than a pass the faults and values that were in the devices before the scenario began."""
+    """Add to a result that is not a pass the faults and values that were active in the devices before the scenario began."""
     before = bench.lease.before if bench.lease is not None else ""
     if not before or result.verdict in (Verdict.PASSED, Verdict.SKIPPED):
         return result

@@ -1,7 +1,7 @@
 """The strict check of a run in virtual time: the device held every value that was published as good within the value's age.
 
 Both sides share one clock there, so the check is exact: between the moment of the request (for an unrequested value:
-the value's own time) and the publication the device must have held those very bytes at least once. Bounded: history
+the value's own time) and the publication the device must have held exactly these bytes at least once. Bounded: history
 older than `KEPT_NS` is dropped.
 """
 

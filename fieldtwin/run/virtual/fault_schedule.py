@@ -34,7 +34,7 @@ NOT_BY_CHANCE = frozenset({"set", "late-frame"})
 `set` is not a fault; no gateway could detect `late-frame`, because no CAN frame carries the time of its values.
 """
 UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-parity", "noise", "echo"})
-"""Serial faults that sockets do not get: Modbus TCP has no check sum of its own, so no gateway could detect them."""
+"""Serial faults that are not injected on sockets. Modbus TCP has no check sum, so a gateway cannot detect them there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def _aims_of(system: System) -> Iterator[str]:
 
 
 def _choices(system: System, wanted: RandomFaults) -> list[tuple[str, str, list[str]]]:
-    """Return each (device, tag or empty, names of the faults that can strike there), in the order of the system file."""
+    """Return each (device, tag or empty, names of the faults that can take effect there), in the order of the system file."""
     found: list[tuple[str, str, list[str]]] = []
     for device in system.devices.values():
         of_tag = [aim.partition(".")[2] for aim in wanted.aims if aim.startswith(f"{device.name}.")]
@@ -122,7 +122,7 @@ def _is_seen(name: str, endpoint: Endpoint) -> bool:
 
 
 def _struck(system: System, name: str, device: str) -> list[str]:
-    """Return the tags of `device` that a fault of values can strike."""
+    """Return the tags of `device` that a value fault can change."""
     return [
         tag.name
         for tag in numbers(system.devices[device].profile.tags.values())

@@ -37,7 +37,7 @@ class VirtualSystems(Protocol):
 
     @property
     def topside(self) -> TopsideController | None:
-        """The sender of commands that none of the systems has for itself."""
+        """The name of a sender of commands that the systems share; empty if they share no sender."""
 
     def results(self) -> dict[str, Any]:
         """Return the part of the summary that is about what the systems share."""

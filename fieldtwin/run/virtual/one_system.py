@@ -1,4 +1,6 @@
-"""A system alone in virtual time: what `fieldtwin.run.virtual.group_kinds.VirtualKind` asks of a group, for a group of one."""
+"""A system alone in virtual time: the implementation of `fieldtwin.run.virtual.group_kinds.VirtualKind` for a group of one
+system.
+"""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 from fieldtwin.twin.prototype.group import SystemGroup, load_group, one_system
 
 TRACE_KEPT = 20_000
-"""Events that stay in memory; the hash and a file have them all."""
+"""How many of the latest events stay in memory. The hash and a trace file cover all events."""
 PIECE_S = 10.0
 """Virtual seconds between two progress reports, and between two checks."""
 MAX_ERRORS = 100
@@ -108,7 +108,7 @@ class VirtualRun:
         self._about: TraceAbout | None = None
         """The description of the trace, if there is one."""
         self._judged = False
-        """False while the run cannot be judged: an error before that is a user's mistake and is raised."""
+        """Whether the run has begun. An error before that is a mistake of the user, and is raised."""
 
     @property
     def scripted(self) -> list[Scripted]:

@@ -1,8 +1,8 @@
 """The process that answers a question: ``python -m fieldtwin.run.what_if.asked``. It reads one JSON object and writes one.
 
-Input, as `QuestionMessage`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty if
-nothing speaks against the command. With ``"only_check": true`` nothing is run, and the objection is an error in the
-question.
+Input, as `QuestionMessage`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty
+if the prototype does not object to the command. With ``"only_check": true`` nothing is run, and the objection is an error in
+the question.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def main() -> int:
     if hasattr(os, "nice"):
         os.nice(NICE)
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # output of control logic must not mix with the answer
+    os.dup2(2, 1)  # the output of control logic must not be mixed with the answer
     asked = msgspec.json.decode(sys.stdin.buffer.read(), type=QuestionMessage)
     with answers:
         answers.write(msgspec.json.encode({"objection": objection(asked)}) + b"\n")

@@ -48,7 +48,7 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
 
 def _command(run: VirtualPrototype, period_s: Number) -> None:
-    """Inject this command as if the transmitter had received it, if the plant has one and listens to it."""
+    """Inject this command as if the transmitter had received it, if the plant has a transmitter and obeys its commands."""
     if len(run.gateway.pumps) == 1 and isinstance(period_s, int):
         run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
 

@@ -149,7 +149,8 @@ class _ForkRun:
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
-            if run.plc.stop_reason is not StopReason.NONE:  # whatever its variables say, no requirement holds any more
+            # no requirement holds any more, whatever values the variables have
+            if run.plc.stop_reason is not StopReason.NONE:
                 self.outcome.error = f"the PLC stopped ({run.plc.stop_reason.value}): {run.plc.error or 'on request'}"
             self.outcome.ends(loop.now_ns)
             # The end of the run (safe outputs) is not part of the plan.

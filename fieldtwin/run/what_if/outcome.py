@@ -95,7 +95,8 @@ class Requirement:
 class PlanOutcome:
     """The outcome of one plan.
 
-    `error` says why there is none. `not_taken` names devices and programs that could not start from their known state.
+    `error` is the reason why the outcome is missing. `not_taken` names devices and programs that could not start from their
+    known state.
     """
 
     plan: str

@@ -167,7 +167,7 @@ def bounds_text(bounds: BoundsForm) -> str:
 
 
 def said(part: Any) -> str:
-    """Return a part of a scenario file in its own words."""
+    """Return the text of a part of a scenario file, as the file writes it."""
     if hasattr(part, "model_dump"):
         part = part.model_dump(exclude_none=True, exclude_defaults=True, by_alias=True)
     if isinstance(part, dict):

@@ -1,4 +1,6 @@
-"""The last exchanges on the bus before a check failed, as lines for people: the evidence of a verdict that is not PASSED."""
+"""The last exchanges on the bus before a check failed, as lines of text. They are the evidence of a verdict that is not
+PASSED.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,8 @@ def line_of(exchange: DecodedExchange) -> str:
 
 
 def deciding(checks: Sequence[CheckResult], verdict: Verdict) -> CheckResult | None:
-    """Return the check that gave a scenario its `verdict`, or None if the reason was not a check, but that nothing was
-    expected.
+    """Return the check that gave a scenario its `verdict`, or None if no check decided it, because the scenario expected
+    nothing.
     """
     return next((check for check in checks if check.verdict is verdict and check.t_ns is not None), None)
 

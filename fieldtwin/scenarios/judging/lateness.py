@@ -1,9 +1,9 @@
 """How a late host affects a deadline.
 
 Outside virtual time, the system under test and the test runner share a host. The runner measures by how much its own
-sleeps ended too late: only the host can cause that, and it is subtracted. A reaction that came later than that, but
-within all lateness that was observed (slow answers, late scans), proves nothing: the host or the system may be the
-cause. A reaction that is later still has failed.
+sleeps ended too late: only the host can cause that, and it is subtracted. A reaction that is later than that, but within the
+whole observed lateness (slow answers, late scans), proves nothing, because the host or the system may be the cause. An even
+later reaction has failed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The always-on check of a scenario: no output of a program is refused, except for the tags that the scenario names.
 
 A refusal breaks the check if the program or the configuration is wrong (a value outside its limits, a tag that may not
-be written). Until the scenario has injected a fault, a refusal by the device breaks it too. A refusal by design (a
-read-only plant), a write that is tried again and a client's request break nothing; traces and reports show them.
+be written). Until the scenario has injected a fault, a refusal by the device breaks it too. A refusal by design (a read-only
+plant), a write that is tried again, and a client's request do not break the check. Traces and reports show them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Runs a scenario on a bench: step after step, while the rules of the whole run are checked.
 
-A step that fails ends the scenario; the later steps are not reached. The runner does not depend on the target: what a
-target cannot do is SKIPPED, what its host's lateness makes worthless is INCONCLUSIVE, and neither ever passes.
+A step that fails ends the scenario; the later steps are not reached. The runner does not depend on the target. A step that a
+target cannot carry out is SKIPPED. A check that proves nothing because the host was late is INCONCLUSIVE. Neither counts as a
+pass.
 """
 
 from __future__ import annotations
@@ -114,8 +115,8 @@ def fault_id(n: int, step: Step) -> str:
 class ByChance:
     """Random faults of a campaign, injected before the first step.
 
-    The steps then only drive the system: their expectations, rates and cycles are not judged. All other rules are
-    judged at least until `until_s`, in seconds of the run.
+    The steps then only drive the system: their expectations, rates and cycles are not checked. All other rules are checked at
+    least until `until_s`, in seconds of the run.
     """
 
     faults: tuple[dict[str, Any], ...]
@@ -204,12 +205,12 @@ class ScenarioRunner:
         except NothingKnown as e:
             self.results.append(replace(gone(e, self._now_ns()), verdict=Verdict.INCONCLUSIVE))
             return Verdict.INCONCLUSIVE, str(e)
-        except FieldtwinError as e:  # raised by the bench: a part of the system is gone
+        except FieldtwinError as e:  # the bench raises this when a part of the system is gone
             self.results.append(gone(e, self._now_ns()))
             return Verdict.ERROR, str(e)
 
     async def _count_faults(self, verdict: Verdict, reason: str) -> tuple[Verdict, str]:
-        """Ask how often each fault struck. A scenario that passed with a fault that never struck is INCONCLUSIVE."""
+        """Ask how often each fault took effect. A scenario that passed although a fault never took effect is INCONCLUSIVE."""
         try:
             struck = await self.bench.struck()
             self.faults = [one for one in struck if not one.is_set]
@@ -340,7 +341,8 @@ class ScenarioRunner:
                 got = unknown + self._knowledge.of_expression(expression)
                 raise _too_late(_wanted(expression.text, within_s), got, self._bound(expression, within_s), allowed)
             await self._tick(deadline_s)
-        if self.bench.now_s() - unknown_until_s > TICK_S:  # otherwise it was in time as soon as it was known
+        # otherwise the reaction was in time as soon as its value was known
+        if self.bench.now_s() - unknown_until_s > TICK_S:
             self._met(_wanted(expression.text, within_s), since_s, within_s, [expression])
 
     def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:

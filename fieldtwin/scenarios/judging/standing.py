@@ -1,6 +1,6 @@
 """The rules of a scenario for the whole run: `always`, `never`, and that every part of the system runs.
 
-These rules are checked whenever the runner looks. A rule that is unknown is neither kept nor broken: a rule that was
+These rules are checked at each check of the runner. A rule whose value is unknown is neither kept nor broken: a rule that was
 never known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.
 """
 
@@ -86,7 +86,7 @@ class AlwaysRule:
     """Time from which it was judged."""
     looks: int = 0
     unknown_s: float | None = None
-    """Time at which it was unknown for the first time after that."""
+    """The time at which it became unknown for the first time after it was known."""
     unknown_looks: int = 0
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
@@ -155,8 +155,8 @@ class _NeverOnWire:
     _excused: bool = False
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
-        # An exchange may be older than this look: `unless` counts if it is known to be true at this look or the one
-        # before.
+        # An exchange may have ended before this check: `unless` counts if it is known to be true now or was at the previous
+        # check.
         now = self.unless is not None and self.unless.truth(knowledge.look) is True
         excused, self._excused = now or self._excused, now
         while self.watched:

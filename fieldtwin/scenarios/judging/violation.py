@@ -8,8 +8,9 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Violation:
     """A broken rule. `since_s` is the start of the time that it checked; `where` is the rule's file and line, or that
-    of the logic that failed. `bound_s` is the time that the rule is about: if the host was late by a part of it,
-    nothing is proved."""
+    of the logic that failed. `bound_s` is the time that the rule is about: if the host was late by a part of this time, the
+    violation proves nothing.
+    """
 
     number: str
     expected: str
@@ -20,4 +21,4 @@ class Violation:
     where: str = ""
     asks_lateness: bool = False
     nobody_knows: bool = False
-    """The host was late, so it cannot be decided whether the rule is broken."""
+    """Whether the host was so late that it cannot be decided if the rule is broken."""

@@ -1,6 +1,6 @@
 """Waivers of scenarios, in the form of `fieldtwin.conformance.core.waivers`.
 
-The id is a file's name without .scenario.yaml, or the name in the scenario.
+The ID of a scenario is its file's name without .scenario.yaml, or the name in the scenario.
 """
 
 from __future__ import annotations

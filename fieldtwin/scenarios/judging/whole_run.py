@@ -1,7 +1,7 @@
-"""The rules of a scenario for the whole run: sequences in time, rates, cycles. Checked whenever the runner looks.
+"""The rules of a scenario for the whole run: sequences in time, rates, cycles. They are checked at each check of the runner.
 
-Pure: it gets the time, reads known values with `look`, and takes the trace's events. It reports broken rules; the
-caller decides what they end.
+Pure: the caller passes the time and the trace's events, and known values are read with `look`. This module reports broken
+rules; the caller decides whether a broken rule ends the run.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class WholeRun:
                 vacuous = rule.never_came
                 if (
                     vacuous and rule.invariant and rule.known
-                ):  # it applies to every run, and `after` never comes true in most
+                ):  # an invariant applies to every run, and in most runs `after` never becomes true
                     verdict = Verdict.PASSED
             yield CheckResult(
                 rule.number, rule.text, verdict, now_ns, 0, got=got, where=rule.where, names=rule.names, vacuous=vacuous

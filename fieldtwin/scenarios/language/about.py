@@ -27,7 +27,7 @@ def case_of(path: Path) -> str:
 
 
 def impacts(scenario: Scenario) -> Iterator[tuple[Impact, str]]:
-    """Yield each step and probe as its impact level and a description for people."""
+    """Yield the impact level and a description of each step and probe."""
     for n, step in enumerate(scenario.form.steps, 1):
         yield _danger_of(step), f"step {n}"
     for probe in scenario.probes:

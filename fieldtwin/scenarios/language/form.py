@@ -128,7 +128,7 @@ def invariants_of(system: System, group: SystemGroup | None = None, errors: Erro
 def incomplete_parts(system: System) -> frozenset[str]:
     """Return the devices, buses and programs of the system file that were not resolved because of errors.
 
-    A program whose variables are all bound to tags publishes no name, and is nevertheless complete.
+    A program is also complete if all its variables are bound to tags, although it then publishes no name.
     """
     from fieldtwin.twin.plant.physical import bound_programs
 

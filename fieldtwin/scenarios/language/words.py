@@ -92,7 +92,9 @@ class Within(_Form):
 
 
 class Rate(_Form):
-    """How often a tag is published, or a device asked, in any period of `over`; `while` says when it counts."""
+    """How often a tag must be published, or a device must be asked, in any period of `over`. The rule applies while `while` is
+    true.
+    """
 
     tag: str | None = None
     updates_per_s: BoundsForm | None = None
@@ -123,8 +125,9 @@ class ScenarioForm(_Form):
     """Restart PLC, simulations and devices first, on every target."""
     needs: list[str] = []
     stopped: list[Literal["plc"]] = []
-    """Parts of the system that stop in this scenario. Without it, a part that stops fails the scenario; with it, a part
-    that does not stop."""
+    """Parts of the system that must stop in this scenario. A part that stops without being named here fails the scenario, and
+    so does a named part that does not stop.
+    """
     always: list[str] = []
     never: list[str | WireForm] = []
     within: list[Within] = []

@@ -35,8 +35,8 @@ STOPPING_NS = 2 * NS_PER_S
 class ScenarioOptions:
     """The options of the scenario.
 
-    `share` of a value is its tolerance, `window_s` the allowed delay. `values`: device values are set, too (for a prototype
-    that replays something else).
+    `share` of a value is its tolerance, `window_s` the allowed delay. `values`: the scenario also sets device values, for a
+    prototype that replays different recordings.
     """
 
     name: str
@@ -94,7 +94,7 @@ def _stimuli(system: System, history: RunHistory, wanted: ScenarioOptions) -> It
         try:
             yield _Stimulus(came.t_ns, f"send: {{period_s: {decode_period(COMMAND(came.payload))}}}")
         except FieldtwinError:
-            continue  # not a command that a scenario can send; its effects are expected all the same
+            continue  # a scenario cannot send this command, but its effects are still expected
     yield from _faults(history)
     if not wanted.values:
         return
@@ -138,7 +138,7 @@ def _steps(system: System, history: RunHistory, wanted: ScenarioOptions, stimuli
             now_ns = look_ns
             yield from _looks(
                 system, history, wanted, begin_ns, look_ns
-            )  # of the fields that changed; at the end of all fields
+            )  # the expectations of the fields that changed; at the end, those of all fields
 
 
 def _seen(history: RunHistory, wanted: ScenarioOptions, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:

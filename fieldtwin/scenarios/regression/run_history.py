@@ -31,7 +31,7 @@ class ValueChange:
     quality: str = ""
 
     def says(self) -> tuple[Any, str]:
-        """Return the relevant content: a bad value counts as no value."""
+        """Return the part that is compared: a bad value counts as no value."""
         return (None if self.quality == "bad" else self.value), self.quality
 
     def __str__(self) -> str:

@@ -35,7 +35,7 @@ STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
     (WireError, 504),
     (DeviceRefused, 502),
 )
-"""The first class that fits gives the status; any other error is 422, a bug 500."""
+"""HTTP status by class of error; the first class that matches counts. All other errors give 422, and a bug gives 500."""
 
 _BY_NAME = {kind.__name__: status for kind, status in STATUS}
 

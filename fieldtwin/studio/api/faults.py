@@ -18,7 +18,7 @@ class InjectFault(msgspec.Struct, forbid_unknown_fields=True):
 
 
 async def list_fault_kinds(request: Request) -> list[dict[str, Any]]:
-    """Return every kind of fault with its parameters as JSON schema, and what it can be aimed at."""
+    """Return every kind of fault with its parameters as JSON schema, and the targets at which it can be aimed."""
     from fieldtwin.emulators.faults.registry import FAULTS  # here: a plant has no emulators installed
     from fieldtwin.emulators.faults.schema import aims_of
 

@@ -1,4 +1,4 @@
-"""Instances: which ones there are, what they consist of, and their present statuses."""
+"""Instances: a list of them, the system of each, and their present statuses."""
 
 from __future__ import annotations
 

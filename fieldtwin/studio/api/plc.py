@@ -31,7 +31,7 @@ async def get_plc(request: Request) -> Any:
 
 
 async def get_programs(request: Request) -> dict[str, Any]:
-    """Return of each program its variables, its states and transitions, and the text of its source."""
+    """Return for each program its variables, its states and transitions, and the text of its source."""
     return (await attached(request)).programs
 
 

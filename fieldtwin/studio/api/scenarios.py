@@ -1,4 +1,4 @@
-"""Scenarios: record what is done to a prototype as one, and run those of the instance's system."""
+"""Scenarios: record the actions on a prototype as a scenario, and run the scenarios of the instance's system."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ RECORD_EVERY_S = 0.5
 AGAIN_AFTER_S = 1.0
 """Pause in seconds before a process that did not answer is asked again."""
 NONE_OF_THEM = 1 << 62
-"""The number after which the refused writes are wanted: the status has them already."""
+"""The number after which refused writes are requested. It excludes all of them, because the status already contains them."""
 
 
 class Attachment:
@@ -201,7 +201,7 @@ class Attachment:
     async def _read_programs(self) -> dict[str, Any]:
         try:
             answer = await self.plc_channel.call("about")
-        except RemoteError:  # a PLC of an older version, whose programs are shown without names of states
+        except RemoteError:  # the PLC has an older version, so its programs are shown without names of states
             return {}
         programs: dict[str, Any] = answer["programs"]
         return programs

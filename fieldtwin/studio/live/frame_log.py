@@ -380,7 +380,7 @@ class FrameLog:
 
 
 def _whole(event: TraceEvent, answered: DecodedExchange | None) -> str:
-    """Return the reply that ended with this piece, "" if the frame has all of it."""
+    """Return the whole reply that ended with this piece, or "" if the frame itself contains all of it."""
     if answered is None or "id" in event.data or event.data.get("dir") == "sent":
         return ""
     reply = answered.reply.hex()

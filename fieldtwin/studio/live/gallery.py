@@ -35,8 +35,8 @@ class Gallery:
     async def attached(self, name: str) -> Attachment:
         """Return the attachment of an instance.
 
-        A run that was started again under the same name is attached anew. Raises `NoInstance`, and `FileInvalid` for a run of
-        another version.
+        If a run was started again under the same name, a new attachment is made. Raises `NoInstance`, and `FileInvalid` for a
+        run of another version.
         """
         async with self._lock:
             found = await find_instance(name)

@@ -14,7 +14,9 @@ Update = dict[str, Any]
 
 
 class Subscription:
-    """The updates for one client. ``async for`` is not offered, because a client also has to be told of its losses."""
+    """The updates for one client. ``async for`` is not offered, because the server also has to report lost updates to the
+    client.
+    """
 
     def __init__(self) -> None:
         self._waiting: deque[Update] = deque(maxlen=MOST_WAITING)

@@ -25,7 +25,7 @@ RESTLESS = 3
 SLACK_S = 4.0
 """An effect may take twice as long as observed, and this much longer: polls have another phase in each run."""
 RECOVERY_SLACK_S = 10.0
-"""The same for a tag that becomes good again: the gateway asks a lost device more and more rarely."""
+"""The same for a tag that becomes good again: the gateway asks a lost device at growing intervals."""
 KNOWN_WITHIN_S = 60
 
 T = TypeVar("T", Seen, State)
@@ -39,7 +39,7 @@ class _Expected(NamedTuple):
 
 
 def as_scenario(recording: Recording, name: str, system: str) -> str:
-    """Return the scenario file. `system` is what its key `system` says."""
+    """Return the scenario file. `system` is the value of its key `system`."""
     expected = [list(_expected(recording, n)) for n in range(len(recording.actions))]
     return "\n".join(
         [

@@ -1,4 +1,4 @@
-"""Record what clients do to a prototype, and what its tags and programs then do, as a scenario.
+"""Record the actions of clients on a prototype, and the reactions of its tags and programs, as a scenario.
 
 A `Recorder` notes actions and changes of one instance; `fieldtwin.studio.scenarios.proposal` turns its `Recording` into a
 scenario file.
@@ -27,7 +27,9 @@ Words = Mapping[str, Mapping[int, str]]
 
 
 class Action(NamedTuple):
-    """An action of a client. `step` is a step of a scenario; without one, `note` says what a scenario cannot express."""
+    """An action of a client. `step` is a step of a scenario; without one, `note` describes an action that a scenario cannot
+    express.
+    """
 
     t_ns: int
     step: dict[str, Any] | None

@@ -48,7 +48,7 @@ def _known(file: Path, system: Path) -> KnownScenario | None:
             return None
         data = load(file).data
     except (OSError, FieldtwinError):
-        return None  # `fieldtwin test` reports what is wrong with such a file
+        return None  # `fieldtwin test` reports the errors in such a file
     if not isinstance(data, dict) or not _names(str(data.get("system", "")), file, system):
         return None
     steps = data.get("steps")

@@ -120,7 +120,7 @@ class WorkerBench:
         found = self._tag(device, tag)
         config = self.system.devices[device]
         put = self.field.faults.value_set(device, tag)
-        if put is not None:  # a sensor that samples notes it at its next sample only
+        if put is not None:  # a sampling sensor uses the value only at its next sample
             return _as_held(found, put)
         emulated = self.field.devices[device]
         raw = next((h.raw for h in reversed(list(emulated.journal.since(0))) if h.tag == tag), None)
@@ -139,7 +139,7 @@ class WorkerBench:
         return tags[tag]
 
     def fault(self, said: Mapping[str, Any]) -> str:
-        """Put a fault in; its id. Times in it count from now."""
+        """Inject a fault and return its ID. Its times count from now."""
         self.field.faults.start_ns = self.field._clock.monotonic_ns()
         return self.field.faults.inject(said)
 

@@ -1,7 +1,6 @@
 """Write a system of one device as files: a test's description of a device becomes the input of a field simulator.
 
-So a device in a test is the device of any system: the same emulator, the same faults, the same names. Pure except for
-the files.
+So a device in a test has the same emulator, faults and names as in any system. Pure except for the files.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Gateway and PLC of a bench's system, as processes connected to its emulated field, which a test observes and controls.
 
-They are those of every run, on the wall clock; retained values of earlier runs are not used. The module does not depend
-on tests, and changes nothing in the field simulator.
+These are the same processes as in every run, on the wall clock; retained values of earlier runs are not used. The module does
+not depend on tests, and changes nothing in the field simulator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fieldtwin.twin.site.system import System
 
 BY = "test"
 STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
-"""Verbs of the PLC's process that a test may use; each with the arguments that it has there."""
+"""Commands of the PLC's process that a test may use, each with the names of its arguments."""
 
 
 class PlcProcesses:

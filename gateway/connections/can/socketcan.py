@@ -23,13 +23,13 @@ from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable, U
 from fieldtwin.gateway.wallclock import WallClock
 
 FRAMES_PER_TURN = 256
-"""The number of frames that are taken from the kernel before the event loop runs other tasks; the rest stays readable."""
+"""The largest number of frames read from the kernel before the event loop runs other tasks. Further frames stay in the kernel."""
 
 RECEIVE_BUFFER_BYTES = 4 << 20
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.001, 0.05
 SEND_TIMEOUT_S = 2.0
-"""If the transmit queue stays full for this long, no node acknowledges, or the controller is bus-off."""
+"""How long a full transmit queue is waited for. If it stays full, no node acknowledges, or the controller is bus-off."""
 
 
 class SocketCanConnection(CanConnection):

@@ -82,8 +82,8 @@ class SoftBusConnection(CanConnection):
     async def send(self, frame: CanFrame) -> None:
         """Pass `frame` to the bus's transmit queue, waiting while it is full. Raises `ConnectionLost`.
 
-        A node has at most the bus's transmit window of unconfirmed frames outstanding, so a new frame never waits for
-        seconds of frames in socket buffers.
+        A node has at most the bus's transmit window of unconfirmed frames outstanding, so a new frame does not wait behind
+        many older frames in socket buffers.
         """
         if frame.error:
             raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
@@ -142,7 +142,8 @@ class _Wire(asyncio.Protocol):
         self._gone: asyncio.Future[None] = loop.create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport = cast(asyncio.Transport, transport)  # uvloop's has the same methods, but another base class
+        # uvloop's transport has the same methods, but a different base class
+        transport = cast(asyncio.Transport, transport)
         self._transport = transport
         self._connection.local = address_of(transport)
 

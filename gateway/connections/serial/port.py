@@ -52,7 +52,8 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
             stopbits=settings.stop_bits,
             timeout=read_s,
             write_timeout=write_s,
-            # 0 and not None gives VMIN 1: an empty port then reads EAGAIN, and b"" can only mean that it hung up
+            # With a timeout of 0 pyserial sets VMIN 1: reading an empty port gives EAGAIN, and b"" only means that the port
+            # hung up.
             inter_byte_timeout=None if read_s else 0.0,
             exclusive=True,
         )

@@ -1,7 +1,7 @@
 """A serial port as a `ByteConnection` on systems whose ports have no descriptors for an event loop: Windows' COM ports.
 
-One thread reads and another writes; both wait in pyserial. Delivery is slower than in `line` by the time that it
-takes to wake a thread; otherwise the two are the same. This module must not know a protocol.
+One thread reads and another writes; both wait in pyserial. Delivery takes longer than in `line` by the time that it takes to
+wake a thread. Otherwise both behave the same. This module must not know a protocol.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ThreadedSerialConnection(ByteConnection):
                 OSError,
                 ValueError,
                 TypeError,
-            ) as e:  # pyserial's own are OSErrors; others if it was closed meanwhile
+            ) as e:  # pyserial's own errors are OSErrors; a port that was closed meanwhile raises other errors
                 self.feed_lost(lost(self.endpoint, str(e)))
                 raise self._loss() from e
 

@@ -143,7 +143,8 @@ class _Wire(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport = cast(asyncio.Transport, transport)  # uvloop's has the same methods, but another base class
+        # uvloop's transport has the same methods, but a different base class
+        transport = cast(asyncio.Transport, transport)
         self.transport = transport
         transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))

@@ -67,7 +67,7 @@ class Nursery:
                 try:
                     await asyncio.wait([child])
                 except asyncio.CancelledError:
-                    child.cancel()  # we were cancelled meanwhile: cancel the child, and raise below
+                    child.cancel()  # this task was cancelled meanwhile: cancel the child, and raise below
             if not child.cancelled():  # kept, and raised below unless another exception is already being raised
                 failed = failed or child.exception()
         if me is not None and me.cancelling() > asked_before:

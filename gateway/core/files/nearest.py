@@ -24,6 +24,6 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> list[str]:
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return a hint with the `known` name that is most similar to `name`, or `otherwise` if none is similar."""
+    """Return a hint with the `known` name that is most similar to `name`, or return `otherwise` if no name is similar."""
     near = nearest(name, known)
     return f"did you mean {near[0]!r}?" if near else otherwise

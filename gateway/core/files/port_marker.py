@@ -1,9 +1,9 @@
-"""The marker beside the link of a virtual serial port: whether the program that made the link still runs.
+"""The marker file next to the link of a virtual serial port. It shows whether the program that made the link still runs.
 
 A program that is killed leaves its link, and the kernel gives the number of its pseudo-terminal to the next program that opens
 one. The link then leads to a foreign terminal. The marker is a file beside the link. It names the pseudo-terminal, and the
 program that made the port keeps it locked; the kernel releases the lock when that program ends, however it ends. A link
-without a marker belongs to the user, and is not judged.
+without a marker belongs to the user, and is not checked.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Read the file of a device profile: resolve its form to a `DeviceProfile`, and check what the form alone cannot express."""
+"""Read the file of a device profile: convert it to a `DeviceProfile`, and check the rules that the schema cannot express."""
 
 from __future__ import annotations
 

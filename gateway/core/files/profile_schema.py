@@ -1,6 +1,6 @@
 """The pydantic models of a device profile's YAML file (see docs and `fieldtwin schema profile`).
 
-fieldtwin.gateway.core.files.profile_file turns the form into frozen objects with resolved addresses.
+fieldtwin.gateway.core.files.profile_file converts these models to frozen objects with resolved addresses.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ MAX_LINE_BYTES = 65_536
 """Longer lines are refused: the longest Modbus exchange takes about 1,100 bytes."""
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""Each operating system has only one of the last two flags."""
+"""Of the last two flags, each operating system has only one."""
 
 _OTHER_FILES = (
     (b'{"fieldtwin_dump"', " but a dump: fieldtwin infer, diff and report read it"),

@@ -4,10 +4,10 @@ There are normally two regions: `INPUTS`, written by the gateway, and `OUTPUTS`,
 carries a counter and a time, which show the other process that the writer is alive. Both ends of the memory compare a
 hash of the layout. This module has no mmap, no file and no clock (DESIGN.md, "Who shares the process image").
 
-Messages (a modem's mailbox) go through a region as rings. The *other* region says up to which message a message tag has
-been handled: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for
-every message tag of INPUTS. So neither process overruns a ring, and a mailbox is acknowledged only up to the messages
-that were consumed.
+Messages (a modem's mailbox) go through a region as rings. The *other* region holds the sequence of the last message that has
+been handled: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for every
+message tag of INPUTS. So neither process overruns a ring, and a mailbox is acknowledged only up to the messages that were
+consumed.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ _MAGIC = b"ftimage\0"
 
 
 def taken_name(tag: str) -> str:
-    """Return the INT tag of INPUTS that says up to which sequence the gateway took messages of output `tag`."""
+    """Return the INT tag of INPUTS that holds the sequence of the last message of output `tag` that the gateway took."""
     return f"{tag}.taken"
 
 
 def consumed_name(tag: str) -> str:
-    """Return the INT tag of OUTPUTS that says up to which sequence the PLC consumed messages of input `tag`."""
+    """Return the INT tag of OUTPUTS that holds the sequence of the last message of input `tag` that the PLC consumed."""
     return f"{tag}.consumed"
 
 

@@ -1,6 +1,6 @@
 """The contents of a process image: tags, regions, and the positions in bytes that follow from them.
 
-This module only describes. It must not know the memory itself, who maps it, or what a tag means in a plant.
+This module only describes the layout. It must not know the memory itself, who maps it, or what a tag means in a plant.
 
 A region (one writer, any number of readers) lies in memory as
 

@@ -1,6 +1,6 @@
 """CAN identifiers of CANopen: the pre-defined connection set, and the restricted CAN-IDs (CiA 301, 7.3.3 and 7.3.5).
 
-Pure arithmetic, without frames or a bus.
+This module only computes numbers; it uses no frames and no bus.
 """
 
 from __future__ import annotations

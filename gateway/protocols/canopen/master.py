@@ -1,6 +1,6 @@
 """The CANopen master on one bus: the only reader of a CanConnection, and the services that drivers use.
 
-Thin asyncio around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no particular device and no bus
+It is a thin asyncio layer around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no particular device and no bus
 hardware; the parts quote the clauses of the standard.
 """
 

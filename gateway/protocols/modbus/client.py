@@ -107,7 +107,7 @@ class ModbusClient:
     transmission. Without it (RTU inside TCP) frames need no silence. `timeout_s` is the time in which a unit has to answer,
     `turnaround_s` the time that all units get to execute a broadcast, `spacing_s` a pause after every exchange, and `silence_s`
     the silence before a request if it differs from that of SL 2.5.1.1. `RtuFramer` describes `echo` and `strict`, and
-    `MbapFramer` `accepts_zero_id`. A setting that the framing does not have raises `UsageError`.
+    `MbapFramer` `accepts_zero_id`. The constructor raises `UsageError` for a setting that the framing does not have.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """The serial line between two exchanges: the silence before a request, and the quarantine after a failed exchange.
 
 On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no request
-is sent until the line has been silent for as long as the slowest reply so far took (case MB-013). Pure: it is told what arrived
-and when, and returns the time until which to wait. Times are monotonic nanoseconds.
+is sent until the line has been silent for as long as the slowest reply so far took (case MB-013). Pure: the caller reports
+what arrived and when, and this module returns the time until which the caller has to wait. Times are monotonic nanoseconds.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
 Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A unit ID without a route gets
 exception 0A, a unit that does not answer gets 0B, each once (TG 4.4.2.5). The request goes through the target bus's own queue,
-after the PLC's writes and alternating with its polls. After a unit did not answer, the bridge does not ask it for a growing time,
-in which its clients get 0B at once (case MB-062). Every write is recorded in the audit log before it is sent.
+after the PLC's writes and alternating with its polls. After a unit did not answer, the bridge sends it no requests for a time
+that grows with each failure. Meanwhile its clients get 0B immediately (case MB-062). Every write is recorded in the audit log
+before it is sent.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class BridgeConfig:
     in_flight: int = 16
     idle_s: float = 0.0
     insist: bool = True
-    """Whether a port that cannot be opened is tried again and again; otherwise that is an error."""
+    """Whether the bridge keeps trying to open a port that cannot be opened; otherwise this is an error."""
 
     @property
     def buses(self) -> set[str]:
@@ -105,8 +106,8 @@ class BridgeCounters:
     """Counters of the outcomes of requests.
 
     Requests in `no_path` and `refused` were not forwarded. Those in `spared` and `full` were answered without using the bus,
-    because the unit was away or the queue was full. Those in `silent` got no answer from the unit, and those in `unread` were
-    answered after the client had disconnected.
+    because the unit had not answered before or the queue was full. Those in `silent` got no answer from the unit, and those in
+    `unread` were answered after the client had disconnected.
     """
 
     requests: int = 0

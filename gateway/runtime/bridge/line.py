@@ -1,8 +1,9 @@
 """A Modbus RTU client on a serial line that sends requests to the gateway: the gateway acts as one or more servers on
 it.
 
-A reply on a serial line does not identify its request. A client that sends something else before it has its answer has given up
-waiting. The answer is then never sent, because the client would take it for the answer to the next request.
+A reply on a serial line does not identify its request. A client that sends something else before it has received its answer
+has given up waiting. The gateway then never sends the answer, because the client would take it for the answer to the next
+request.
 """
 
 from __future__ import annotations

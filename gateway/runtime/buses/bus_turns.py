@@ -47,9 +47,9 @@ class DeviceState:
     asked_ns: int = 0
     """When it was last tried while it was away."""
     late_ns: int = 0
-    """The duration of its reply that came after a shortened timeout; 0: there was none."""
+    """How long its reply took that arrived after a shortened timeout; 0 if there was no such reply."""
     last_cost_ns: int = 0
-    """How long it used the bus without success although it answered at first."""
+    """How long its last poll used the bus without success, although the device answered at first."""
     timeout_ns: int = 0
     """The timeout of its next try; 0: its own."""
     answered_ns: int = 0
@@ -57,7 +57,7 @@ class DeviceState:
     silences: int = 0
     """How many of its polls in a row had no reply while it counts as online."""
     fits: bool = True
-    """Whether its next try can end before another device misses a period."""
+    """Whether its next attempt can end before another device misses a poll."""
 
     @property
     def retries_left(self) -> bool:
@@ -231,6 +231,6 @@ class Turns:
 
 
 def _own_ns(device: DeviceState, bus_timeout_s: float) -> int:
-    """Return how long the device may take to answer, in ns."""
+    """Return the device's normal timeout in ns."""
     own_s = device.driver.config.timeout_s
     return round((bus_timeout_s if own_s is None else own_s) * NS_PER_S)

@@ -156,7 +156,7 @@ class CanopenBus:
             if not status.reading:
                 self._take_over(status)
                 if status.polling is not None and self._nursery is not None:
-                    status.polling.cancel()  # it may sleep until a poll that no longer exists
+                    status.polling.cancel()  # the task may sleep until the time of a poll that no longer exists
                     status.polling = self._nursery.start(self._poll(status), f"{status.driver.config.name} polls")
         self._taken_over()
 
@@ -293,7 +293,10 @@ class CanopenBus:
         while True:
             try:
                 connection = await self._connector.open_can(self.config.endpoint, self.config.bitrate)
-            except (Unreachable, UsageError) as e:  # a wrong bit rate can be corrected while we run, so keep trying
+            except (
+                Unreachable,
+                UsageError,
+            ) as e:  # a user can correct a wrong bit rate while the gateway runs, so keep trying
                 self._lost(e)
                 await self._pause(backoff.next_s())
                 continue
@@ -395,7 +398,7 @@ class CanopenBus:
     def _online(self, status: NodeStatus) -> None:
         driver = status.driver
         for tag in driver.profile.tags.values():
-            if tag.readable:  # only now is it known which tags a TPDO brings, and when
+            if tag.readable:  # only now the gateway knows which tags a TPDO carries, and when it is sent
                 self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
         self._tags.put_bad([f"{driver.config.name}.{tag}" for tag in driver.unbrought], Reason.NOT_OPERATIONAL)
         status.online, status.error = True, ""
@@ -552,7 +555,7 @@ class CanopenBus:
             self._offline(status, Unreachable("heartbeat lost"))
             status.wanted.set()
         elif event.kind == "state" and event.state is not NmtState.OPERATIONAL:
-            self._on_offline(status.driver)  # the node alone decides about its outputs then
+            self._on_offline(status.driver)  # in that case the node alone controls its outputs
             if event.state is NmtState.PRE_OPERATIONAL and status.online and status.driver.config.start:
                 self._start_again(status)
         elif event.kind == "conflict":

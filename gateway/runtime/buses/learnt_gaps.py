@@ -58,7 +58,7 @@ class LearntFile:
             with self._path.open("rb") as file:
                 entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, LearntGapsEntry])
         except (OSError, msgspec.DecodeError):
-            # there is no file yet, or it is not one of ours: the gaps are learnt again and the file is written anew
+            # there is no file yet, or fieldtwin did not write it: the gaps are learnt again and the file is replaced
             return
         for driver in self._drivers:
             entry = entries.get(driver.config.name)

@@ -497,7 +497,7 @@ class ModbusBus:
             await self._attempts(device, driver.synchronise)
         device.schedule.start(self._clock.monotonic_ns())
         group = next(iter(device.schedule.due_ns), "")
-        # A device of which nothing is ever read counts as online, because no poll could tell.
+        # A device from which nothing is ever read counts as online, because no poll can show whether it is.
         device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
         if device.online:
             device.error = ""
@@ -542,10 +542,10 @@ class ModbusBus:
     def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
         """Handle a device that answers but refuses this group. Its other groups are still read.
 
-        Busy (06) and acknowledge (05: the request takes long) mean "later": the last value stays valid until it is stale and is
-        never replaced by 0, and the device gets a pause (MB-023, MB-024). The pause is one for the whole device: other groups
-        that are refused with "later" before it is over wait until the same moment. Only a refusal after that moment makes the
-        next pause longer.
+        The exceptions busy (06) and acknowledge (05: the request takes long) mean that the request may succeed later. The last
+        value stays valid until it is stale, it is never replaced by 0, and the device gets a pause (MB-023, MB-024). The pause
+        is one for the whole device: other groups that get one of these exceptions before the pause is over wait until its end.
+        Only an exception after its end makes the next pause longer.
         """
         device.poll_errors += 1
         device.reading = None

@@ -92,7 +92,7 @@ class NodeWrites:
                 except FieldtwinError as e:
                     error = e
                 finally:
-                    self._driver.consumer.queue.clear()  # a failed command must not be sent before a newer one
+                    self._driver.consumer.queue.clear()  # a failed command must not be repeated ahead of a newer command
                 if self._downloads and self._downloads[0] is item:  # otherwise `fail` has already ended this write
                     self._downloads.popleft()
                     done(error)

@@ -31,7 +31,7 @@ class AckedCommandStore:
                     entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, str])
                 self._taken = {device: bytes.fromhex(raw) for device, raw in entries.items()}
             except (OSError, msgspec.DecodeError, ValueError):
-                pass  # there is no file yet, or it is not one of ours
+                pass  # there is no file yet, or fieldtwin did not write it
 
     def of(self, device: str) -> bytes:
         """Return the transmitter's inbox whose message was taken, or b"" if there is none."""

@@ -1,6 +1,6 @@
 """Outputs of one device that are written together or not at all.
 
-It is worse to start a drive with its old setpoint, because the new one was refused, than not to start it. So the members of a
+For example, a drive must not be started with its old setpoint because the new setpoint was refused. So the members of a
 group are checked before any of them is written: when a program's value for one of them is refused, or does not exist yet, the
 others are held back. Adjacent registers are written with one request, and objects that share an RPDO with one frame. All other
 members are written in the group's order, each write after the previous one was confirmed. If a communication error interrupts the

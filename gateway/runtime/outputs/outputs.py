@@ -420,13 +420,13 @@ class OutputWriter:
             self.writes += 1
             output.held, output.held_since_ns = value, self._now_ns
             if not output.read_back and output.tag in self._tags:
-                # the last reading is older than the write, and there will be no newer one
+                # the last reading is older than the write, and no newer reading will follow
                 self._tags.put_bad([output.tag], Reason.STALE)
             self.journal.settle(output.tag)
         else:
             self.failures += 1
             self._note(output, value, cause_of(error), error, by, audit=False)
-            output.driver.consumer.queue.clear()  # the command that failed must not be sent before a newer one
+            output.driver.consumer.queue.clear()  # the failed command must not be repeated ahead of a newer command
         result = "done" if error is None else f"failed: {error}"
         try:
             self._audit.note(

@@ -108,7 +108,7 @@ class RefusedOutput:
     place: str = ""
     known: bool = True
     standing: bool = True
-    """False once a different value was wanted, or the value was written."""
+    """Whether the refusal still applies: False once a different value was wanted, or the value was written."""
 
     @property
     def of_program(self) -> bool:
@@ -197,7 +197,7 @@ class Refusals:
             before.standing = False
         self._number += 1
         entry = RefusedOutput(self._number, tag, value, value, cause, reason, by, now_ns, now_ns)
-        entry.standing = entry.of_program  # a client's request was for one write, so it does not stand
+        entry.standing = entry.of_program  # a client requests a single write, so its refusal does not stay open
         entry.known = not (self.looks_up and by == "plc")
         if entry.of_program:
             self.faults[entry.fault] += 1

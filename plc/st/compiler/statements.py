@@ -16,7 +16,7 @@ MAX_DEEP = 60
 MAX_LOOPS = 18
 """How deep loops may be nested: Python's limit is 20."""
 MAX_CONTINUES = 50
-"""How many CONTINUEs one REPEAT may have: the condition is written out for each."""
+"""The largest number of CONTINUE statements in one REPEAT. The generated code repeats the condition for each of them."""
 _CHAIN = 48
 """The longest chain of elif: a longer chain is split, because Python nests each branch in the one before."""
 

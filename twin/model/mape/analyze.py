@@ -1,8 +1,8 @@
 """Analyze: the second stage. It compares what the plant reports with the digital model and emits its findings.
 
 It finds state mismatches, values outside the model's limits, and bad and stale values. It also computes the twinning
-figures: how often plant and model agree, the twinning rate, and the lag. It must never depend on a connection, nor on
-anything that could send a command.
+figures: how often plant and model agree, the twinning rate, and the lag. This module must never depend on a connection, or on
+code that can send a command.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 LAGS = 10_000
-"""Number of arrivals whose lag is kept for the figures."""
+"""How many of the latest events count in the figures of the lag."""
 LATE_MS = 10_000
-"""An event that is older than this when it arrives was backfilled. It is counted, and excluded from lag and rate. So
-are events from before this twin was running."""
+"""An event that is older than this when it arrives counts as backfilled history, and so does an event from before this twin
+was started. Both are counted, and left out of the lag and the rate.
+"""
 
 
 class Analyze(DTDigitalThreadProcess):

@@ -70,8 +70,8 @@ class CommandCheck:
 class Execute(DTDigitalThreadProcess):
     """SPEC row Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
 
-    For each command for which the planner gives no own question, `what_if` is asked `question`. The command is sent only after an
-    answer without an objection.
+    If the planner gives a command no question, `what_if` is asked the twin's default `question`. The command is sent only
+    after an answer without an objection.
     """
 
     def __init__(

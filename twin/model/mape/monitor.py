@@ -1,7 +1,7 @@
 """Monitor: the first stage. It takes what the plant reports, keeps the digital model up to date, and passes everything
 on.
 
-It must never depend on a connection, nor on anything that could send a command.
+This module must never depend on a connection, or on code that can send a command.
 """
 
 from __future__ import annotations

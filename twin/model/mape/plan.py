@@ -1,6 +1,7 @@
 """Plan: the third stage. It turns findings into commands, by rules or by a planner that the user wrote in Python.
 
-It decides and sends nothing: it emits commands to Execute, which checks them against the digital model first.
+It only decides, and sends nothing itself: it emits commands to Execute, which checks them against the digital model before
+they are sent.
 """
 
 from __future__ import annotations

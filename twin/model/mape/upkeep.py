@@ -1,8 +1,8 @@
 """Upkeep: keeps the digital model's variables up to date with what the plant reports.
 
 The Monitor does not change the model when a measurement arrives; it passes the measurement on to its subscribers (SPEC
-row Monitor). Upkeep is such a subscriber, as a database is: so everything that is received updates the model (SPEC
-prose, row 5). It must never depend on a connection, nor on anything that could send a command.
+row Monitor). Upkeep is such a subscriber, as a database is. So every received measurement updates the model (SPEC prose, row
+5). This module must never depend on a connection, or on code that can send a command.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction,
 RESTART_S = 2.0
 """Time within which a master has to notice that a node booted, and to start it."""
 SILENT = _case("CO-000", "no reply", ROBUST, "", READ, plays.nothing, judges.rejects, "is silent", "")
-"""Not a listed case: it measures the master's timeout."""
+"""This is not a test case: it measures the master's timeout."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
 DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 

@@ -70,7 +70,7 @@ is_unmoved = owes(_unmoved)
 
 
 def _waits_for_each(seen: Observation) -> Finding | None:
-    """Check that no request was repeated before its answer came. Every answer came within the timeout of its own request."""
+    """Check that the master repeated no request before its answer. Every answer came within the timeout of its own request."""
     asked = list(seen.of(RequestSeen, seen.begun_ns, seen.over_ns))
     for one, following in pairwise(asked):
         told = next(seen.of(ReplySent, one.t_ns, seen.over_ns), None)
@@ -104,7 +104,7 @@ def takes_the_switch(seen: Observation) -> Finding:
 
 
 def _one_a_block(seen: Observation) -> Finding | None:
-    """Check that a sub-block is acknowledged once, and a segment never."""
+    """Check that the master acknowledges each sub-block once, and does not acknowledge single segments."""
     acknowledged = [s for s in seen.of(Sent, seen.begun_ns, seen.over_ns) if s.data[2] & 0xE3 == BLOCK_ACKNOWLEDGED]
     segments = sum(
         1 for t in seen.of(ReplySent, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS

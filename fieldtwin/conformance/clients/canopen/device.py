@@ -1,4 +1,5 @@
-"""The correct CANopen nodes underneath the hostile one: every object exists and holds one word, every node answers SDO.
+"""The correct CANopen nodes, from which the hostile node derives its replies. Every object exists and holds one word, and
+every node answers SDO.
 
 Pure: frames and `now` in, frames out. A node is created by the first request or command to it.
 """

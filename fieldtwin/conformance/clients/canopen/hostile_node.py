@@ -70,7 +70,7 @@ class HostileNode:
         return self._word
 
     def begin(self, case: CanopenCase, strikes: int) -> None:
-        """Run `case` from the next matching transfer on, until `strikes` are used up or `end` is called."""
+        """Run `case` from the next matching transfer on, until it has answered `strikes` transfers wrongly or `end` is called."""
         self._case, self.strikes, self._memory = case, strikes, None
         self.struck = self.first_ns = self.last_ns = 0
 

@@ -13,7 +13,9 @@ PRE_OPERATIONAL = 0x7F
 LATE = 1.5
 STORM = range(100, 120)
 SLOW = 0.35
-"""Share of a timeout that each step of a slow transfer takes: no step is too long, but all of them together are."""
+"""The part of a timeout that each step of a slow transfer takes. No single step exceeds the timeout, but all steps together
+do.
+"""
 
 
 def nothing(scene: SdoRequestContext) -> list[SayFrame]:
@@ -79,7 +81,7 @@ def loses(at: int) -> SdoReplyFunction:
 
 
 def expedited_instead(scene: SdoRequestContext) -> list[SayFrame]:
-    """Block upload is answered by an ordinary one, as pst allows."""
+    """Answer a block upload with an ordinary upload, as the client's protocol switch threshold (pst) allows."""
     if not scene.opens:
         return scene.honest()
     size = len(scene.poison)
@@ -204,7 +206,7 @@ def slow_segments(scene: SdoRequestContext) -> list[SayFrame]:
 
 
 def unhurried(scene: SdoRequestContext) -> list[SayFrame]:
-    """Delay each reply by more than half of a timeout: two consecutive ones take longer than one."""
+    """Delay each reply by more than half of a timeout, so that two consecutive replies take longer than one timeout."""
     return [scene.reply(data, 0.6 * scene.timeout_s) for data in scene.true]
 
 

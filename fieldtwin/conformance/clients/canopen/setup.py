@@ -25,9 +25,9 @@ class SayFrame:
 class SdoRequestContext:
     """One SDO request that receives a wrong reply: eight bytes to `node`.
 
-    `true` are the correct replies, `false` is an expedited one with the poisoned word. `nth` counts the transfers of
-    the case from 0; `opens` is whether the request begins one. `memory` belongs to the transfer, for replies that
-    depend on earlier segments.
+    `true` are the correct replies, `false` is an expedited reply with the poison word (a value that no correct answer holds).
+    `nth` counts the transfers of the case from 0; `opens` is whether the request begins one. `memory` belongs to the transfer,
+    for replies that depend on earlier segments.
     """
 
     node: int

@@ -1,4 +1,5 @@
-"""The correct Modbus device underneath the hostile one: every address exists, every function of the standard works.
+"""The correct Modbus device, from which the hostile server derives its replies. Every address exists, and every function of
+the standard works.
 
 All registers and bits hold one word, so that every value that a client reads and publishes is known; it reads back the
 values that it wrote.

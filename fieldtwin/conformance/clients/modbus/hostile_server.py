@@ -1,6 +1,6 @@
 """The endpoint of a Modbus client under test: it replies correctly until a case begins.
 
-It records everything without a verdict. It handles connections and time, and no specific case.
+It records everything without a verdict. It handles connections and time, and does not know specific cases.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class HostileServer:
         self.clients = 0
         self.on_event: Callable[[], None] = lambda: None
         self.unplug: Callable[[Unplug], None] = lambda move: None
-        """Takes the port away and gives it back; `pending` counts it until then."""
+        """The function that removes the port and restores it. Until the port is restored, `pending` counts this move."""
         self._make_wire = make_wire
         self._first: RequestContext | None = None
         self._loop = asyncio.get_running_loop()
@@ -68,7 +68,7 @@ class HostileServer:
         return self.device.word
 
     def begin(self, case: ModbusCase, strikes: int) -> None:
-        """Run `case` from the next matching request on, until `strikes` are used up or `end` is called."""
+        """Run `case` from the next matching request on, until it has answered `strikes` requests wrongly or `end` is called."""
         self.play, self.strikes, self._first = case, strikes, None
         self.struck = self.first_ns = self.last_ns = 0
 
@@ -185,7 +185,7 @@ class _Client:
                 left -= 1
                 self._stage.pending -= 1
         except ConnectionLost:
-            pass  # the client closed the connection before it was answered
+            pass  # the client closed the connection before it received its answer
         finally:
             self._stage.pending -= left
             self._stage.on_event()

@@ -65,12 +65,12 @@ def corrupt_echo(scene: RequestContext) -> list[Move]:
 
 
 def late(scene: RequestContext) -> list[Move]:
-    """Answer the first request too late, with the poison; requests meanwhile are answered after it."""
+    """Answer the first request too late, with the poison value. Requests that arrive meanwhile are answered after it."""
     return [Say(scene.frame(scene.false), LATE * scene.timeout_s)]
 
 
 def late_other(scene: RequestContext) -> list[Move]:
-    """Answer the first request when one of a different shape has come, and answer that one afterwards."""
+    """Answer the first request only after a different request has arrived, and answer the second request afterwards."""
     if scene.first is None:
         return []
     if scene.first.request == scene.request:

@@ -44,7 +44,7 @@ class PtyLine:
         return frozenset({"port"} if os.geteuid() == 0 else {"port", "lock"})
 
     async def run(self) -> None:
-        """Serve the client; when the port is unplugged, do as the move says, and continue to serve."""
+        """Serve the client; when a case unplugs the port, restore it as the case states, and continue to serve."""
         plugged_in_again = False
         while True:
             await self._stage.serve(self._port, plugged_in_again=plugged_in_again)

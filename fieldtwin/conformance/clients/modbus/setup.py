@@ -29,7 +29,7 @@ class HangUp:
 
 @dataclass(frozen=True, slots=True)
 class Deaf:
-    """Leave the connection open and never say anything on it again."""
+    """Leave the connection open, and send nothing on it any more."""
 
     after_s: float = 0.0
 
@@ -48,11 +48,11 @@ Move = Say | HangUp | Deaf | Unplug
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """One request that is to be misanswered.
+    """One request that gets a wrong reply.
 
-    `request` is unit id and PDU, `tag` its transaction id. `true` is the honest response PDU, `false` one of the same shape with
-    the poisoned word. `nth` counts the requests of the case from 0. `timeout_s` is the client's response timeout, or the best
-    guess. `first` is the case's first scene, None in it.
+    `request` is unit ID and PDU, `tag` its transaction ID. `true` is the correct response PDU, `false` a response of the same
+    form with the poison word. `nth` counts the requests of the case from 0. `timeout_s` is the client's response timeout, or
+    the best guess. `first` is the context of the case's first request, None for that request itself.
     """
 
     wire: ModbusWire

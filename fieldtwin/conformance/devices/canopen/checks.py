@@ -39,7 +39,7 @@ async def long_object(wire: NodeConnection) -> Key:
 
 
 async def begin_upload(wire: NodeConnection, key: Key) -> None:
-    """Begin an upload in segments. Raises `NotHere` if the node answers otherwise."""
+    """Begin an upload in segments. Raises `NotHere` if the node does not answer with segments."""
     reply = await wire.ask(b"\x40" + mux(*key))
     if reply.specifier != 2 or reply.data[0] & 2:
         raise NotHere(f"{shown(key)} is not uploaded in segments: {reply}")

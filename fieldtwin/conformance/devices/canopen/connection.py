@@ -1,4 +1,5 @@
-"""The connection of a check to a CAN bus: any frame out, every frame of the node in, and SDO by hand.
+"""The connection of a check to a CAN bus. It sends any frame, receives every frame of the node, and sends SDO requests byte by
+byte.
 
 It must not depend on the purpose of a case. It sends only frames that the case's impact level permits: reading means
 uploads, however unusual. Clauses are CiA 301's.

@@ -127,7 +127,7 @@ async def silent_outside(wire: NodeConnection) -> Finding:
 
 
 async def fastscan(wire: NodeConnection) -> Finding:
-    """CO-057: a node that has an id keeps out of a fastscan."""
+    """CO-057: a node that has a node ID does not answer a fastscan."""
     wire.forget()
     await wire.send(CanFrame(LSS_REQUEST, b"\x51\0\0\0\0\x80\0\0"))
     if await wire.hear(LSS_REPLY) is not None:

@@ -39,7 +39,7 @@ async def toggle_repeated(wire: NodeConnection) -> Finding:
 
 
 async def client_aborts(wire: NodeConnection) -> Finding:
-    """CO-002: the client aborts after a segment, then asks for the next one all the same."""
+    """CO-002: abort after a segment, and then request the next segment nevertheless."""
     key = await long_object(wire)
     await begin_upload(wire, key)
     await wire.ask(b"\x60")
@@ -165,7 +165,9 @@ async def _any_object(wire: NodeConnection) -> Key:
 
 
 async def no_switch_unasked(wire: NodeConnection) -> Finding:
-    """CO-021: request a block upload without permission to switch to an ordinary one: blocks, or an abort."""
+    """CO-021: request a block upload without permission to switch to an ordinary upload. The node must answer with blocks or
+    an abort.
+    """
     key = await _any_object(wire)
     reply = await _begin_block(wire, key, 127, switch=0)
     if not reply.data:
@@ -195,7 +197,7 @@ async def block_size_128(wire: NodeConnection) -> Finding:
 
 
 async def _block(wire: NodeConnection, size: int) -> list[bytes] | str:
-    """Return the segments of one sub-block, or a description of the differing reply."""
+    """Return the segments of one sub-block, or a description of the reply if it is not a segment."""
     segments: list[bytes] = []
     while len(segments) < size:
         reply = await wire.reply()
@@ -210,8 +212,8 @@ async def _block(wire: NodeConnection, size: int) -> list[bytes] | str:
 async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool) -> tuple[bytes, str]:
     """Make a whole block upload; return the value and any error.
 
-    With `lose`, the first sub-block is acknowledged only up to its last but one segment. The end is left open: the
-    server's last frame has been received, the client's has not been sent.
+    With `lose`, the first sub-block is acknowledged only up to its last but one segment. The upload is not ended: the server's
+    last frame was received, and the client's confirmation was not sent.
     """
     begun = await _begin_block(wire, key, size)
     if begun.specifier != 6:

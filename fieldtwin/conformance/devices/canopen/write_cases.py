@@ -80,7 +80,7 @@ async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
 
 
 def _instead(key: Key, value: bytes | SdoReply) -> str:
-    """Describe a given object that a case cannot use."""
+    """Return the reason why a case cannot use a given object."""
     if isinstance(value, SdoReply):
         return f"{shown(key)} could not be read ({value})"
     return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
@@ -146,7 +146,8 @@ async def _limit(wire: NodeConnection, *, above: bool) -> Finding:
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
         bound = None if entry is None else entry.high if above else entry.low
         if not isinstance(bound, int):
-            continue  # no limit, or one of a real type, where the next value depends on the precision
+            # the object has no limit, or a limit of a real type, for which the next value depends on the precision
+            continue
         async with _borrowed(wire, key) as before:
             value, bits = (bound + 1 if above else bound - 1), 8 * len(before)
             least = -(1 << bits - 1) if entry is not None and entry.type_code in SIGNED else 0
@@ -246,7 +247,7 @@ async def crc_mismatch(wire: NodeConnection) -> Finding:
 
 
 async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
-    """Download the object's own value by blocks; if `lose`, the second segment is lost at first."""
+    """Download the object's present value by blocks. With `lose`, the second segment is not sent at first."""
     key, before = await _text(wire)
     async with _borrowed(wire, key):
         begun = await _begin_block(wire, key, len(before))

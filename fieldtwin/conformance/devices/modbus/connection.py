@@ -1,4 +1,4 @@
-"""The connection of a check to a Modbus device: any bytes out, every byte in, and the device's normal answers.
+"""The connection of a check to a Modbus device. It sends any bytes, receives every byte, and knows the device's normal answers.
 
 It must not depend on the purpose of a case. It permits only requests within the case's impact level, by a list of
 functions: a case that would send others is a bug of fieldtwin.
@@ -30,7 +30,7 @@ PATIENCE = 3
 FIRST_TRANSACTION = 0x0100
 """First transaction ID of each case: the same case always sends the same bytes, whatever ran before."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
-"""Exceptions of a gateway that has no such device."""
+"""Exceptions with which a gateway reports that the addressed device is missing."""
 
 Open = Callable[[], Awaitable[ByteConnection]]
 
@@ -82,7 +82,7 @@ class DeviceConnection:
         self.framing, self.unit, self.traits = framing, unit, traits
         self.timeout_s, self.char_s = timeout_s, char_s
         self.pause_s = max(4 * char_s, 0.005)
-        """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with something to spare."""
+        """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with a margin."""
         self.impact = Impact.READ
         self.good = b""
         """The request that tests normal operation: a read."""
@@ -182,7 +182,7 @@ class DeviceConnection:
             if chunk:
                 data += self._without_echo(chunk)
                 self._quiet_since_ns = self.clock.monotonic_ns()
-                if count:  # a reply has begun: its rest may take the time of a frame
+                if count:  # a reply has begun, and its remaining bytes may take as long as a whole frame
                     end_ns = max(end_ns, self._quiet_since_ns + round((self.pause_s + 0.05) * NS_PER_S))
         return data, self._closed
 

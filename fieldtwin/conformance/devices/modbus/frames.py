@@ -1,7 +1,7 @@
 """Modbus frames for checks: requests made by hand, including damaged ones, and replies found in the received bytes.
 
-Pure. A driver's framer discards invalid data; a check looks for it, so nothing is discarded: bytes that form no frame
-are kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
+Pure. A driver's framer discards invalid data. A check examines invalid data, so nothing is discarded here: bytes that form no
+frame are kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
 """
 
 from __future__ import annotations

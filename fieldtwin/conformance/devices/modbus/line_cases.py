@@ -1,4 +1,4 @@
-"""Cases of a serial line, RTU and ASCII: damaged frames, noise, pauses, neighbours. They send reads only.
+"""Cases of a serial line, RTU and ASCII: damaged frames, noise, pauses, and the traffic of other units. They send reads only.
 
 SL is MODBUS over Serial Line V1.02. Where strict and tolerant receivers differ, both pass as long as they are
 consistent.
@@ -16,7 +16,7 @@ from fieldtwin.gateway.protocols.modbus.frames.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 LONG_PAUSE_S = 0.1
-"""Ends any RTU frame at any baud rate from 1200 on."""
+"""A pause that ends any RTU frame at any baud rate from 1200 on."""
 
 
 async def bad_check_sum(wire: DeviceConnection) -> Finding:
@@ -29,7 +29,7 @@ async def bad_check_sum(wire: DeviceConnection) -> Finding:
 
 
 async def half_then_whole(wire: DeviceConnection) -> Finding:
-    """MB-004: half a request, a pause, a whole one."""
+    """MB-004: send half a request, and after a pause a whole request."""
     frame = wire.frame(wire.good)
     await wire.say(frame[: len(frame) // 2], wire.good)
     await wire.pause(max(LONG_PAUSE_S, 2 * wire.pause_s))
@@ -210,7 +210,7 @@ async def bad_lrc(wire: DeviceConnection) -> Finding:
 
 
 async def second_colon(wire: DeviceConnection) -> Finding:
-    """MB-070: send half a frame, then a whole one: the colon begins a new frame."""
+    """MB-070: send half a frame, then a whole frame. The colon begins a new frame."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7] + frame, wire.good)
     heard = await wire.hear()

@@ -34,7 +34,7 @@ async def after_unknown(wire: DeviceConnection) -> Finding:
 
 
 async def high_function(wire: DeviceConnection) -> Finding:
-    """MB-035: function 83h; code 01 or silence, the same both times."""
+    """MB-035: send function 83h twice. The device must give code 01 or no answer, and the same both times."""
     seen = []
     for _ in range(2):
         heard = await wire.ask(b"\x83\x00\x00\x00\x01", due=False)
@@ -159,7 +159,7 @@ async def identification(wire: DeviceConnection) -> Finding:
 
 
 async def regular_identification(wire: DeviceConnection) -> Finding:
-    """MB-045: the regular objects, in as many frames as they take."""
+    """MB-045: read the regular objects, in as many frames as they need."""
     objects, wrong = await _objects(wire, 0x02)
     if wrong:
         return failed(wrong)

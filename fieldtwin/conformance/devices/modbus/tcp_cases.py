@@ -135,7 +135,7 @@ def _told(answer: ReceivedReply | None) -> str:
 
 
 async def _as_itself(wire: DeviceConnection, unit: int) -> Finding:
-    """A direct device answers to `unit`, and echoes it (TG 4.4.1.2)."""
+    """Check that a device without a gateway answers requests to `unit`, and repeats that unit ID (TG 4.4.1.2)."""
     if wire.unit == unit:
         raise NotHere(f"all other test cases use unit {unit}")
     heard = await wire.ask(wire.good, unit)

@@ -1,4 +1,5 @@
-"""One node's default SDO channel. It does one transfer at a time and never takes a reply for that to a different request.
+"""One node's default SDO channel. It carries out one transfer at a time, and never uses a reply to one request as the reply to
+another request.
 
 It connects the pure transfers (`sdo`), the tracking of late replies (`late_replies`) and the master, which owns the bus
 and delivers the frames on 580h + node ID. It knows nothing about the objects transferred.

@@ -1,4 +1,4 @@
-"""Track which replies may still arrive after an SDO request was not answered, and decide how to get past them.
+"""Track which replies may still arrive after an SDO request was not answered, and prevent that a late reply is used wrongly.
 
 An SDO reply names index and subindex, but not the request. If a request timed out and the same object is requested
 again, a late reply to the first request could be taken for a reply to the second: an old value would be delivered as a

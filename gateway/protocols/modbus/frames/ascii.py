@@ -1,6 +1,6 @@
 """Modbus ASCII (SL 2.5.2): ``:``, the frame in hexadecimal, LRC, CR LF.
 
-Every colon begins a frame and LF ends it, so frames are not recognised by length. A pause of more than a second inside
+A frame extends from a colon to LF, so its length is not needed to recognise it. A pause of more than a second inside
 a frame also ends it (case MB-070). As in RTU, a reply does not say which request it answers. This module knows no
 ports.
 """

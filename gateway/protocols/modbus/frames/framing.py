@@ -15,7 +15,8 @@ from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 
 class Framer(ABC):
-    """The framing of one link. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
+    """The framing of one link. It handles one request at a time: call `begin`, then `feed` until it returns a reply, raises an
+    error, or the time is over.
 
     `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those that belong to no exchange, and
     `foreign_frames` complete frames of other devices. All three only increase.
@@ -25,7 +26,7 @@ class Framer(ABC):
     """Whether a reply identifies its request, so that a late reply needs no quarantine."""
 
     has_broadcast: bool = False
-    """Whether unit 0 addresses all units and none answers (SL 2.1); otherwise it is an ordinary unit (TG 4.4.1.2)."""
+    """Whether unit ID 0 is a broadcast, which no unit answers (SL 2.1); otherwise 0 is an ordinary unit ID (TG 4.4.1.2)."""
 
     datagrams: bool = False
     """Whether the link preserves message boundaries: then each `feed` gets exactly one datagram."""

@@ -57,7 +57,7 @@ class MbapFramer(Framer):
 
     def feed(self, data: bytes, now_ns: int) -> bytes | None:
         if self._awaiting and not self._buffer and not self._lost and data[: _HEADER.size] == self._header_for(data):
-            self._awaiting = False  # the reply, whole and alone: 13 % less for 10 registers
+            self._awaiting = False  # the usual case, exactly one complete reply: takes 13 % less time for 10 registers
             return data[_HEADER.size :]
         self._buffer += data
         while (adu := self._next_adu()) is not None:

@@ -39,7 +39,9 @@ _TYPES: dict[int, type[ModbusExceptionReply]] = {
 
 
 def refusal(function: int, code: int, hint: str = "") -> ModbusExceptionReply:
-    """Return the error for exception `code` to a request of `function`. `hint` gives the reason, which is not on the wire."""
+    """Return the error for exception `code` to a request of `function`. `hint` gives the reason, which the reply does not
+    contain.
+    """
     error = _TYPES.get(code, ModbusExceptionReply)(function, code)
     error.hint = hint
     return error

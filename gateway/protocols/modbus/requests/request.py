@@ -64,7 +64,7 @@ class Request(ABC, Generic[R_co]):
         return NEED_MORE
 
     def heard_out(self) -> None:
-        """Note that the line has been silent since the last byte, which ends a reply of unknown length (SL 2.5.1.1)."""
+        """Note a silence on the line after the last byte. A silence ends a reply of unknown length (SL 2.5.1.1)."""
 
     def unanswered(self, t_ns: int) -> R_co:
         """Return the result of a broadcast of this request. Raises `UsageError` if the request reads data (SL 2.1)."""

@@ -25,7 +25,9 @@ NO_PATH = 0x0A
 NO_RESPONSE = 0x0B
 
 READ_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x18, 0x2B})
-"""Functions that do not change a unit. Of 2Bh only the device identification (0Eh) is one: see `ServerRequest.changes`."""
+"""Functions that do not change a unit. Function 2Bh belongs to them only as device identification (0Eh): see
+`ServerRequest.changes`.
+"""
 
 WRITE_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
 
@@ -79,7 +81,7 @@ def examine(pdu: bytes) -> ServerRequest:
 
 
 def changes_a_unit(pdu: bytes) -> bool:
-    """Return whether a request may change the unit. A request with wrong lengths is judged by its function code."""
+    """Return whether a request may change the unit. For a request with a wrong length, only its function code is considered."""
     try:
         return examine(pdu).changes
     except ModbusExceptionReply:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from studio_rig import VIEW, Studio, studio, until
 
@@ -129,6 +130,9 @@ def test_a_scenario_of_the_list_runs_and_its_steps_and_checks_are_returned(runni
     assert run["result"]["verdict"] == "passed"
     assert [c["number"] for c in run["result"]["checks"]][:12] == [str(n) for n in range(1, 13)]
     assert "always 1" in [c["number"] for c in run["result"]["checks"]]
+    seen = {one["number"]: one["verdict"] for one in run["progress"]["steps"] + run["progress"]["checks"]}
+    assert seen == {check["number"]: check["verdict"] for check in run["result"]["checks"]}
+    assert {name for name, *_ in run["progress"]["values"]} >= {"ctd.pressure", "relay.state"}
 
 
 def test_a_scenario_with_an_error_reports_the_place(running: Studio, folder: Path) -> None:
@@ -140,6 +144,11 @@ def test_a_scenario_with_an_error_reports_the_place(running: Studio, folder: Pat
     assert "Traceback" not in run["trouble"]
 
 
+def begun_steps(client: httpx.Client) -> list[str]:
+    steps = client.get(f"{SCENARIOS}/run").json()["run"]["progress"]["steps"]
+    return [step["number"] for step in steps if step["begun_s"] is not None and not step["verdict"]]
+
+
 def test_one_scenario_runs_at_a_time_and_can_be_stopped(running: Studio, folder: Path) -> None:
     slow = folder / "slow.scenario.yaml"
     slow.write_text(
@@ -148,6 +157,7 @@ def test_one_scenario_runs_at_a_time_and_can_be_stopped(running: Studio, folder:
     with running.client() as client:
         run = {"path": str(slow), "target": "local"}
         assert client.post(f"{SCENARIOS}/run", json=run).json()["run"]["running"]
+        until(lambda: begun_steps(client) == ["1"], "the progress shows that the first step has begun")
         second = client.post(f"{SCENARIOS}/run", json=run)
         assert second.status_code >= 400
         assert "running already" in second.json()["error"]["message"]

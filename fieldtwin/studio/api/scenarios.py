@@ -10,7 +10,8 @@ from starlette.requests import Request
 
 from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, of_server, prototype, recordings_of
 from fieldtwin.studio.api.errors import NotFound
-from fieldtwin.studio.api.operation import Operation, body_of
+from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
+from fieldtwin.studio.scenarios.progress import MOST_VALUES
 from fieldtwin.studio.scenarios.runner import ScenarioRunner, known_scenarios
 
 
@@ -31,7 +32,7 @@ async def list_scenarios(request: Request) -> dict[str, Any]:
     """Return the scenario files of the system, and the present or latest run with its result."""
     attachment = await attached(request)
     files = known_scenarios(Path(attachment.record.path), folder_of(request))
-    return {"files": [msgspec.to_builtins(file) for file in files], "run": _runner(request).state()}
+    return {"files": [msgspec.to_builtins(file) for file in files], "run": _runner(request).state(MOST_VALUES)}
 
 
 async def run_scenario(request: Request) -> dict[str, Any]:
@@ -46,9 +47,9 @@ async def run_scenario(request: Request) -> dict[str, Any]:
 
 
 async def get_run(request: Request) -> dict[str, Any]:
-    """Return the present or latest run."""
+    """Return the present or latest run: its progress while it runs, and at its end the result."""
     await attached(request)
-    return {"run": _runner(request).state()}
+    return {"run": _runner(request).state(whole(request, "values_from", 0))}
 
 
 async def stop_scenario(request: Request) -> dict[str, Any]:
@@ -91,7 +92,13 @@ SCENARIOS = f"{INSTANCE}/scenarios"
 OPERATIONS = (
     Operation("GET", SCENARIOS, list_scenarios, "List the scenario files of the system"),
     Operation("POST", SCENARIOS, save_scenario, "Save the recorded scenario", body=SaveScenario, changes=True),
-    Operation("GET", f"{SCENARIOS}/run", get_run, "Read the run of a scenario and its result"),
+    Operation(
+        "GET",
+        f"{SCENARIOS}/run",
+        get_run,
+        "Read the run of a scenario, its progress and its result",
+        (Parameter("values_from", "integer", "the number of values that the client has already"),),
+    ),
     Operation("POST", f"{SCENARIOS}/run", run_scenario, "Run a scenario", body=RunScenario, changes=True),
     Operation("DELETE", f"{SCENARIOS}/run", stop_scenario, "Stop the running scenario", changes=True),
     Operation("GET", f"{SCENARIOS}/recording", get_recording, "Read the recording of a scenario"),

@@ -10,6 +10,7 @@ from starlette.requests import Request
 from fieldtwin.gateway.core.errors import CheckFailed, Unreachable, UsageError
 from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, prototype, recordings_of, tag_of
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
+from fieldtwin.studio.live.marks import Mark, all_marks
 from fieldtwin.studio.live.tag_history import MOST_POINTS
 
 WRITE_WITHIN_S = 8.0
@@ -48,6 +49,12 @@ async def get_history(request: Request) -> dict[str, Any]:
     points = whole(request, "points", MOST_POINTS, 4, MOST_POINTS)
     found, thinned = attachment.history.between(f"{device}.{name}", from_ns, to_ns, points)
     return {"points": [list(point) for point in found], "thinned": thinned, "now_ns": now_ns}
+
+
+async def list_marks(request: Request) -> list[Mark]:
+    """Return the times at which faults began and ended, values were set and released, and programs changed their states."""
+    attachment = await attached(request)
+    return all_marks(attachment.fault_marks, attachment.state_history, attachment.programs)
 
 
 async def set_value(request: Request) -> dict[str, Any]:
@@ -108,6 +115,7 @@ OPERATIONS = (
             ),
         ),
     ),
+    Operation("GET", f"{INSTANCE}/marks", list_marks, "List faults and changes of states with their times"),
     Operation("POST", f"{TAG}/write", write_value, "Write a writable tag of a device", body=WriteValue, changes=True),
     Operation("PUT", f"{TAG}/set", set_value, "Set a value in a simulated device", body=SetValue, changes=True),
     Operation("DELETE", f"{TAG}/set", release_value, "Release a value that was set", changes=True),

@@ -27,6 +27,7 @@ from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, read_reco
 from fieldtwin.studio.live.channel import Channel
 from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
+from fieldtwin.studio.live.marks import FaultMarks
 from fieldtwin.studio.live.observed import describe_system
 from fieldtwin.studio.live.plc_values import PlcValues
 from fieldtwin.studio.live.state_history import StateHistory
@@ -75,6 +76,7 @@ class Attachment:
         self.programs: dict[str, Any] = {}
         """The description of the PLC's programs (the command `about`): empty until the PLC has answered."""
         self.state_history = StateHistory()
+        self.fault_marks = FaultMarks()
         self.updates = Publisher()
         self.gateway_channel = Channel(found.dir / GATEWAY_SOCKET, "gateway")
         self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
@@ -208,6 +210,7 @@ class Attachment:
 
     async def _read_field(self) -> None:
         self.field = await self.field_channel.ask("get", FieldStatus)
+        self.fault_marks.look(self.field, self.now_ns())
 
     async def _read_tags(self) -> None:
         names = self.history.names() if self._seen_change is None else []

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import shutil
 import signal
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.studio.scenarios.progress import RunProgress
 from fieldtwin.twin.plant.child import command
 
 SUFFIX = ".scenario.yaml"
@@ -22,6 +25,7 @@ MOST_FILE_BYTES = 1 << 20
 MOST_OUTPUT_BYTES = 8 << 20
 MOST_MESSAGE_BYTES = 16_384
 LONGEST_S = 1800.0
+LOOK_EVERY_S = 0.1
 STOPS_WITHIN_S = 10.0
 TARGETS = ("virtual", "local")
 
@@ -68,6 +72,7 @@ class ScenarioRunner:
 
     def __init__(self) -> None:
         self._run: _Run | None = None
+        self._count = 0
 
     async def __aenter__(self) -> ScenarioRunner:
         return self
@@ -75,9 +80,9 @@ class ScenarioRunner:
     async def __aexit__(self, *error: object) -> None:
         await self.stop()
 
-    def state(self) -> dict[str, Any] | None:
-        """Return the present or the latest run, None if there was none."""
-        return self._run.state() if self._run is not None else None
+    def state(self, values_from: int = 0) -> dict[str, Any] | None:
+        """Return the present or the latest run, None if there was none. `values_from`: the first value of its progress."""
+        return self._run.state(values_from) if self._run is not None else None
 
     async def start(self, path: str, target: str) -> None:
         """Start a scenario. Raises `EndpointBusy` while another one runs."""
@@ -85,14 +90,17 @@ class ScenarioRunner:
             raise UsageError("the target", expected=" or ".join(TARGETS), got=repr(target[:40]))
         if self._run is not None and self._run.is_running:
             raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
+        folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
+        progress = folder / "progress.jsonl"
         process = await asyncio.create_subprocess_exec(
-            *command("fieldtwin", "test", path, "--target", target, "--json"),
+            *command("fieldtwin", "test", path, "--target", target, "--json", "--progress", str(progress)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
-        self._run = _Run(path, target, process)
+        self._count += 1
+        self._run = _Run(self._count, path, target, process, progress)
 
     async def stop(self) -> None:
         """Stop the run, if one is running."""
@@ -101,34 +109,42 @@ class ScenarioRunner:
 
 
 class _Run:
-    def __init__(self, path: str, target: str, process: asyncio.subprocess.Process) -> None:
+    def __init__(
+        self, number: int, path: str, target: str, process: asyncio.subprocess.Process, progress: Path
+    ) -> None:
         self.path = path
+        self._number = number
         self._target = target
         self._process = process
         self._began_s = asyncio.get_running_loop().time()
         self._took_s = 0.0
         self._trouble = ""
         self._result: dict[str, Any] | None = None
+        self._progress_file = progress
+        self._progress = RunProgress(progress)
         self._following = asyncio.ensure_future(self._follow())
 
     @property
     def is_running(self) -> bool:
         return not self._following.done()
 
-    def state(self) -> dict[str, Any]:
+    def state(self, values_from: int) -> dict[str, Any]:
         return {
+            "number": self._number,
             "path": self.path,
             "target": self._target,
             "running": self.is_running,
             "elapsed_s": asyncio.get_running_loop().time() - self._began_s if self.is_running else self._took_s,
             "trouble": self._trouble,
             "result": self._result,
+            "progress": self._progress.state(values_from),
         }
 
     async def _follow(self) -> None:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         messages = asyncio.ensure_future(_tail(self._process.stderr))
+        looking = asyncio.ensure_future(self._look())
         try:
             async with asyncio.timeout(LONGEST_S):
                 output = await _whole(self._process.stdout)
@@ -144,6 +160,15 @@ class _Run:
             self._kill()
             await self._process.wait()
             messages.cancel()
+            looking.cancel()
+            while self._progress.look():
+                pass
+            shutil.rmtree(self._progress_file.parent, ignore_errors=True)
+
+    async def _look(self) -> None:
+        while True:
+            self._progress.look()
+            await asyncio.sleep(LOOK_EVERY_S)
 
     def _take(self, output: bytes, messages: bytes) -> None:
         try:

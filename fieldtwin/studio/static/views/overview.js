@@ -1,6 +1,6 @@
 // The drawing of the system with its present state: the controller on the left, a line for each bus with its devices below it.
 
-import { html } from "../vendor/preact.js";
+import { html, useEffect, useState } from "../vendor/preact.js";
 import { address } from "../lib/address.js";
 import { age, number, reason, value } from "../lib/format.js";
 import { Sparkline } from "../lib/parts.js";
@@ -8,12 +8,14 @@ import { Sparkline } from "../lib/parts.js";
 const LEFT = 250; // width of the controller, in units of the drawing
 const NARROW = 236; // width of a device
 const WIDE = 420; // from this width on, a device shows two columns of values with their last minute
+const ROOMY = 280; // in a narrower column the last minute would lie below the texts
 const TALL = 116;
 const MOST_VALUES = 3; // in a column
 const GAP = 16;
-const WIDTH = 1240;
-const SPACE = WIDTH - LEFT - 40;
-const COLUMNS = Math.floor(SPACE / (NARROW + GAP));
+const WIDEST = 1240;
+const NARROWEST = 740;
+const AROUND = 32; // around the drawing in a narrow window, where the views are listed above it
+const LIST = 176; // the list of views on the left
 
 export function Overview({ store }) {
   const { system } = store.about;
@@ -24,8 +26,11 @@ export function Overview({ store }) {
     devices: Object.entries(system.devices).filter(([, d]) => d.bus === name),
   }));
   // Buses with few devices leave room, so their devices are wider.
-  const columns = Math.min(COLUMNS, Math.max(1, ...buses.map((bus) => bus.devices.length)));
-  const box = Math.floor(SPACE / columns) - GAP;
+  const total = useWidth();
+  const space = total - LEFT - 40;
+  const most = Math.max(1, Math.floor(space / (NARROW + GAP)));
+  const columns = Math.min(most, Math.max(1, ...buses.map((bus) => bus.devices.length)));
+  const box = Math.floor(space / columns) - GAP;
   let y = 14;
   for (const bus of buses) {
     bus.y = y;
@@ -33,11 +38,23 @@ export function Overview({ store }) {
   }
   const height = Math.max(y, 240);
   return html`<h1 class="visually-hidden">Overview of ${store.name}</h1>
-    <svg class="plan" viewBox="0 0 ${WIDTH} ${height}" role="group" aria-label="Buses and devices of ${system.name}">
+    <svg class="plan" viewBox="0 0 ${total} ${height}" role="group" aria-label="Buses and devices of ${system.name}">
       <${Controller} store=${store} height=${height - 14} />
       ${buses.map((bus) => html`<${BusLine} store=${store} bus=${bus} seen=${gateway?.buses[bus.name]} columns=${columns} box=${box} />`)}
     </svg>
     ${!gateway && html`<p class="soft">The gateway does not answer, so no state is shown.</p>`}`;
+}
+
+/** The width of the drawing: that of the page, so that texts are not smaller in a narrow window. */
+function useWidth() {
+  const read = () => Math.max(NARROWEST, Math.min(WIDEST, innerWidth - AROUND - (innerWidth > 900 ? LIST : 0)));
+  const [width, setWidth] = useState(read);
+  useEffect(() => {
+    const changed = () => setWidth(read());
+    addEventListener("resize", changed);
+    return () => removeEventListener("resize", changed);
+  }, []);
+  return width;
 }
 
 function Controller({ store, height }) {
@@ -137,6 +154,7 @@ function Device({ store, name, device, x, y, width, line }) {
         const row = y + 76 + (n % MOST_VALUES) * 17;
         return html`<text class=${bad ? "bad-text" : "soft"} x=${left + 12} y=${row}>${cut(tag, 16)}</text>
           ${halves > 1 &&
+          half >= ROOMY &&
           html`<g transform="translate(${left + half / 2 - 60}, ${row - 12})">
             <${Sparkline} points=${store.recent.get(`${name}.${tag}`)} now=${store.now()} width=${100} height=${14} />
           </g>`}

@@ -1,24 +1,32 @@
 // Scenarios: record what is done to the simulated devices as one, and run those of the system with their verdicts as a timeline.
 
-import { html, useEffect, useState } from "../vendor/preact.js";
+import { html, useEffect, useMemo, useRef, useState } from "../vendor/preact.js";
 import { get, post, remove } from "../lib/api.js";
+import { Charts, Cursors, Marks } from "../lib/chart.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 
 const LOOK_EVERY_MS = 1000;
+const FOLLOW_EVERY_MS = 300;
 
 export function Scenario({ store }) {
   useStore(store);
   const path = `${store.path}/scenarios`;
   const [list, error, again] = useFetched(() => get(path), [path]);
+  const [run, values, runError, lookAgain] = useRun(path);
   return html`<h1 class="visually-hidden">Scenario</h1>
     <${Failure} text=${error} />
     <div class="scenarios">
       <div>
         ${store.isPrototype && html`<${Record} store=${store} path=${path} onSaved=${again} />`}
       </div>
-      <${Run} store=${store} path=${path} files=${list?.files} first=${list?.run} />
-    </div>`;
+      <${Run} store=${store} path=${path} files=${list?.files} run=${run} error=${runError} again=${lookAgain} />
+    </div>
+    ${run &&
+    html`<div class="columns run-view">
+      <${Timeline} run=${run} />
+      <${Values} store=${store} run=${run} values=${values} key=${run.number} />
+    </div>`}`;
 }
 
 /** Fetch every second while `active`: [latest result, error, fetch now]. */
@@ -88,17 +96,12 @@ function Record({ store, path, onSaved }) {
   </section>`;
 }
 
-function Run({ store, path, files, first }) {
+function Run({ store, path, files, run: now, error, again }) {
   const [chosen, setChosen] = useState("");
   const [target, setTarget] = useState("virtual");
-  const [state, error, again] = usePolled(
-    () => get(`${path}/run`),
-    (latest) => latest?.run?.running ?? false,
-  );
-  const [run, failed, busy] = useAction();
-  const now = state?.run ?? first;
+  const [act, failed, busy] = useAction();
   const file = files?.find((f) => f.path === chosen) ?? files?.[0];
-  const act = (action) => run(action).then(again);
+  const does = (action) => act(action).then(again);
   return html`<section class="card">
     <header><h2>Run</h2></header>
     <${Failure} text=${failed || error} />
@@ -118,57 +121,142 @@ function Run({ store, path, files, first }) {
       </label>
       ${store.mayOperate &&
       (now?.running
-        ? html`<button class="danger" disabled=${busy} onClick=${() => act(() => remove(`${path}/run`))}>Stop</button>`
-        : html`<button class="primary" disabled=${busy} onClick=${() => act(() => post(`${path}/run`, { path: file.path, target }))}>Run</button>`)}
+        ? html`<button class="danger" disabled=${busy} onClick=${() => does(() => remove(`${path}/run`))}>Stop</button>`
+        : html`<button class="primary" disabled=${busy} onClick=${() => does(() => post(`${path}/run`, { path: file.path, target }))}>Run</button>`)}
     </div>`}
-    ${now && html`<${Verdict} run=${now} />`}
+    ${now && html`<${Summary} run=${now} />`}
   </section>`;
 }
 
 const TONE = { passed: "good", failed: "bad", error: "bad" };
 
-function Verdict({ run }) {
-  const { result } = run;
-  if (run.running)
-    return html`<p role="status"><span class="chip accent">running</span> ${run.path.split("/").pop()}, ${run.elapsed_s.toFixed(0)} s. The steps are shown at its end.</p>`;
-  if (!result) return html`<${Failure} text=${`${run.path.split("/").pop()}: ${run.trouble}`} />`;
-  const whole = Math.max(result.simulated_s, ...result.checks.map((c) => c.t_s), 0.001);
+function Summary({ run }) {
+  const { result, progress } = run;
+  const file = run.path.split("/").pop();
+  if (run.running) return html`<p role="status"><span class="chip accent">running</span> ${file}, ${progress.t_s.toFixed(1)} s of the system in ${run.elapsed_s.toFixed(0)} s</p>`;
+  if (!result) return html`<${Failure} text=${`${file}: ${run.trouble}`} />`;
   return html`<p role="status">
       <span class="chip ${TONE[result.verdict] ?? "warn"}">${result.verdict}</span> <strong>${result.name}</strong>${" "}
       <span class="soft">${result.simulated_s.toFixed(1)} s of the system, target ${result.target}; the run took ${run.elapsed_s.toFixed(1)} s</span>
     </p>
     ${result.reason && html`<p>${result.reason}</p>`}
     ${result.faults.length > 0 &&
-    html`<p class="soft">${result.faults.map((f) => `Fault ${f.id} (${f.name} on ${f.on}) took effect ${f.struck} times.`).join(" ")}</p>`}
+    html`<p class="soft">${result.faults.map((f) => `Fault ${f.id} (${f.name} on ${f.on}) took effect ${f.struck} times.`).join(" ")}</p>`}`;
+}
+
+/** Steps and checks of the whole run: what the progress says, completed by the result at the end. */
+function rowsOf({ progress, result, running }) {
+  const decided = new Map((result?.checks ?? []).map((check) => [check.number, check]));
+  const named = [...progress.steps, ...progress.checks];
+  const known = new Set(named.map(({ number }) => number));
+  const rows = [...named, ...(result?.checks ?? []).filter((check) => !known.has(check.number))];
+  return rows.map((row) => {
+    const check = decided.get(row.number);
+    const verdict = check?.verdict ?? row.verdict;
+    const begun = row.begun_s ?? null;
+    const isStep = "begun_s" in row;
+    const waiting = !running ? (isStep ? "not reached" : "not judged") : !isStep ? "watched" : begun === null ? "to come" : "running";
+    return { ...row, ...check, text: check?.text ?? row.text, isStep, begun, verdict, shown: verdict || waiting, t_s: check?.t_s ?? row.t_s };
+  });
+}
+
+function Timeline({ run }) {
+  const rows = rowsOf(run);
+  const whole = Math.max(run.result?.simulated_s ?? 0, run.progress.t_s, ...rows.map((row) => row.t_s ?? 0), 0.001);
+  if (!rows.length) return null;
+  return html`<section class="scroll steps" aria-label="Timeline" tabindex="0">
     <table class="list timeline">
-      <thead>
-        <tr><th>Step</th><th>Verdict</th><th class="number">Decided</th><th>Time</th><th>Step or check</th></tr>
-      </thead>
+      <thead><tr><th>Step</th><th>Verdict</th><th class="number">Decided</th><th>Time</th><th>Step or check</th></tr></thead>
       <tbody>
-        ${result.checks.map((check, n) => {
-          const from = isStep(check) && n > 0 ? result.checks[n - 1].t_s : 0;
-          return html`<tr key=${n}>
-            <td>${check.number}</td>
-            <td><span class="chip ${TONE[check.verdict] ?? "warn"}">${check.verdict}</span></td>
-            <td class="number">${check.t_s.toFixed(2)} s</td>
-            <td><${Span} from=${from / whole} to=${check.t_s / whole} tone=${TONE[check.verdict] ?? "warn"} /></td>
+        ${rows.map((row) => {
+          const tone = TONE[row.verdict] ?? (row.verdict ? "warn" : row.shown === "running" ? "accent" : "");
+          const from = row.isStep ? row.begun : 0;
+          return html`<tr key=${row.number} class=${row.shown === "running" ? "marked" : ""} data-step=${row.number}>
+            <td>${row.number}</td>
+            <td><span class="chip ${tone}">${row.shown}</span></td>
+            <td class="number">${row.t_s === null || row.t_s === undefined ? "" : `${row.t_s.toFixed(2)} s`}</td>
+            <td>${from !== null && from !== undefined && html`<${Span} from=${from / whole} to=${(row.t_s ?? run.progress.t_s) / whole} tone=${tone || "idle"} />`}</td>
             <td class="what">
-              ${check.text}
-              ${check.verdict !== "passed" &&
-              html`<div class="bad-text">${[check.expected && `expected: ${check.expected}`, check.got && `got: ${check.got}`, check.reason].filter(Boolean).join("; ")}</div>`}
-              ${check.verdict !== "passed" && check.where && html`<div class="soft mono">${check.where}</div>`}
+              ${row.text}
+              ${row.verdict && row.verdict !== "passed" &&
+              html`<div class="bad-text">${[row.expected && `expected: ${row.expected}`, row.got && `got: ${row.got}`, row.reason].filter(Boolean).join("; ")}</div>`}
+              ${row.verdict && row.verdict !== "passed" && row.where && html`<div class="soft mono">${row.where}</div>`}
             </td>
           </tr>`;
         })}
       </tbody>
-    </table>`;
+    </table>
+  </section>`;
 }
 
-const isStep = (check) => /^\d+$/.test(check.number);
-const WIDTH = 110;
+const WIDTH = 84;
 
 const Span = ({ from, to, tone }) =>
   html`<svg class="span" width=${WIDTH} height="14" aria-hidden="true">
     <rect class="ground" width=${WIDTH} height="14" rx="3" />
     <rect class=${tone} x=${from * WIDTH} width=${Math.max(2, (to - from) * WIDTH)} height="14" rx="2" />
   </svg>`;
+
+const MOST_CHARTED = 6;
+
+/** The values that the scenario checks or sets, over the time of the run, with its faults and changes of states as marks. */
+function Values({ store, run, values }) {
+  const [view, setView] = useState({ zoom: null, a: null, b: null });
+  const { data, tags, marks } = useMemo(() => {
+    const found = {};
+    const states = [];
+    for (const [name, t, value, quality, why] of values) {
+      const t_ns = t * 1e9;
+      if (typeof value === "string") states.push({ t_ns, kind: "state", text: `${name.split(".")[0]}: ${value}` });
+      else (found[name] ??= { points: [], now_ns: run.progress.t_s * 1e9 }).points.push([t_ns, value, quality, why]);
+    }
+    const steps = run.progress.steps.filter(({ begun_s, text }) => begun_s !== null && /^(fault|clear|set|send):/.test(text));
+    const acts = steps.map(({ begun_s, text }) => ({ t_ns: begun_s * 1e9, kind: text.startsWith("clear") ? "cleared" : "fault", text }));
+    return { data: found, tags: Object.keys(found).slice(0, MOST_CHARTED), marks: [...acts, ...states].sort((a, b) => a.t_ns - b.t_ns) };
+  }, [values, run.progress.t_s]);
+  const unitOf = (tag) => store.tagOf(tag)?.unit ?? "";
+  if (!tags.length) return null;
+  return html`<section aria-label="Values of the run">
+    ${view.zoom && html`<div class="bar"><button class="primary" onClick=${() => setView({ ...view, zoom: null })}>Reset zoom</button></div>`}
+    <${Charts} started=${0} tags=${tags} unitOf=${unitOf} data=${data} marks=${marks} view=${view} setView=${setView} />
+    <${Cursors} started=${0} tags=${tags} data=${data} unitOf=${unitOf} view=${view} setView=${setView} from=${0} to=${run.progress.t_s} />
+    <${Marks} started=${0} marks=${marks} view=${view} setView=${setView} />
+  </section>`;
+}
+
+/** The present or latest run and all values of its progress: [run, values, error, fetch now]. */
+function useRun(path) {
+  const known = useRef({ number: 0, values: [] });
+  const [run, setRun] = useState(null);
+  const [error, setError] = useState("");
+  const [round, setRound] = useState(0);
+  useEffect(() => {
+    let current = true;
+    let timer = 0;
+    const look = async () => {
+      try {
+        const found = (await get(`${path}/run?values_from=${known.current.values.length}`)).run;
+        if (!current) return;
+        setError("");
+        if (!found) return;
+        const { number, values } = known.current;
+        const other = found.number !== number || found.progress.values_total < values.length;
+        if (other) known.current = { number: found.number, values: [] };
+        if (other && found.progress.values_from > 0) return look();
+        if (found.progress.values.length) known.current.values = [...known.current.values, ...found.progress.values];
+        setRun(found);
+        if (found.running) timer = setTimeout(look, FOLLOW_EVERY_MS);
+      } catch (e) {
+        if (!current) return;
+        setError(e.message);
+        timer = setTimeout(look, LOOK_EVERY_MS);
+      }
+    };
+    look();
+    return () => {
+      current = false;
+      clearTimeout(timer);
+    };
+  }, [path, round]);
+  return [run, known.current.values, error, () => setRound((n) => n + 1)];
+}

@@ -304,3 +304,16 @@ def test_a_client_is_sent_to_the_new_run_when_a_run_starts_under_the_same_name(o
             assert client.get("/instances/again").json()["started_ns"] == 2
     finally:
         shutil.rmtree(folder)
+
+
+def test_a_fault_that_lasts_for_a_moment_has_marks_at_its_begin_and_end(observatory: Studio) -> None:
+    with observatory.client() as client:
+        before = len(client.get(f"{NAME}/marks").json())
+        client.post(f"{NAME}/faults", json={"fault": {"name": "silence", "device": "ctd"}}).raise_for_status()
+        client.delete(f"{NAME}/faults").raise_for_status()
+        marks = [mark for mark in client.get(f"{NAME}/marks").json()[before:] if mark["kind"] != "state"]
+    assert [(mark["kind"], mark["text"]) for mark in marks] == [
+        ("fault", "silence on ctd"),
+        ("cleared", "silence on ctd"),
+    ]
+    assert marks[0]["t_ns"] <= marks[1]["t_ns"]

@@ -47,6 +47,7 @@ async def inject_fault(request: Request) -> dict[str, Any]:
     form = await body_of(request, InjectFault)
     now_ns = attachment.now_ns()
     found = await attachment.field_channel.call("fault", fault=form.fault, start_ns=now_ns)
+    await attachment.look_at_field()
     recordings_of(request).note(attachment, now_ns, {"fault": {"id": found["id"], **form.fault}})
     return {"id": found["id"], "active": found["faults"]}
 
@@ -56,6 +57,7 @@ async def clear_fault(request: Request) -> dict[str, Any]:
     attachment = await prototype(request)
     now_ns = attachment.now_ns()
     found = await attachment.field_channel.call("clear", id=request.path_params["fault"])
+    await attachment.look_at_field()
     recordings_of(request).note(attachment, now_ns, {"clear": request.path_params["fault"]})
     return {"active": found["faults"]}
 
@@ -67,6 +69,7 @@ async def clear_faults(request: Request) -> dict[str, Any]:
         now_ns = attachment.now_ns()
         await attachment.field_channel.call("clear", id=fault.id)
         recordings_of(request).note(attachment, now_ns, {"clear": fault.id})
+    await attachment.look_at_field()
     return {"active": []}
 
 

@@ -67,6 +67,7 @@ async def set_value(request: Request) -> dict[str, Any]:
         raise UsageError("the value", expected="a finite number")
     now_ns = attachment.now_ns()
     await attachment.field_channel.call("set", device=device, tag=name, value=number)
+    await attachment.look_at_field()
     value = int(number) if number.is_integer() and not isinstance(form.value, bool) else form.value
     recordings_of(request).note(attachment, now_ns, {"set": {"tag": f"{device}.{name}", "value": value}})
     return {"tag": f"{device}.{name}", "value": number}
@@ -78,6 +79,7 @@ async def release_value(request: Request) -> dict[str, Any]:
     device, name = tag_of(request, attachment)
     now_ns = attachment.now_ns()
     await attachment.field_channel.call("set", device=device, tag=name, value=None)
+    await attachment.look_at_field()
     recordings_of(request).note(attachment, now_ns, {"set": {"tag": f"{device}.{name}", "value": None}})
     return {"tag": f"{device}.{name}", "value": None}
 

@@ -8,6 +8,7 @@ PLC is asked only for what it answers in a bounded time; the values of its tags 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,11 @@ class Attachment:
             return {}
         programs: dict[str, Any] = answer["programs"]
         return programs
+
+    async def look_at_field(self) -> None:
+        """Read the status of the simulated devices now: after an action of a client, so that even a short fault has its marks."""
+        with contextlib.suppress(FieldtwinError):  # the regular reading reports it
+            await self._read_field()
 
     async def _read_field(self) -> None:
         self.field = await self.field_channel.ask("get", FieldStatus)

@@ -183,6 +183,35 @@ class StuckAlarm:
             raise ScanStuck(f"{self._s * 1000:g} ms and no end")
 
 
+class VirtualStuckAlarm(StuckAlarm):
+    """The guard for scans under virtual time: it ends a scan that takes `stuck_ms` to two times `stuck_ms` of real time.
+
+    Its timer is set once and runs on between scans. Setting and clearing it for each scan took 4.3 us of a scan's 50 us.
+    """
+
+    def __init__(self, stuck_ms: float) -> None:
+        super().__init__(stuck_ms)
+        self._expired = False
+        """Whether the timer has expired since the scan began, which it may do at any time after the beginning."""
+        signal.setitimer(signal.ITIMER_REAL, self._s, self._s)
+
+    def arm(self) -> None:
+        self._armed = True
+        self._expired = False
+
+    def disarm(self) -> None:
+        self._armed = False
+
+    def close(self) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        super().close()
+
+    def _on_alarm(self, number: int, frame: object) -> None:
+        if self._expired:
+            super()._on_alarm(number, frame)
+        self._expired = True
+
+
 VIRTUAL_STUCK_MS = 10_000.0
 """The limit in ms of real time for a scan under virtual time, if `stuck_ms` of the system file is not longer."""
 
@@ -191,7 +220,7 @@ def alarm_if_free(stuck_ms: float) -> StuckAlarm | None:
     """Return an alarm, or None if it cannot be used: outside the main thread, or if other code uses SIGALRM."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         return None
-    return StuckAlarm(stuck_ms) if signal.getsignal(signal.SIGALRM) is signal.SIG_DFL else None
+    return VirtualStuckAlarm(stuck_ms) if signal.getsignal(signal.SIGALRM) is signal.SIG_DFL else None
 
 
 def lead(until_due_ns: int) -> int:

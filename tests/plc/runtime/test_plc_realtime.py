@@ -9,7 +9,16 @@ import time
 import pytest
 
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.plc.runtime.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
+from fieldtwin.plc.program import ScanStuck
+from fieldtwin.plc.runtime.realtime import (
+    GUARD_NS,
+    LEAD_NS,
+    VirtualStuckAlarm,
+    lead,
+    monotonic_ns,
+    run_task,
+    sleep_until_ns,
+)
 
 MS = 1_000_000
 
@@ -86,3 +95,38 @@ def test_sleeping_ends_at_the_instant_or_after_it() -> None:
         until = time.monotonic_ns() + ahead_ns
         sleep_until_ns(until)
         assert time.monotonic_ns() >= until
+
+
+def test_a_scan_in_virtual_time_is_ended_by_the_second_expiry_of_the_timer() -> None:
+    """The timer runs on between scans, so its first expiry may come at any time after the scan began."""
+    guard = VirtualStuckAlarm(stuck_ms=3_600_000)
+    try:
+        for _ in range(3):
+            guard.arm()
+            signal.raise_signal(signal.SIGALRM)
+            guard.disarm()
+        guard.arm()
+        signal.raise_signal(signal.SIGALRM)
+        for _ in range(2):  # logic may catch the first error
+            with pytest.raises(ScanStuck):
+                signal.raise_signal(signal.SIGALRM)
+        guard.disarm()
+        signal.raise_signal(signal.SIGALRM)
+    finally:
+        guard.close()
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def _loop_forever() -> None:
+    while True:
+        pass
+
+
+def test_the_timer_of_a_run_in_virtual_time_ends_a_scan_without_an_end() -> None:
+    guard = VirtualStuckAlarm(stuck_ms=20)
+    try:
+        guard.arm()
+        with pytest.raises(ScanStuck):
+            _loop_forever()
+    finally:
+        guard.close()

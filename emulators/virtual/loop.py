@@ -122,7 +122,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _set_timer(self, when_ns: int, due: asyncio.TimerHandle | asyncio.Future[None]) -> None:
         self._sequence += 1
-        heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, due))
+        heappush(self._timers, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, due))
         if self._sequence >= self._compact_at:
             self._compact()
 

@@ -51,7 +51,7 @@ class Histogram:
             self.max_ns = ns
         self.count += 1
         self.total_ns += ns
-        self.counts[bisect_left(self.limits_ns, ns)] += 1
+        self.counts[bisect_left(self.limits_ns, ns) if ns else 0] += 1  # in virtual time every scan takes 0 ns
         self._recent.append(ns)
 
     @property

@@ -85,16 +85,10 @@ class ImageExchange:
         self._publish(now_ns)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
-        """Return whether values, qualities and reasons equal those of the last call. Without this, the virtual run of
-        a scan each 10 ms takes a fifth longer."""
+        """Return whether values, qualities and reasons are those of the last call, which snapshots then share. Without
+        this, the virtual run of a scan each 10 ms takes a fifth longer."""
         before, self._seen = self._seen, snapshot
-        if before is None:
-            return False
-        return (
-            snapshot.values == before.values
-            and snapshot.qualities == before.qualities
-            and snapshot.reasons == before.reasons
-        )
+        return before is not None and snapshot.values is before.values
 
     def plc_age_ms(self, now_ns: int) -> float:
         """Return the milliseconds since the PLC last published; infinite if it never did."""

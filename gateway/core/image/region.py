@@ -11,6 +11,7 @@ This module must not know who maps the memory, what time it is, or what a value 
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ MAX_LOOKS = 16
 """Number of attempts of a reader before it gives up for now. Trying four slots gave 0.0015 retries per read (DESIGN.md)."""
 
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality but no value
+_WITHOUT_VALUE = re.compile(rb"[\x80-\xff]")
+"""Finds the quality bytes that have `_NO_VALUE`."""
 _NO_MESSAGES: Mapping[str, tuple[Message, ...]] = MappingProxyType({})
 _UNFLAGGED = RegionFlag.NONE  # an Enum's members are slow to look up
 _QUALITY_OF = bytes(mark & ~_NO_VALUE for mark in range(256))
@@ -382,9 +385,8 @@ class RegionReader(_Region):
         reasons, marks = values.pop(), values.pop()
         for i in self.shape.bool_indexes:
             values[i] = bool(values[i])
-        for i, mark in enumerate(marks):
-            if mark & _NO_VALUE:
-                values[i] = None
+        for marked in _WITHOUT_VALUE.finditer(marks):
+            values[marked.start()] = None
         return tuple(values), marks.translate(_QUALITY_OF), reasons
 
     def _drain(self, ring: RingShape, last: int) -> tuple[Message, ...]:

@@ -14,6 +14,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from fieldtwin.gateway.core.files.profile import DeviceProfile, MessageBlock, RegisterRange, Tag
+from fieldtwin.gateway.protocols.modbus.requests.data import ReadBits, ReadRegisters
+from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply
+from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
 """Exceptions (AP 7) which show that a read covered a gap, and that it was too long."""
@@ -30,6 +33,11 @@ class Read:
     messages: tuple[MessageBlock, ...]
 
     @cached_property
+    def request(self) -> Request[BitsReply | RegistersReply]:
+        """Return the request, which is checked once for all polls."""
+        return read_request(self.range)
+
+    @cached_property
     def places(self) -> tuple[tuple[Tag, slice], ...]:
         """Return each tag with the position of its bytes in the data of the read."""
         return tuple((tag, place_of(tag.registers, self.range)) for tag in self.tags)
@@ -43,6 +51,13 @@ class Read:
         both: list[Member] = [(t.registers, t) for t in self.tags]
         both += [(m.at, m) for m in self.messages]
         return sorted(both, key=lambda m: (m[0].address, -m[0].count))
+
+
+def read_request(at: RegisterRange) -> Request[BitsReply | RegistersReply]:
+    """Return the request that reads the range `at`."""
+    if at.table == "coil" or at.table == "discrete":
+        return ReadBits(at.table, at.address, at.count)
+    return ReadRegisters(at.table, at.address, at.count)
 
 
 def place_of(at: RegisterRange, read: RegisterRange) -> slice:

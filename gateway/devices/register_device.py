@@ -9,19 +9,26 @@ sample has no good values.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
-from fieldtwin.gateway.core.files.profile import RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, encode
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.driver import DeviceDriver, TagSink
-from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, place_of
+from fieldtwin.gateway.devices.read_plan import (
+    ILLEGAL_ADDRESS,
+    TOO_LONG,
+    GroupPlan,
+    Learnt,
+    Read,
+    place_of,
+    read_request,
+)
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
 from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply
 
@@ -198,7 +205,7 @@ class RegisterDriver(DeviceDriver):
     async def _read_block(self, reading: GroupReading) -> None:
         plan, read = self.plans[reading.what], reading.todo[0]
         try:
-            reply = await self._transaction(read.range)
+            reply = await self.client.execute(self.config.address, read.request)
         except ModbusExceptionReply as e:
             if e.code not in (ILLEGAL_ADDRESS, TOO_LONG):
                 raise
@@ -238,15 +245,8 @@ class RegisterDriver(DeviceDriver):
             return []
         return [MEASUREMENT(raw[place_of(m.at, read.range)]) for read, raw in reading.blocks for m in read.messages]
 
-    def _transaction(self, at: RegisterRange) -> Coroutine[Any, Any, BitsReply | RegistersReply]:
-        """Read the range `at`."""
-        unit = self.config.address
-        if at.table == "coil" or at.table == "discrete":
-            return self.client.read_bits(unit, at.table, at.address, at.count)
-        return self.client.read_registers(unit, at.table, at.address, at.count)
-
     async def _read_tag(self, tag: Tag) -> TagValue:
-        reply = await self._transaction(tag.registers)
+        reply = await self.client.execute(self.config.address, read_request(tag.registers))
         value = decode(tag, _cells(reply), reply.t_ns)
         self._publish(tag.name, value)
         return value

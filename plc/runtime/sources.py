@@ -56,18 +56,23 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = 
 
 def _beside(path: str) -> list[str]:
     """Return the files of the imported modules in the folder of the module `path` or below it, without those of libraries."""
-    folder, libraries = Path(path).resolve().parent, tuple(Path(p).resolve() for p in {*get_paths().values()})
+    folder = _folder(os.path.dirname(path))
+    libraries = tuple(library for p in {*get_paths().values()} if not folder.startswith(library := _folder(p)))
     files: dict[str, set[str]] = {}
     for module in list(sys.modules.values()):
         if isinstance(file := getattr(module, "__file__", None), str) and file != path:
             files.setdefault(os.path.dirname(file), set()).add(file)
-    near = (  # resolved by folder, of which there are far fewer than files: a virtual run starts in 41 ms instead of 50
-        files[name]
-        for name in files
-        if (at := Path(name).resolve()).is_relative_to(folder)
-        and not any(at.is_relative_to(library) and not folder.is_relative_to(library) for library in libraries)
+    near = (  # links are followed by folder, of which there are far fewer than files
+        found
+        for name, found in files.items()
+        if (at := _folder(name)).startswith(folder) and not at.startswith(libraries)
     )
     return sorted(set().union(*near))
+
+
+def _folder(path: str) -> str:
+    """Return the folder `path` without links, with a separator at its end, so that it is a prefix of the paths below it."""
+    return os.path.join(os.path.realpath(path), "")
 
 
 def changed(known: Sequence[ProgramSource]) -> list[ProgramSource]:

@@ -20,10 +20,14 @@ from rich.table import Table
 from support import eventually, run
 
 from fieldtwin.cli.run.simulate_command import command as simulate
+from fieldtwin.cli.twin.shadow_command import exit_code, print_shadow
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.files.recording import looks_like_another_file
 from fieldtwin.gateway.devices.config import Heartbeat
 from fieldtwin.run.processes import plc_client
+from fieldtwin.run.shadow.shadow import Shadowing
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import load_system
 
 SILENT = "faults: [{name: silence, device: ctd}]\n"
 VIRTUAL = ["observatory", "--for", "5s"]
@@ -97,3 +101,18 @@ def test_the_socket_of_a_killed_plc_is_not_an_instance(monkeypatch: pytest.Monke
         server.listen()
         with server:
             assert plc_client.running_instances() == ["running"]
+
+
+def test_a_shadow_compares_no_states_with_a_plant_that_reports_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    # Defect: it printed "STANDBY" and ended with 1, "the states differed", because such a plant never reports a state.
+    shadow = Shadowing(load_system("lab_vehicle"), "tcp://127.0.0.1:1", Instance("hall", tmp_path), on_verdict=print)
+    seen = {**shadow.describe(), "origins": ["plant:1"], "thread": {"links": 1, "duplicates": 0, "trouble": ""}}
+    print_shadow(seen)
+    told = capsys.readouterr().err
+    assert "states     not compared: no device of this system reports one" in told
+    assert "STANDBY" not in told
+    assert exit_code(seen) == 0
+    reports = Shadowing(load_system("observatory"), "tcp://127.0.0.1:1", Instance("sea", tmp_path), on_verdict=print)
+    assert exit_code(reports.describe()) == 1, "without a status there is no result"

@@ -18,7 +18,7 @@ from support import eventually, run
 from wire_rig import Crossed, relay, strange_device
 
 from fieldtwin.cli.recordings.compare_command import command as compare_command
-from fieldtwin.cli.twin.shadow_command import print_shadow
+from fieldtwin.cli.twin.shadow_command import exit_code, print_shadow
 from fieldtwin.emulators.models.modbus.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
@@ -362,8 +362,9 @@ def test_prose_10_twinning_rate_and_lag_are_measured_and_printed(capsys: pytest.
         receiving.observe("plant:1", status(5, t_ms=clock.now_ms - 40))
         shadow.step()
     thread = {"links": 1, "duplicates": 0, "trouble": ""}
-    other = {"origins": ["plant:1"], "prototype": True, "thread": thread, "store_trouble": ""}
+    other = {"origins": ["plant:1"], "prototype": True, "reports_state": True, "thread": thread, "store_trouble": ""}
     print_shadow({**shadow.describe(), **other})
+    assert exit_code({**shadow.describe(), **other}) == 0
     told = capsys.readouterr().err
     assert "10.0 reports a second" in told
     assert "median 40 ms" in told

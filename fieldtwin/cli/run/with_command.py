@@ -61,6 +61,10 @@ def command(
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
         raise UsageError("`fieldtwin with` needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
+    if words[0].startswith("-"):
+        raise UsageError(
+            f"{words[0]!r} is no program", expected=f"options before SYSTEM: fieldtwin with [OPTION]... {system} -- CMD"
+        )
     file = replay.prototype_file
     loaded = load_system(
         system_file(system, sources.ask(), prototype_file=file, profiles=sources.profiles), sources.profiles

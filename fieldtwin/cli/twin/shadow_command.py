@@ -85,8 +85,8 @@ def command(
     """Follow SYSTEM as its digital shadow: receive the plant's data, update the digital model, and report differences.
 
     It reports a state that differs from the model's, values outside their limits, bad and stale values, and how often and
-    with which delay plant and model agree. A shadow sends no commands. Exit code 1 if the states differed. SYSTEM may be a
-    template.
+    with which delay plant and model agree. A shadow sends no commands. Exit code 1 if the states differed, or if none was
+    received from a system that reports states. SYSTEM may be a template.
     """
     loaded = load_system(system_file(system, lambda template: True, plant=True), profiles)
     with Instance(instance or f"{loaded.name}-shadow") as here:
@@ -98,7 +98,7 @@ def command(
         print_shadow(seen)
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
-    return 0 if seen["statuses"] and seen["agreed"] == seen["statuses"] else 1  # without a status there is no result
+    return exit_code(seen)
 
 
 async def _run(
@@ -112,6 +112,12 @@ async def _run(
         stderr.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
     await shadowing.run(stop, duration_s)
     return shadowing.describe()
+
+
+def exit_code(seen: dict[str, Any]) -> int:
+    """Return 1 if a state differed, or if none was received from a system that reports states; else 0."""
+    received = seen["statuses"] or not seen["reports_state"]
+    return 0 if received and seen["agreed"] == seen["statuses"] else 1
 
 
 def why_nothing(seen: dict[str, Any], place: str) -> str:
@@ -138,11 +144,13 @@ def print_shadow(seen: dict[str, Any]) -> None:
         return
     kind = "a prototype" if seen["prototype"] else "a plant"
     lag, rate, thread = seen["lag_ms"], seen["twinning_rate_hz"], seen["thread"]
+    compared = seen["reports_state"]
+    states = f"{seen['statuses']}, {seen['agreed']} of them agree with the model"
     lines = [
-        ("model", f"{seen['state']}, period {seen['period_s']} s"),
+        *([("model", f"{seen['state']}, period {seen['period_s']} s")] if compared else []),
         ("variables", told_of(seen["variables"], seen["undeclared"])),
         ("from", f"{', '.join(seen['origins'])}, {kind}"),
-        ("statuses", f"{seen['statuses']}, {seen['agreed']} of them agree with the model"),
+        ("statuses", states) if compared else ("states", "not compared: no device of this system reports one"),
         (
             "twinning",
             f"{f'{rate:.1f} reports a second' if rate else 'too few reports'}, {seen['backfilled']} backfilled",

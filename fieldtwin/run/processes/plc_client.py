@@ -114,12 +114,13 @@ def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) 
         raise UsageError(f"no program {name!r}", expected=", ".join(system.plc.programs))
     if name:
         found = {n: thing for n, thing in found.items() if n == name}
-    if len(found) != 1:
-        raise UsageError(
-            f"{'several programs have' if found else 'no program has'} {what}",
-            expected="--program NAME" if found else "",
-            got=", ".join(found),
-        )
+    if not system.plc.programs:
+        raise UsageError(f"{system.name} has no program", where=str(system.path), expected=f"a program with {what}")
+    if not found:
+        where = ", ".join([name] if name else system.plc.programs)
+        raise UsageError(f"no program has {what}", got=where, hint="see docs/how-to/state-machines.md")
+    if len(found) > 1:
+        raise UsageError(f"several programs have {what}", expected="--program NAME", got=", ".join(found))
     return next(iter(found.items()))
 
 

@@ -206,6 +206,7 @@ class Shadowing:
         return {
             "system": self._system.name,
             "prototype": bool(self.prototypes),
+            "reports_state": any(device.profile.inbox is not None for device in self._system.devices.values()),
             "origins": sorted(self.origins),
             "thread": thread,
             "store_trouble": self._troubles.get("store", ""),

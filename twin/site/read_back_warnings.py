@@ -1,8 +1,8 @@
-"""Warnings for the author of a system file about tags that the gateway may write and never reads back.
+"""Warnings for the author of a system file about tags that the gateway reads only once, after it has connected.
 
 The value that the device holds in such a tag is unknown: the published value is the one read at the start, or there is
-none. A device that loses the written value does not get it again, and every start writes it again. Pure: it inspects a
-loaded system file.
+none. It stays good while the device changes or is lost. A device that loses a written value does not get it again, and
+every start writes it again. Pure: it inspects a loaded system file.
 """
 
 from __future__ import annotations
@@ -32,6 +32,36 @@ def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tupl
                     expected=_remedy(device, tag),
                 )
                 found.append(str(error))
+    return tuple(found)
+
+
+ONCE = ("identity", "setup")
+"""Poll groups whose values do not change while the device runs: they are read once on purpose."""
+
+
+def read_only_once(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
+    """Return a warning for each poll group of measured values that is read once, because the device's `poll` lacks it.
+
+    A tag of `writable` has its own warning (`never_read_back`), and a transmitter's mailbox is read without an entry.
+    """
+    found = []
+    for name, device in devices.items():
+        if device.profile.inbox is not None:
+            continue
+        writable = file.data["devices"][name].get("writable", [])
+        groups: dict[str, list[Tag]] = {}
+        for tag in device.profile.tags.values():
+            if tag.readable and tag.poll not in ONCE and tag.name not in writable and not _read_again(device, tag):
+                groups.setdefault(tag.poll, []).append(tag)
+        for group, tags in groups.items():
+            more = f" and {len(tags) - 1} more" if tags[1:] else ""
+            error = file.error(
+                ("devices", name),
+                f"{name}.{tags[0].name}{more} {'are' if tags[1:] else 'is'} read only once, after connecting: the "
+                f"poll group {group!r} has no period",
+                expected=_remedy(device, tags[0]),
+            )
+            found.append(str(error))
     return tuple(found)
 
 

@@ -24,7 +24,7 @@ from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rp
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
-from fieldtwin.twin.site.read_back_warnings import never_read_back
+from fieldtwin.twin.site.read_back_warnings import never_read_back, read_only_once
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
 from fieldtwin.twin.site.serving import Serving, resolve_serving
@@ -103,7 +103,9 @@ def _resolve(
         file=file,
         commands=form.commands,
         invariants=form.invariants,
-        warnings=never_read_back(file, devices) + waits_for_its_command(file, form.plc, devices),
+        warnings=never_read_back(file, devices)
+        + read_only_once(file, devices)
+        + waits_for_its_command(file, form.plc, devices),
         serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc), errors),
     )
     _check_programs(system, errors)

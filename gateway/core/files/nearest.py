@@ -18,9 +18,20 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> list[str]:
     names = {k.lower(): k for k in known}
     whole = re.compile(rf"(?:^|.*[^a-z0-9]){re.escape(name.lower())}(?:[^a-z0-9].*|$)") if name else None
     longer = [k for k in names if whole is not None and whole.fullmatch(k)]
-    alike = difflib.get_close_matches(name.lower(), longer, n=most, cutoff=0)
-    alike += difflib.get_close_matches(name.lower(), [k for k in names if k not in longer], n=most, cutoff=ALIKE)
+    alike = _by_likeness(name.lower(), longer, 0)
+    alike += _by_likeness(name.lower(), [k for k in names if k not in longer], ALIKE)
     return [names[near] for near in alike[:most]]
+
+
+def _by_likeness(name: str, known: Iterable[str], least: float) -> list[str]:
+    """Return the names with at least this likeness to `name`, the most similar first, equally similar ones as they come."""
+    matcher = difflib.SequenceMatcher(b=name)
+    found = []
+    for each in known:
+        matcher.set_seq1(each)
+        if matcher.real_quick_ratio() >= least and matcher.quick_ratio() >= least and matcher.ratio() >= least:
+            found.append((matcher.ratio(), each))
+    return [each for _, each in sorted(found, key=lambda one: -one[0])]
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:

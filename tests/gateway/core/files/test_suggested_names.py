@@ -31,3 +31,7 @@ def test_a_longer_name_with_the_whole_name_comes_before_a_similar_one() -> None:
     assert did_you_mean("fan.frequency", ["panel.frequency", "supply_fan.frequency"]) == (
         "did you mean 'supply_fan.frequency'?"
     )
+
+
+def test_of_equally_similar_names_the_first_is_suggested() -> None:
+    assert nearest("outputs", ["outputs_1", "outputs_2"]) == ["outputs_1"]

@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Studio's bus view in headless Chromium: the time from a frame to the screen, and a million frames at hand.
 
-    benchmarks/studio.py [--quick] [--rate 5000] [--seconds 20] [--frames 1000000]
+    benchmarks/studio.py [--quick] [--rate 5000] [--seconds 20] [--frames 1000000] [--pairs 5] [--only PART]
 
 First part: Studio starts with a capture of a million frames of the observatory. Measured are the time until it serves its page,
 the time until all frames are indexed, the memory of the server, and the time until the rows at random positions are drawn.
 Second part: another process appends frames to a capture at the given rate; the page follows them. For each frame, the time from
 its time stamp until its row, or a later one, is drawn. Nothing else is compared: no peer shows the frames of such a run.
+Third part, in pairs without and with Studio: the lateness of the scans of a running system with 5,000 tags, and the CPU time of
+its PLC and its gateway. Studio observes the system, and the devices view is open in Chromium. `--only` runs one part.
 
 Needs `chromium` and `chromedriver` (Debian: chromium-driver) and selenium. Absolute times: a quiet machine of 2 cores.
 """
@@ -18,28 +20,39 @@ import json
 import os
 import random
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any, TextIO
 
-from peers import Goals, Missing, free_port, peak_mb, python, stop
+from peers import Goals, Missing, cpu_s, free_port, peak_mb, python, stop
 
 SCREEN_MS, MEMORY_MB, SHOWN_MS, FIRST_PAGE_S = 250, 400, 200, 2.0
 FOLLOWED = 0.85
 """Share of the appended frames that must reach the screen, because a page that stops following has no late frames. The
 measurement ends half a second before the last frame."""
 MOST_STEAL = 0.02
+MOST_BUSY = 2.0
+"""The load average for each CPU, the benchmark's own processes included."""
 NAME = "bench"
 BATCH_S = 0.01
 INDEXED_WITHIN_S = 900
 PLACES = 40
+TAGS = 5000
+PART_S = 10.0
+LATE_MORE_US = 100
+CPU_MORE = 0.05
+"""The share of a CPU that Studio may cost the gateway, and the PLC."""
 REQUEST, REPLY = "010300010001d5ca", "01030200057847"
 
 
@@ -148,6 +161,21 @@ class Server:
                 raise SystemExit(f"only {self.total()} of {total} frames were indexed in {INDEXED_WITHIN_S} s")
             time.sleep(0.5)
         return time.monotonic() - begun
+
+    def wait_until_all_values(self, instance: str) -> None:
+        """Wait until Studio has the values of all tags from the gateway and from the process image."""
+        begun = time.monotonic()
+        while time.monotonic() - begun < 60:
+            with urllib.request.urlopen(f"{self.url}api/v1/instances/{instance}/status", timeout=30) as answer:
+                status = json.load(answer)
+            if (
+                status["gateway"]
+                and status["plc"]
+                and min(len(status["gateway"]["tags"]), len(status["plc"]["inputs"])) >= TAGS
+            ):
+                return
+            time.sleep(0.5)
+        raise SystemExit(f"Studio does not have all values: {status['troubles']}")
 
     def close(self) -> None:
         stop(self.process)
@@ -282,6 +310,167 @@ def to_screen(root: Path, rate: int, seconds: float) -> list[float]:
     return ages
 
 
+LOAD_PROFILE = """device: bench/many
+source: "this benchmark"
+protocol: modbus
+defaults: {{poll: all}}
+tags:
+{tags}
+"""
+LOAD_SYSTEM = """fieldtwin: 1
+system: many
+buses: {{lan: {{url: "tcp://127.0.0.1:502"}}}}
+devices:
+{devices}
+plc: {{cycle_ms: 10, watchdog: {{late_ms: 1000}}, programs: {{copy: {{source: copy.st, inputs: {{x: {{tag: d0.t0}}}}}}}}}}
+"""
+LOAD_PROTOTYPE = """prototype_of: many.yaml
+buses: {{lan: {{listen: "tcp://127.0.0.1:0"}}}}
+devices:
+{devices}
+"""
+LOAD_PROGRAM = """PROGRAM copy
+  VAR_INPUT x : REAL; END_VAR
+  VAR y : REAL; END_VAR
+  y := x + 1.0;
+END_PROGRAM
+"""
+
+
+def write_plant(folder: Path) -> None:
+    """Write a system with `TAGS` tags: devices of 100 registers, each of which is read every 500 ms."""
+    devices = range(TAGS // 100)
+    tags = "\n".join(f"  t{n}: {{at: {30001 + n}, type: uint16}}" for n in range(100))
+    poll = "poll: {all: {every_ms: 500}}"
+    named = "\n".join(f"  d{n}: {{profile: many_device.yaml, bus: lan, unit: {n + 1}, {poll}}}" for n in devices)
+    values = "\n".join(f"  d{n}: {{model: profile, values: {{t0: {n}}}}}" for n in devices)
+    (folder / "many_device.yaml").write_text(LOAD_PROFILE.format(tags=tags))
+    (folder / "many.yaml").write_text(LOAD_SYSTEM.format(devices=named))
+    (folder / "many.prototype.yaml").write_text(LOAD_PROTOTYPE.format(devices=values))
+    (folder / "copy.st").write_text(LOAD_PROGRAM)
+
+
+@dataclass
+class Cost:
+    """The figures of one part of a pair: shares of a CPU, and how late scans began, in us."""
+
+    gateway: float
+    plc: float
+    p50: float
+    p99: float
+
+
+class Plant:
+    """A running prototype with `TAGS` tags."""
+
+    def __init__(self, root: Path) -> None:
+        write_plant(root)
+        self.root, self.run_dir = root, root / "run" / "many"
+        self._log = (root / "run.log").open("wb")
+        command = [
+            python(),
+            "-m",
+            "fieldtwin",
+            "run",
+            "many.yaml",
+            "--prototype",
+            "--commands",
+            "none",
+            "--log",
+            "text",
+        ]
+        environment = os.environ | {"FIELDTWIN_RUN": str(root / "run")}
+        self.process = subprocess.Popen(command, cwd=root, stdout=self._log, stderr=self._log, env=environment)
+        deadline = time.monotonic() + 90
+        while not (self.run_dir / "run.json").exists() or self.plc()["state"] != "running":
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise SystemExit(f"the plant did not start: {(root / 'run.log').read_text()[-500:]}")
+            time.sleep(0.2)
+
+    def plc(self) -> dict[str, Any]:
+        """Return the brief status of the PLC with the distribution of the lateness."""
+        try:
+            return asked(self.run_dir / "plc.sock")
+        except OSError:
+            return {"state": "absent"}
+
+    def cost(self, seconds: float) -> Cost:
+        """Measure for some seconds. The lateness is that of the scans of this time only."""
+        pids = {name: child_pid(self.process.pid, name) for name in ("fieldtwin.plc", "controller")}
+        before, spent = self.plc(), {name: cpu_s(pid) for name, pid in pids.items()}
+        time.sleep(seconds)
+        after = self.plc()
+        used = {name: (cpu_s(pid) - spent[name]) / seconds for name, pid in pids.items()}
+        late = difference(before["lateness_buckets"], after["lateness_buckets"])
+        return Cost(used["controller"], used["fieldtwin.plc"], quantile_us(late, 0.5), quantile_us(late, 0.99))
+
+    def close(self) -> None:
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(30)
+        self._log.close()
+
+
+def asked(path: Path) -> dict[str, Any]:
+    """Return the PLC's brief status."""
+    with socket.socket(socket.AF_UNIX) as s:
+        s.settimeout(10)
+        s.connect(str(path))
+        s.sendall(b'{"v": 1, "id": 1, "command": "get", "args": {"brief": true, "buckets": true}}\n')
+        with s.makefile("rb") as lines:
+            found: dict[str, Any] = json.loads(lines.readline())["result"]
+    return found
+
+
+def child_pid(parent: int, part: str) -> int:
+    """Return the child process whose command line contains `part`."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            stat = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(stat[1]) == parent and part in (folder / "cmdline").read_text().replace("\0", " "):
+                return int(folder.name)
+        except OSError:
+            continue
+    raise SystemExit(f"the plant has no process {part}")
+
+
+def difference(before: list[tuple[float, int]], after: list[tuple[float, int]]) -> list[tuple[float, float]]:
+    """Return the counts of the time between two distributions."""
+    known = dict(before)
+    return [(limit, count - known.get(limit, 0)) for limit, count in after]
+
+
+def quantile_us(buckets: list[tuple[float, float]], share: float) -> float:
+    """Return the upper limit of the bucket that contains a quantile, interpolated within it."""
+    total, seen, low = sum(count for _, count in buckets), 0.0, 0.0
+    for limit, count in buckets:
+        if count and seen + count >= total * share:
+            return low + (limit - low) * (total * share - seen) / count
+        seen, low = seen + count, limit
+    return low
+
+
+def load(root: Path, pairs: int, seconds: float) -> list[tuple[Cost, Cost]]:
+    """Return the costs of the plant without and with Studio, pair by pair."""
+    root.mkdir(parents=True)
+    plant, found = Plant(root), []
+    try:
+        time.sleep(3)
+        for _ in range(pairs):
+            without = plant.cost(seconds)
+            server, driver = Server(root / "run"), browser()
+            try:
+                driver.get(f"{server.url}#/many/devices")
+                server.wait_until_all_values("many")
+                found.append((without, plant.cost(seconds)))
+            finally:
+                driver.quit()
+                server.close()
+            time.sleep(1)
+    finally:
+        plant.close()
+    return found
+
+
 def percentile(values: list[float], share: float) -> float:
     return sorted(values)[min(len(values) - 1, int(len(values) * share))]
 
@@ -298,48 +487,89 @@ def main() -> int:
     parser.add_argument("--rate", type=int, default=5000)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--frames", type=int, default=1_000_000)
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--only", choices=("screen", "many", "load"))
     parser.add_argument("--append", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.append is not None:
         append(options.append, options.rate, options.seconds)
         return 0
-    frames, seconds = (50_000, 6.0) if options.quick else (options.frames, options.seconds)
-    before = cpu_ticks()
+    frames, seconds, pairs, part_s = (
+        (50_000, 6.0, 2, 5.0) if options.quick else (options.frames, options.seconds, options.pairs, PART_S)
+    )
+    wanted = {options.only} if options.only else {"screen", "many", "load"}
+    before, goals = cpu_ticks(), Goals()
     folder = Path(tempfile.mkdtemp(prefix="fieldtwin-bench-"))
-    server = None
+    reports: list[Callable[[], None]] = []
     try:
-        ages = to_screen(folder / "live", options.rate, seconds)
-        server, indexed_s, jumps = a_million(folder / "many", frames)
-        memory, first_page_s = peak_mb(server.process.pid), server.first_page_s
+        if "screen" in wanted:
+            ages = to_screen(folder / "live", options.rate, seconds)
+            reports.append(lambda: report_screen(goals, ages, options.rate, seconds))
+        if "many" in wanted:
+            server, indexed_s, jumps = a_million(folder / "many", frames)
+            memory, first_page_s = peak_mb(server.process.pid), server.first_page_s
+            server.close()
+            reports.append(lambda: report_many(goals, frames, indexed_s, jumps, memory, first_page_s))
+        if "load" in wanted:
+            costs = load(folder / "load", pairs, part_s)
+            reports.append(lambda: report_load(goals, costs))
     except Missing as e:
         print(f"left out: {e} is not installed")
         return 2
     finally:
-        if server is not None:
-            server.close()
         shutil.rmtree(folder, ignore_errors=True)
     stolen, spent = (b - a for a, b in zip(before, cpu_ticks(), strict=True))
-    steal = stolen / max(spent, 1)
+    steal, busy = stolen / max(spent, 1), os.getloadavg()[0] / (os.cpu_count() or 1)
+    for report in reports:
+        report()
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs, steal {steal:.1%}")
+    if steal > MOST_STEAL or busy > MOST_BUSY:
+        print(
+            f"INCONCLUSIVE: the host is not quiet (at most {MOST_STEAL:.0%} steal, and a load of {MOST_BUSY:g} for each CPU)"
+        )
+        return 3
+    return goals.verdict()
+
+
+def report_screen(goals: Goals, ages: list[float], rate: int, seconds: float) -> None:
     late = percentile(ages, 0.95)
+    print(f"{rate} frames/s, {seconds:g} s: {len(ages)} on the screen after {median(ages):.0f} ms, 95 % {late:.0f} ms")
+    goals.least("share of the appended frames that reached the screen", len(ages) / (rate * seconds), FOLLOWED)
+    goals.most("frame to screen, 95 %", late, SCREEN_MS, "ms")
+
+
+def report_many(
+    goals: Goals, frames: int, indexed_s: float, jumps: list[float], memory: float, first_page_s: float
+) -> None:
     slow = percentile(jumps, 0.95) if len(jumps) == PLACES else float("inf")
-    print(
-        f"{options.rate} frames/s, {seconds:g} s: {len(ages)} on the screen after {median(ages):.0f} ms, 95 % {late:.0f} ms"
-    )
     print(
         f"{frames} frames: indexed in {indexed_s:.1f} s, {frames / indexed_s:.0f} frames/s; server {memory:.0f} MB at most"
     )
     print(f"a random place: {median(jumps):.0f} ms, 95 % {slow:.0f} ms, worst {max(jumps):.0f} ms of {len(jumps)}")
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs, steal {steal:.1%}\n")
-    if steal > MOST_STEAL:
-        print(f"INCONCLUSIVE: the host took {steal:.1%} of the CPU time away (at most {MOST_STEAL:.0%})")
-        return 3
-    goals = Goals()
-    goals.least("share of the appended frames that reached the screen", len(ages) / (options.rate * seconds), FOLLOWED)
-    goals.most("frame to screen, 95 %", late, SCREEN_MS, "ms")
     goals.most("memory of the server", memory, MEMORY_MB, "MB")
     goals.most("any frame on the screen, 95 %", slow, SHOWN_MS, "ms")
     goals.most("first page after the start", first_page_s, FIRST_PAGE_S, "s")
-    return goals.verdict()
+
+
+def report_load(goals: Goals, costs: list[tuple[Cost, Cost]]) -> None:
+    print(f"{TAGS} tags, {len(costs)} pairs              without Studio   with Studio   difference of pairs")
+    for name, text, scale, unit in (
+        ("p50", "scan late, median", 1, "us"),
+        ("p99", "scan late, 99 %", 1, "us"),
+        ("plc", "CPU of the PLC", 100, "%"),
+        ("gateway", "CPU of the gateway", 100, "%"),
+    ):
+        without, with_studio = ([getattr(part, name) * scale for part in side] for side in zip(*costs, strict=True))
+        more = [b - a for a, b in zip(without, with_studio, strict=True)]
+        print(
+            f"  {text:<28} {median(without):>11.1f} {unit:<2} {median(with_studio):>10.1f} {unit:<2}"
+            f" {median(more):>+9.1f} ({min(more):+.1f} to {max(more):+.1f})"
+        )
+    goals.most("scan late with Studio, 99 %, more", median(b.p99 - a.p99 for a, b in costs), LATE_MORE_US, "us")
+    goals.most("CPU of the PLC with Studio, more", median(b.plc - a.plc for a, b in costs), CPU_MORE, "of a CPU")
+    goals.most(
+        "CPU of the gateway with Studio, more", median(b.gateway - a.gateway for a, b in costs), CPU_MORE, "of a CPU"
+    )
 
 
 if __name__ == "__main__":

@@ -163,7 +163,7 @@ async def _first_trace(traces: Traces, options: StudioOptions) -> str:
     await traces.opened(
         named[0].name
     )  # an unreadable trace is reported at once, and the others are indexed from now on
-    at = "" if options.at_s is None else f"?t={options.at_s:g}"
+    at = "" if options.at_s is None else f"?t={options.at_s!r}"
     return f"#/{quote(f'trace:{named[0].name}')}/overview{at}"
 
 

@@ -9,6 +9,8 @@ from studio_rig import Studio, studio, until
 from trace_rig import FAILED_NS, FAULT_NS, TITLE, failing_trace
 
 pytest.importorskip("selenium", reason="needs selenium, which is in the extra dev")
+from accessibility_rules import MISSING as NO_AXE
+from accessibility_rules import violations
 from browser import MISSING, Window, browser
 from selenium.webdriver.common.keys import Keys
 
@@ -73,6 +75,24 @@ def test_the_failed_check_of_a_trace_is_found_and_the_run_is_walked_through_by_k
         page.click(".nav a", "Trends")
         page.sees(".trend", "ctd.pressure")
         assert page.complaints() == []
+
+
+@pytest.mark.long
+@pytest.mark.skipif(bool(NO_AXE), reason=NO_AXE)
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_no_view_of_a_trace_violates_a_rule_of_wcag_2_a_or_aa(tmp_path: Path, dark: bool) -> None:
+    failing_trace(tmp_path)
+    with studio("fail.jsonl", folder=tmp_path) as running, browser() as page:
+        page.dark(dark)
+        opened(page, running)
+        at(page, FAILED_NS)
+        found = {}
+        for view in ("Overview", "Devices", "Bus", "PLC", "Trends"):
+            page.click(".nav a", view)
+            page.sees(".nav a[aria-current]", view)
+            until(lambda: page.elements("main > :not(h1)"), f"{view} is drawn")
+            found[view] = violations(page)
+        assert {view: broken for view, broken in found.items() if broken} == {}
 
 
 def press(page: Window, key: str) -> None:

@@ -25,6 +25,7 @@ from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.check_options import JunitOptions
 from fieldtwin.cli.test.target_options import TargetOptions
+from fieldtwin.cli.test.trace_files import SUFFIX, trace_files
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from fieldtwin.results.model import Machine, ScenarioResult, SystemKey
     from fieldtwin.twin.site.system import System
 
-SUFFIX = ".scenario.yaml"
 _CONTROLLER = "fieldtwin.controller"
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
 
@@ -83,6 +83,11 @@ class _WithCommand(GroupedCommand):
         help="Write every event of a single scenario to this file (JSON lines).",
     ),
     click.option(
+        "--traces",
+        type=click.Path(file_okay=False, path_type=Path),
+        help="Write every event of each scenario to a file in this folder, which fieldtwin studio shows.",
+    ),
+    click.option(
         "--progress",
         type=click.Path(dir_okay=False),
         help="Write the steps, verdicts and checked values of a single scenario to this file while it runs (JSON lines).",
@@ -100,6 +105,7 @@ def command(
     junit: JunitOptions,
     html: str | None,
     trace: str | None,
+    traces: Path | None,
     progress: str | None,
     as_json: bool,
 ) -> int:
@@ -140,7 +146,8 @@ def command(
             "--retry-inconclusive would repeat a scenario's writes to a plant",
             expected="--allow read, or no retries",
         )
-    _check_campaign(campaign, target, (seed, trace, progress, retries))
+    _check_campaign(campaign, target, (seed, trace, traces, progress, retries))
+    events = trace_files(paths, trace, traces)
     folders = sources.profiles
     for path in paths:
         agree_to_scenario(sources.ask(), path, folders, plant=target == "real", virtual=target == "virtual")
@@ -163,7 +170,7 @@ def command(
     shown = Progress(Path(progress)) if progress else None
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
-    for scenario in scenarios:
+    for scenario, file in zip(scenarios, events, strict=True):
         if campaign.seeds:
             from fieldtwin.cli.run.virtual_view import parse_seeds
             from fieldtwin.cli.test.campaign_view import run_scenario_campaign
@@ -174,7 +181,7 @@ def command(
             results += waived_ones
             seeds += waived_ones[1 : 1 + len(parse_seeds(campaign.seeds))]
             continue
-        result = run_scenario(scenario, where, Path(trace) if trace else None, retries, shown)
+        result = run_scenario(scenario, where, file, retries, shown)
         result = replace(result, system=scenario.system)
         results.append(waive(result, waived, datetime.now(UTC).date()))
         if not as_json:
@@ -231,7 +238,7 @@ def _check_campaign(campaign: CampaignOptions, target: str, of_one_run: tuple[ob
     if campaign.seeds and any(of_one_run):
         raise UsageError(
             "--seeds, which makes several runs",
-            hint="--seed, --trace, --progress and --retry-inconclusive need a single run",
+            hint="--seed, --trace, --traces, --progress and --retry-inconclusive need a single run",
         )
 
 

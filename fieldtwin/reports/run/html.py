@@ -8,6 +8,7 @@ with the command that runs it again. The page's text is in templates/run.html.j2
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -145,8 +146,16 @@ def _failure(report: Report, number: int, scenario: ScenarioResult, windows: lis
     failing = [c for c in scenario.checks if c.verdict.bad]
     return fill(
         "failure.html.j2", number=number, scenario=scenario, place=_place(scenario), failing=failing, drawn=drawn,
-        opened=opened, **_SHARED,
+        opened=opened, in_studio=_in_studio, **_SHARED,
     )  # fmt: skip
+
+
+def _in_studio(scenario: ScenarioResult, t_ns: int | None) -> str:
+    """Return the command that shows an instant of the scenario's trace in Studio, empty without such a trace."""
+    if not scenario.trace_file:
+        return ""
+    at = "" if t_ns is None else f"{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}".rstrip("0").rstrip(".") + "s"
+    return shlex.join(["fieldtwin", "studio", scenario.trace_file, *(["--at", at] if at else [])])
 
 
 def _place(scenario: ScenarioResult) -> str:

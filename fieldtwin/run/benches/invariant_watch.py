@@ -29,7 +29,8 @@ class InvariantWatch:
         self.names = sorted(stated.names)
         """The tags and variables that they use."""
         self._rules: list[Rule] = [*map(always_rule, stated.stated), *map(within_rule, stated.followed)]
-        self._broken: dict[str, tuple[Verdict, str]] = {}
+        self._broken: dict[str, tuple[Verdict, str, float]] = {}
+        """By rule: verdict, explanation, and the second of the run at which it was broken."""
         self._ended = ""
         self._now_s = 0.0
 
@@ -62,16 +63,17 @@ class InvariantWatch:
                 unknown = said.nobody_knows or (said.bound_s > 0 and late_s > LATE_SHARE * said.bound_s)
                 verdict = Verdict.INCONCLUSIVE if unknown else Verdict.FAILED
                 late = f"; but this host itself was {late_s * 1000:.0f} ms late" if unknown else ""
-                self._broken[rule.number] = verdict, f"broken at {now_s:.3f} s: {said.got}{late}"
+                self._broken[rule.number] = verdict, f"broken at {now_s:.3f} s: {said.got}{late}", now_s
 
     def results(self) -> list[dict[str, Any]]:
         """Return each invariant with its verdict, as plain data: passed, failed, or inconclusive if its value was not known."""
         return [self._result(rule) for rule in self._rules]
 
     def _result(self, rule: Rule) -> dict[str, Any]:
+        broken_s = None
         text = rule.text if isinstance(rule, WithinRule) else rule.expression.text
         if rule.number in self._broken:
-            verdict, got = self._broken[rule.number]
+            verdict, got, broken_s = self._broken[rule.number]
         elif isinstance(rule, WithinRule):
             got, judged = rule.summary()
             verdict = Verdict.PASSED if judged or (rule.never_came and rule.known) else Verdict.INCONCLUSIVE
@@ -83,6 +85,7 @@ class InvariantWatch:
             "text": text,
             "verdict": verdict.value,
             "got": got + self._ended,
+            "broken_s": broken_s,
             "where": rule.where,
         }
 

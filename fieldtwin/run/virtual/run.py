@@ -18,6 +18,7 @@ from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.virtual.chance import seeded
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.results.model import Verdict
@@ -149,7 +150,12 @@ class VirtualRun:
             summary = self.summary()
             broken = [
                 CheckAbout(
-                    number=one["number"], text=one["text"], verdict=one["verdict"], got=one["got"], where=one["where"]
+                    number=one["number"],
+                    text=one["text"],
+                    verdict=one["verdict"],
+                    got=one["got"],
+                    where=one["where"],
+                    t_ns=None if one["broken_s"] is None else round(one["broken_s"] * NS_PER_S),
                 )
                 for one in summary.get("invariants", ())
             ]

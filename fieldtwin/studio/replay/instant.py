@@ -81,24 +81,25 @@ def _tag(replay: Replay, name: str, t_ns: int) -> dict[str, Any]:
     age_ns = t_ns - point.t_ns
     limit_ms = replay.about.stale_after_ms.get(name) if replay.about is not None else None
     if point.quality != BAD and limit_ms is not None and age_ns > limit_ms * NS_PER_MS:
-        read_ns = _read_again(replay, name, t_ns, t_ns - limit_ms * NS_PER_MS)
-        if read_ns is None:
+        if not replay.frames.reaches(t_ns):
+            point = point._replace(quality="uncertain", reason="frames_not_read_yet")
+        elif not _was_read(replay, name, t_ns, t_ns - limit_ms * NS_PER_MS):
             point = point._replace(quality=BAD, reason="stale")
     return {"value": point.value, "quality": point.quality, "reason": point.reason, "age_s": age_ns / NS_PER_S}
 
 
-def _read_again(replay: Replay, name: str, t_ns: int, since_ns: int) -> int | None:
-    """Return when a tag was read last between two instants, None if it was not.
+def _was_read(replay: Replay, name: str, t_ns: int, since_ns: int) -> bool:
+    """Return whether the device has sent a tag between two instants.
 
     The gateway publishes only changes, so an unchanged value is confirmed by the frames of its device only.
     """
     device, _, tag = name.rpartition(".")
     for row in islice(replay.frames.latest_of_device(device, t_ns + 1), LOOKS_BACK):
         if row.t_ns < since_ns:
-            return None
+            return False
         if tag in row.tags:
-            return row.t_ns
-    return None
+            return True
+    return False
 
 
 def _device(replay: Replay, name: str, tags: dict[str, dict[str, Any]]) -> dict[str, Any]:

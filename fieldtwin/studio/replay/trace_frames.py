@@ -35,6 +35,10 @@ class TraceFrames(FrameLog):
         self._failed_ns = {name: array("q") for name in system.buses}
         """By bus: when exchanges failed, ordered by time."""
 
+    def reaches(self, t_ns: int) -> bool:
+        """Return whether the frames up to an instant are indexed."""
+        return (bool(self._times) and self._times[-1] > t_ns) or self.behind_bytes == 0
+
     def count_of_bus(self, bus: str, t_ns: int) -> int:
         """Return how many frames a bus had before an instant."""
         return bisect_left(self._of_bus[bus], t_ns, key=self._times.__getitem__)

@@ -13,6 +13,7 @@ from pathlib import Path
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.results.trace_about import SUFFIX, TraceAbout, about_path, read_about
 from fieldtwin.studio.replay.replay import Replay
+from fieldtwin.twin.site.data_files import system_files
 
 MOST_OPEN = 3
 """Traces that are indexed at a time; the one that was opened first is closed."""
@@ -39,9 +40,9 @@ class KnownTrace:
 
 
 def is_trace(path: Path) -> bool:
-    """Return whether a path that the user names is a trace, or a folder with traces, and not a system file."""
+    """Return whether a path that the user names is a trace, or a folder with traces and without a system file."""
     if path.is_dir():
-        return next(path.glob(f"*{SUFFIX}"), None) is not None
+        return next(path.glob(f"*{SUFFIX}"), None) is not None and not system_files(path)
     return path.is_file() and (path.suffix == ".jsonl" or about_path(path).is_file())
 
 

@@ -139,7 +139,8 @@ function Banners({ store }) {
       <span class="grow">Forced: ${forces.map(([tag, f]) => `${tag} = ${store.wordOf(tag, f.value)}${f.by ? ` by ${f.by}` : ""}`).join(", ")}</span>
       ${store.mayOperate && html`<button onClick=${() => run(() => remove(`${store.path}/plc/forces`))}>Remove all forces</button>`}
     </div>`}
-    ${(field?.faults?.length > 0 || set.length > 0) &&
+    ${!store.isTrace &&
+    (field?.faults?.length > 0 || set.length > 0) &&
     html`<div class="banner" role="status">
       <span class="grow"
         >${"Faults: "}${[
@@ -147,7 +148,7 @@ function Banners({ store }) {
           ...set.map(([tag, v]) => `${tag} set to ${store.wordOf(tag, v)}`),
         ].join(", ")}</span
       >
-      ${!store.isTrace && html`<a href=${address(store.name, "faults")}>Show</a>`}
+      <a href=${address(store.name, "faults")}>Show</a>
     </div>`}
     ${gateway?.plc && !gateway.plc.alive && html`<div class="banner bad" role="alert">The gateway receives nothing from the PLC.</div>`}
     <${Failure} text=${error} />

@@ -6,6 +6,7 @@ import { Store } from "./store.js";
 export const PREFIX = "trace:";
 const GROWS_MS = 1000; // how often a trace that is not read to its end is asked for its extent
 const SETTLED_MS = 120; // after this time without a move, what takes longer is fetched
+const MOVING_MS = 400; // while the user moves or the run plays, it is fetched this often
 const TICK_MS = 50;
 
 export class TraceStore extends Store {
@@ -14,6 +15,7 @@ export class TraceStore extends Store {
     this.path = `/traces/${encodeURIComponent(name.slice(PREFIX.length))}`;
     this.instant = seconds === null ? null : Math.round(seconds * 1e9); // the wanted instant in ns
     this.settled = null; // the instant at which the user stayed
+    this.settledAt = 0;
     this.speed = 1;
     this.playing = false;
     this.busy = false;
@@ -58,7 +60,8 @@ export class TraceStore extends Store {
   go(t) {
     this.instant = Math.max(0, Math.min(this.about.end_ns, Math.round(t)));
     clearTimeout(this.settling);
-    this.settling = setTimeout(() => this.settle(), SETTLED_MS);
+    const moved = performance.now() - this.settledAt;
+    this.settling = setTimeout(() => this.settle(), moved > MOVING_MS ? 0 : SETTLED_MS);
     this.show();
     this.tell();
   }
@@ -90,6 +93,7 @@ export class TraceStore extends Store {
   async settle() {
     const at = this.instant;
     this.settled = at;
+    this.settledAt = performance.now();
     const [path] = location.hash.split("?");
     history.replaceState(null, "", `${path}?t=${at / 1e9}`);
     this.tell();

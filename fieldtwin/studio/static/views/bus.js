@@ -173,6 +173,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
     const row = Array.isArray(page) ? page[position % PAGE] : tail?.rows[position - tail.start];
     rows.push([position, row]);
   }
+  const later = (row) => store.isTrace && row.t_ns > store.now(); // than the instant of a trace
   const linked = rows.find(([, r]) => r?.number === selected)?.[1];
   return html`<${Failure} text=${error} />
     <div class="frames" role="region" aria-label="Frames" onKeyDown=${move}>
@@ -181,13 +182,14 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
       </div>
       <div class="view" ref=${view} onScroll=${scrolled} role="group" tabindex="0" aria-label="Scroll with the arrow keys">
         <div style=${{ height: `${whole}px` }}></div>
-        ${rows.map(([position, r]) => {
+        ${rows.map(([position, r], n) => {
           const top = following ? whole - (tail.total - position) * ROW : factor === 1 ? position * ROW : state.top + (position - first) * ROW;
           if (!r) return html`<div class="row soft" key=${position} style=${{ position: "absolute", left: 0, top: `${top}px` }}>…</div>`;
           const bad = r.verdict !== "good" && r.verdict !== "";
+          const earlier = rows[n - 1]?.[1];
           const tied = linked && (r.number === linked.request || r.number === linked.reply);
           return html`<button
-            class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""} ${store.isTrace && r.t_ns > store.now() ? "later" : ""}"
+            class="row item ${bad ? "problem" : ""} ${tied ? "linked" : ""} ${later(r) ? (earlier && !later(earlier) ? "later next" : "later") : ""}"
             key=${position}
             style=${{ top: `${top}px` }}
             tabindex=${live ? -1 : 0 /* rows that move would hold the tab key; an arrow key or Pause stops them */}

@@ -63,6 +63,7 @@ export function Timeline({ store }) {
       <output class="mono instant" aria-live="off">${clock(at)}</output><span class="soft">of ${clock(end)}</span>
       ${step && html`<span class="soft step" title=${step.text}>step ${step.number}: ${step.text}</span>`}
       <span class="grow"></span>
+      ${(store.status?.field.faults ?? []).map((f) => html`<span class="chip warn" key=${f.id}>fault: ${f.name} on ${f.device || f.bus}</span>`)}
       ${store.about.behind_bytes > 0 && html`<span class="chip warn" role="status">reading the trace …</span>`}
       ${store.about.growing && html`<span class="chip accent" role="status">the run continues</span>`}
       ${store.about.marks_left_out > 0 && html`<span class="chip" title="Transitions that are not marked">${store.about.marks_left_out} not marked</span>`}

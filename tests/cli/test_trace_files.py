@@ -1,4 +1,4 @@
-"""`fieldtwin test --traces FOLDER`: a trace with its description for each scenario, and the report names the command for Studio."""
+"""`fieldtwin test --traces FOLDER`: a trace for each scenario, and a report with the command for Studio."""
 
 from __future__ import annotations
 

@@ -148,7 +148,10 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
     if (at !== null && at !== undefined)
       get(`${store.path}/frames?at_ns=${at}&count=${PAGE}&${search}`).then((a) => {
         setState((s) => ({ ...s, total: a.total }));
-        requestAnimationFrame(() => view.current && (view.current.scrollTop = (a.start + PAGE / 2) * ROW));
+        const after = a.rows.findIndex((row) => row.t_ns > at);
+        const position = a.start + (after < 0 ? a.rows.length : after);
+        const rows = store.isTrace ? view.current?.clientHeight * 0.6 : 0; // what led to the instant of a trace is above it
+        requestAnimationFrame(() => view.current && (view.current.scrollTop = position * ROW - rows));
       });
   }, [at, key]);
   const scrolled = (e) => {

@@ -25,7 +25,7 @@ FAULTS = (
 )
 
 NEVER, NO_NUMBER = ("bad", "never_read"), ("bad", "not_a_number")
-"""The gateway does not report that a value which was never good is bad for another reason, so the trace keeps the first one."""
+"""The gateway reports no second reason of a value that was never good, so the trace keeps the first reason."""
 
 
 class Sampled(VirtualRun):
@@ -95,7 +95,7 @@ def test_every_value_of_a_run_is_shown_with_the_quality_that_the_gateway_gave_to
 
 
 def cut_off(trace: Path, folder: Path) -> Path:
-    """Return a copy of a trace that ends after 11 s, but for a note after 20 s."""
+    """Return a copy of a trace with the events of 11 s and a note after 20 s."""
     lines = trace.read_bytes().splitlines(keepends=True)
     before = [line for line in lines if json.loads(line)[0] < 11_000_000_000]
     cut = folder / "run.jsonl"

@@ -112,6 +112,6 @@ def test_every_trouble_is_named_once(session: RunSession) -> None:
     shown(session, 80)  # and nothing breaks if no process answers
 
 
-def test_values_for_people() -> None:
+def test_values_are_formatted_for_users() -> None:
     assert [value_text(v) for v in (None, 1.0 / 3, 5, "0042", True)] == ["-", "0.333333", "5", "0042", "True"]
     assert [age_text(a) for a in (None, 0.049, 99.5, 1234.5)] == ["-", "0.05 s", "99.50 s", "1234 s"]

@@ -89,7 +89,7 @@ def test_options_of_simulate_come_from_the_environment() -> None:
         (["observatory", "--for", "1s", "--fault-every", "1s"], "--fault-every, --fault-kinds and --fault-aims choose"),
     ],
 )
-def test_unsupported_requests(words: list[str], told: str) -> None:
+def test_unsupported_requests_are_refused_with_the_reason(words: list[str], told: str) -> None:
     done = CliRunner().invoke(simulate, words)
     assert isinstance(done.exception, UsageError), done.output
     assert told in str(done.exception)

@@ -30,7 +30,7 @@ from fieldtwin.doctor.verdicts import (
         (ClockState(True, 0.004, 1970), HostVerdict.BAD),
     ],
 )
-def test_clock(state: ClockState | None, verdict: HostVerdict) -> None:
+def test_verdict_on_the_clock(state: ClockState | None, verdict: HostVerdict) -> None:
     check = judged_clock(state)
     assert check.verdict is verdict
     assert bool(check.advice) is (verdict is not HostVerdict.OK)
@@ -49,7 +49,7 @@ def test_less_than_a_processor_is_reported() -> None:
     assert "0.5" in tight.found
 
 
-def test_inotify() -> None:
+def test_verdict_on_the_inotify_limit() -> None:
     assert judged_watches(128).verdict is HostVerdict.OK
     assert judged_watches(None).verdict is HostVerdict.OK
     assert judged_watches(4).verdict is HostVerdict.NOTE
@@ -65,7 +65,7 @@ def test_the_group_to_join_is_the_ports_own(tmp_path: Path) -> None:
     assert "udev" in join_advice([str(port)])
 
 
-def test_this_computer_can_be_asked() -> None:
+def test_the_checks_run_on_this_computer() -> None:
     assert cpu_count() >= 1
     assert (cgroup_quota() or 1) > 0
     assert kernel_number("no/such") is None

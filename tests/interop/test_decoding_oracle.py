@@ -43,7 +43,7 @@ def numbers(text: str) -> list[int]:
 
 
 @pytest.mark.parametrize("bus", ["line1", "lan"])
-def test_modbus(bus: str, tmp_path: Path) -> None:
+def test_modbus_is_decoded_as_by_tshark(bus: str, tmp_path: Path) -> None:
     frames: list[tuple[bool, bytes | CanFrame]] = []
     for number, pair in enumerate(PDUS, 1):
         for sent, pdu in zip((True, False), map(bytes.fromhex, pair), strict=True):
@@ -69,7 +69,7 @@ def test_modbus(bus: str, tmp_path: Path) -> None:
             assert told == list(exchange.registers)
 
 
-def test_canopen(tmp_path: Path) -> None:
+def test_canopen_is_decoded_as_by_tshark(tmp_path: Path) -> None:
     frames: list[tuple[bool, bytes | CanFrame]] = []
     for pair in SDOS:
         for sent, text in zip((True, False), pair, strict=True):

@@ -29,7 +29,7 @@ def held(request: pytest.FixtureRequest) -> Held:
     return found
 
 
-def test_modbus_tcp(held: Held, tmp_path: Path) -> None:
+def test_tshark_decodes_the_modbus_tcp_capture(held: Held, tmp_path: Path) -> None:
     endpoint = held.run.system.buses["lan"].endpoint
     fields = ["ip.checksum.status", "tcp.checksum.status", "mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code"]
     fields += ["modbus.exception_code", "tcp.dstport"]
@@ -46,7 +46,7 @@ def test_modbus_tcp(held: Held, tmp_path: Path) -> None:
     assert [p["modbus.exception_code"] for p in modbus if p["modbus.exception_code"]] == ["1", "2", "2"]
 
 
-def test_modbus_rtu(held: Held, tmp_path: Path) -> None:
+def test_tshark_decodes_the_modbus_rtu_capture(held: Held, tmp_path: Path) -> None:
     endpoint = held.run.system.buses["line1"].endpoint
     fields = ["mbrtu.unit_id", "mbrtu.crc16.status", "modbus.func_code", "modbus.exception_code", "_ws.col.Info"]
     packets = dissect(tmp_path / "line1.pcap", held.run.captured, endpoint, fields)
@@ -60,7 +60,7 @@ def test_modbus_rtu(held: Held, tmp_path: Path) -> None:
     assert [p["modbus.exception_code"] for p in packets if p["modbus.exception_code"]] == ["2", "3", "1", "2"]
 
 
-def test_canopen(held: Held, tmp_path: Path) -> None:
+def test_tshark_decodes_the_canopen_capture(held: Held, tmp_path: Path) -> None:
     endpoint = held.run.system.buses["can0"].endpoint
     fields = ["canopen.cob_id", "canopen.function_code", "canopen.sdo.abort_code", "canopen.nmt_ctrl.cd"]
     packets = dissect(tmp_path / "can0.pcap", held.run.captured, endpoint, [*fields, "canopen.nmt_guard.state"])

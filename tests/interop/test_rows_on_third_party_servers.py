@@ -53,7 +53,7 @@ def test_the_list_names_rows(peer: str) -> None:
 
 
 @pytest.mark.parametrize(("peer", "row_id"), [(peer, row["id"]) for peer in PEERS for row in ROWS[peer]])
-def test_row(peer: str, row_id: str) -> None:
+def test_row_on_a_third_party_server(peer: str, row_id: str) -> None:
     here = version_of(peer)
     if not here:
         pytest.skip(f"{peer} is not installed")

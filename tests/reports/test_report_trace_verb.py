@@ -57,14 +57,14 @@ def test_problems_and_json(trace: Path) -> None:
     )
 
 
-def test_waveforms(trace: Path, tmp_path: Path) -> None:
+def test_the_trace_command_writes_waveforms(trace: Path, tmp_path: Path) -> None:
     assert shown(trace, "observatory", "--vcd", tmp_path / "a.vcd") == []
     assert "$enddefinitions" in (tmp_path / "a.vcd").read_text()
     with pytest.raises(FieldtwinError, match="whole trace"):
         shown(trace, "observatory", "--vcd", tmp_path / "a.vcd", "--problems")
 
 
-def test_a_capture(tmp_path: Path) -> None:
+def test_the_trace_command_shows_a_capture(tmp_path: Path) -> None:
     tap, endpoint = TapFile(tmp_path / "c.jsonl"), observatory().buses["can0"].endpoint
     tap.on_frame(endpoint, Direction.RECEIVED, 5_000 * MS, CanFrame(0x705, b"\x05"))
     tap.on_frame(endpoint, Direction.RECEIVED, 5_500 * MS, CanFrame(0x185, bytes.fromhex("9E013500")))
@@ -75,7 +75,7 @@ def test_a_capture(tmp_path: Path) -> None:
     ]
 
 
-def test_invalid_files(tmp_path: Path) -> None:
+def test_invalid_lines_of_a_trace_are_reported_with_their_number(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     good = msgspec.json.encode((1, "note", "run", {"text": "began"}))
     for bad in (b"nonsense", b'[1,"sound","x",{}]', b'[1,"note","x"]', b'["1","note","x",{}]'):

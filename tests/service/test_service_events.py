@@ -73,7 +73,7 @@ def test_a_process_that_ended_is_an_error() -> None:
 EVENT = ServiceEvent(Priority.WARNING, "device_offline", "ctd: no reply", {"device": "ctd", "error": "two\nlines"})
 
 
-def test_json_lines() -> None:
+def test_events_are_written_as_json_lines() -> None:
     out = io.StringIO()
     EventLog("json", "observatory", lambda: 1_500_000_000, out).write(EVENT)
     assert json.loads(out.getvalue()) == {

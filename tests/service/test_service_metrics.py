@@ -261,7 +261,7 @@ def test_without_a_host_it_is_loopback(text: str, place: tuple[str, int]) -> Non
 
 
 @pytest.mark.parametrize("text", ["", "host", "host:", "1:2:3", "x:70000", "http://x:1"])
-def test_no_place(text: str) -> None:
+def test_invalid_addresses_of_the_metrics_server_are_refused(text: str) -> None:
     with pytest.raises(UsageError):
         parse_place(text)
 
@@ -279,7 +279,7 @@ async def ask(url: str, request: bytes) -> tuple[str, str]:
     return head, body
 
 
-def test_a_scrape() -> None:
+def test_the_metrics_server_answers_a_scrape() -> None:
     async def main() -> None:
         server = MetricsServer(lambda: render(families(seen())))
         url = await server.open("127.0.0.1", 0)

@@ -86,7 +86,7 @@ async def listen(end: CanConnection, heard: list[str]) -> None:
         heard.append(str(await end.recv()))
 
 
-def test_over_tcp() -> None:
+def test_rows_on_the_software_bus_over_tcp() -> None:
     async def main() -> None:
         server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000)
         try:
@@ -100,7 +100,7 @@ def test_over_tcp() -> None:
 
 @pytest.mark.socketcan
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.id)
-def test_on_vcan(row: Row) -> None:
+def test_rows_on_a_kernel_can_interface(row: Row) -> None:
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:

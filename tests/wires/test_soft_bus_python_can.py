@@ -114,7 +114,7 @@ def test_one_record_a_recv_leaves_the_descriptor_readable() -> None:
     run(main())
 
 
-def test_filters() -> None:
+def test_can_filters_select_received_frames() -> None:
     async def main() -> None:
         async with bus(paced=False) as server:
             a = server.attach()

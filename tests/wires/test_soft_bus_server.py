@@ -309,7 +309,7 @@ def test_closing_right_after_sending_loses_nothing(opener) -> None:  # type: ign
 
 
 @pytest.mark.parametrize("opener", [SoftBusConnection.open, open_can_end])
-def test_refusals(opener) -> None:  # type: ignore[no-untyped-def]
+def test_a_refused_node_gets_a_typed_error(opener) -> None:  # type: ignore[no-untyped-def]
     async def main() -> None:
         async with bus(125_000, max_nodes=1) as server:
             with pytest.raises(UsageError, match=r"expected 250000 bit/s; got 125000 bit/s"):

@@ -31,7 +31,7 @@ def texts(events: list[TraceEvent]) -> list[str]:
     return [decoder.decode(e).text for e in events]
 
 
-def test_an_upload() -> None:
+def test_an_upload_is_decoded_with_device_object_and_value() -> None:
     events = [can(1, "605#4018100400000000"), can(4, "585#43181004ED030000")]
     assert texts(events) == ["inclinometer: SDO upload 1018h:04 serial", "inclinometer: 1018h:04 serial = 1005"]
     found = only(events)
@@ -113,7 +113,7 @@ def test_a_too_short_pdo_gives_no_values() -> None:
         ("100#112233445566", "TIME", "TIME 11 22 33 44 55 66", None),
     ],
 )
-def test_messages(frame: str, service: str, text: str, value: object) -> None:
+def test_each_kind_of_message_is_decoded(frame: str, service: str, text: str, value: object) -> None:
     found = only([can(1, frame)])
     assert (found.service, found.text, found.value, found.ok) == (service, text, value, True)
 
@@ -131,7 +131,7 @@ def test_frames_outside_canopen() -> None:
     assert exchanges(observatory(), odd) == []
 
 
-def test_lss() -> None:
+def test_lss_requests_are_decoded_with_their_replies() -> None:
     found = exchanges(
         observatory(),
         [can(0, "7E5#0401000000000000"), can(1, "7E5#1105000000000000"), can(3, "7E4#1100000000000000"),

@@ -161,7 +161,7 @@ def test_a_served_wire_is_requested_by_the_remote_side() -> None:
     assert (done.registers, done.latency_ns, done.device) == ((0x4148, 0), 2, "")
 
 
-def test_ascii() -> None:
+def test_ascii_frames_are_decoded() -> None:
     def frame(body: str) -> bytes:
         raw = bytes.fromhex(body)
         return b":" + (raw + bytes([lrc(raw)])).hex().upper().encode() + b"\r\n"
@@ -195,7 +195,7 @@ def test_the_addresses_of_requests(pdu: str, spans: list[TouchedSpan]) -> None:
     assert (list(asked.spans), asked.problem) == (spans, "")
 
 
-def test_bits() -> None:
+def test_written_bits_are_decoded_in_address_order() -> None:
     wire = ModbusConnectionDecoder("line1", "rtu", {})
     wire.feed(True, with_crc(bytes.fromhex("01 0F 0007 000A 02 CD01")), 0)
     (done,) = wire.feed(False, with_crc(bytes.fromhex("01 0F 0007 000A")), 1)[1]

@@ -242,7 +242,7 @@ def test_signals_come_back_from_csv_as_they_were(tmp_path: Path) -> None:
     assert (tmp_path / "x.jsonl").read_bytes().splitlines()[1:] == source.read_bytes().splitlines()[1:]
 
 
-def test_parquet(tmp_path: Path) -> None:
+def test_exchanges_are_exported_to_parquet(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     export(recording(tmp_path), tmp_path / "r.parquet")
     found = parquet.read_table(tmp_path / "r.parquet").to_pylist()

@@ -51,7 +51,7 @@ def node_of(frames: Log) -> CanopenNode:
     return CanopenNode(dictionary, 5, NodeContext(source=objects, factory=objects.initial, refusals=objects.refusals))
 
 
-def test_it_answers_and_sends_as_recorded() -> None:
+def test_a_node_from_a_log_answers_and_sends_as_recorded() -> None:
     frames = log()
     assert nodes_of(frames) == [5]
     node = node_of(frames)

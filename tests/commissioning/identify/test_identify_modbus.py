@@ -147,7 +147,7 @@ def test_a_chain_of_models_ends(data: bytes, address: int) -> None:
     assert model is None or model[1] + 2 + model[2] <= 0x10000
 
 
-def test_nothing_read_is_nothing_known() -> None:
+def test_without_any_reading_no_profile_is_likely() -> None:
     for profile in SHIPPED:
         if profile.protocol == "modbus":
             assert judge_modbus(profile, ModbusClues(), {}).sureness is Sureness.RULED_OUT

@@ -141,7 +141,7 @@ def test_the_rate_limit_holds() -> None:
     run_virtually(main())
 
 
-def test_a_slow_unit_is_put_down_to_itself() -> None:
+def test_a_late_reply_is_attributed_to_the_slow_unit() -> None:
     async def main() -> None:
         line = UartLine({4: meter()}, latency_s=0.12)
         found = await scan(line, f"{PORT}?baudrate=9600&frame=8N1", units=(3, 4, 5, 6), timeout_s=0.1, listen_s=0)

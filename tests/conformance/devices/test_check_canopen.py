@@ -54,7 +54,7 @@ def not_passed(checked: Checked) -> dict[str, str]:
     return {r.case.id: f"{r.verdict.value}: {r.reason}" for r in checked.results if r.verdict is not Verdict.PASSED}
 
 
-def test_ours_passes_all(eds: Path) -> None:
+def test_our_emulated_node_passes_all_cases(eds: Path) -> None:
     checked = check(ours, eds)
     assert not_passed(checked) == {}
     assert len(checked.results) > 40

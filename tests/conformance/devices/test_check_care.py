@@ -158,7 +158,7 @@ def test_writes_and_disruptions_need_confirmation() -> None:
         ["canopen", "can:socketcan/can0", "--node", "5", "--write", "20"],
     ],
 )
-def test_usage(words: list[str]) -> None:
+def test_invalid_options_are_usage_errors(words: list[str]) -> None:
     assert isinstance(fieldtwin(*words).exception, UsageError)
 
 
@@ -188,7 +188,7 @@ def test_a_dry_run_of_a_node(tmp_path: Path) -> None:
     assert sum(bool(r.spoken) for r in checked.results) > 30
 
 
-def test_lists() -> None:
+def test_cases_are_listed_as_json() -> None:
     listed = json.loads(fieldtwin("modbus", "--list", "--json").output)
     assert {c["impact"] for c in listed} == {"read", "write", "disrupt"}
     assert len(json.loads(fieldtwin("canopen", "--list", "--json").output)) > 40

@@ -29,7 +29,7 @@ def test_consecutive_frames_are_all_found(framing: str, said: list[tuple[int, by
 @pytest.mark.parametrize("framing", FRAMINGS)
 @given(data=st.binary(max_size=400))
 @settings(max_examples=60, deadline=None)
-def test_garbage_stays_garbage(framing: str, data: bytes) -> None:
+def test_garbage_contains_no_replies(framing: str, data: bytes) -> None:
     answers, rest = replies(framing, data)
     again = sum(len(framed(framing, a.unit, a.pdu)) for a in answers)
     assert again + len(rest) == len(data)

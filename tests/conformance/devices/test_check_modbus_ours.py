@@ -33,7 +33,7 @@ def check(url: str, plan: CasePlan = ALL, at: int = 1) -> list[DeviceResult]:
 
 
 @pytest.mark.parametrize("url", WIRES)
-def test_ours_pass_all(url: str) -> None:
+def test_our_emulated_devices_pass_all_cases(url: str) -> None:
     results = check(url)
     for r in results:
         print(r.case.id, r.verdict.value, r.reason)

@@ -82,7 +82,7 @@ def test_a_wrong_answer_fails_the_case_for_it(case_id: str) -> None:
     assert failed(results) == {case_id}
 
 
-def test_a_careless_line() -> None:
+def test_a_careless_device_on_a_line_fails_the_cases() -> None:
     found = failed(check("rtu:/virtual/line?baudrate=19200&frame=8E1", serve=wrong.careless_rtu))
     assert found >= {"MB-001", "MB-004", "MB-008a", "MB-008b", "MB-009", "MB-027", "MB-029", "MB-068", "MB-069"}
 
@@ -92,6 +92,6 @@ def test_a_careless_ascii_line() -> None:
     assert found >= {"MB-026", "MB-027", "MB-029", "MB-070a", "MB-070b", "MB-070c", "MB-070e", "MB-070f"}
 
 
-def test_a_careless_server() -> None:
+def test_a_careless_tcp_server_fails_the_cases() -> None:
     found = failed(check("tcp://127.0.0.1:0", serve=wrong.careless_tcp))
     assert found >= {"MB-051", "MB-052", "MB-053", "MB-054", "MB-055c", "MB-056a", "MB-057a", "MB-057b"}

@@ -18,7 +18,7 @@ def test_the_list_names_rows() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.id)
-def test_localnode(row: Row, caplog: pytest.LogCaptureFixture) -> None:
+def test_localnode_passes_the_row_or_its_deviation_is_listed(row: Row, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.CRITICAL, "canopen")
     found = play_localnode(row)
     if version("canopen") == VERSION:

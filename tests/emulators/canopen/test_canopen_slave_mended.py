@@ -65,7 +65,7 @@ def test_nothing_is_reported_for_a_correct_file() -> None:
         ("cp1252", ["line 2: not UTF-8, taken as Windows-1252"]),
     ],
 )
-def test_encodings(tmp_path: Path, encoding: str, told: list[str]) -> None:
+def test_data_sheets_in_several_encodings_are_read(tmp_path: Path, encoding: str, told: list[str]) -> None:
     path = tmp_path / "x.eds"
     path.write_bytes(("[DeviceInfo]\nVendorName=Müller\n" + LEAST).encode(encoding))
     found = load_eds(path)

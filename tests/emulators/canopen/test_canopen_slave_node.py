@@ -329,7 +329,7 @@ def test_remapping_by_the_book(rig: Rig) -> None:
     assert (reply[:2], more) == ("60", ["185#221100"])
 
 
-def test_communication_parameters(rig: Rig) -> None:
+def test_invalid_communication_parameters_are_refused(rig: Rig) -> None:
     assert rig.write(0x1800, 1, 0x186, 4) == "06090030", "no other identifier while valid"
     assert rig.write(0x1800, 3, 10, 2) == "06090030", "no other inhibit time while valid"
     assert rig.write(0x1800, 2, 241, 1) == "06090030"

@@ -122,7 +122,7 @@ def test_nmt_pdo_and_emcy() -> None:
     assert node.state is NmtState.PRE_OPERATIONAL
 
 
-def test_lss_fastscan() -> None:
+def test_lss_fastscan_finds_the_node_without_an_id() -> None:
     """CO-057: the node without an ID is found and gets one; nodes with an ID do not respond."""
     factory = {(0x1018, sub): part.to_bytes(4, "little") for sub, part in ((1, 1), (2, 2), (3, 4), (4, 0x80000000))}
     nodes = [

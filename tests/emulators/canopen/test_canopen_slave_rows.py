@@ -28,7 +28,7 @@ def test_ids_are_unique() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.id)
-def test_pure(row: Row) -> None:
+def test_row_on_the_node_alone(row: Row) -> None:
     node = row.make()
     said = play(row, node)
     assert [frame.key() for frame in frames(said)] == [frame.key() for frame in frames(row.say)]

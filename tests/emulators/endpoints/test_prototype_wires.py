@@ -104,7 +104,7 @@ def test_two_buses_of_a_plant_that_are_one_interface(tmp_path: Path) -> None:
         load_system(str(tmp_path / "two.yaml"))
 
 
-def test_the_command_line_brings_them_together_no_more_than_the_file(tmp_path: Path) -> None:
+def test_the_command_line_cannot_put_two_buses_on_one_endpoint(tmp_path: Path) -> None:
     system, prototype = written(tmp_path, 5, CAN0=BUS)
     with pytest.raises(UsageError, match="node id 5"):
         prototype.with_listen(system, "can1", Endpoint.parse(BUS))

@@ -107,7 +107,7 @@ def test_commands_while_closed(commands: bytes, answer: bytes) -> None:
     assert Adapter(opened=False).say(commands) == answer
 
 
-def test_received_frames() -> None:
+def test_received_frames_are_sent_to_the_client() -> None:
     adapter = Adapter(opened=False)
     frame = CanFrame(0x185, b"\x01\xab", t_ns=61_234 * 10**6)
     assert adapter.session.received(frame) == b""
@@ -118,7 +118,7 @@ def test_received_frames() -> None:
     assert adapter.session.received(frame) == b"t185201AB04D2\r"  # 1234 ms of the minute
 
 
-def test_status_flags() -> None:
+def test_status_flags_report_overruns_errors_and_states() -> None:
     adapter = Adapter()
     adapter.session.controller(overrun_frame())
     adapter.session.controller(violation_frame("bit", 8, 0))
@@ -145,7 +145,7 @@ def test_a_full_queue_delays_the_command() -> None:
         st.binary(max_size=60) | st.sampled_from([b"t1230\r", b"O\r", b"C\r", b"T12345678812345678\r"]), max_size=20
     )
 )
-def test_whatever_comes_is_answered_line_by_line(chunks: list[bytes]) -> None:
+def test_any_bytes_are_answered_line_by_line(chunks: list[bytes]) -> None:
     adapter = Adapter()
     answers = b"".join(adapter.say(chunk) for chunk in chunks)
     text = b"".join(chunks)

@@ -128,7 +128,7 @@ def test_faults_after_an_mbap_header(name: str, said: dict[str, Any], expected: 
         ("exception", {"code": 2}, ascii_("1183 02")),
     ],
 )
-def test_in_ascii(name: str, said: dict[str, Any], expected: bytes) -> None:
+def test_effect_of_each_fault_on_an_ascii_frame(name: str, said: dict[str, Any], expected: bytes) -> None:
     assert pieces(struck(name, IN_ASCII, Framing.ASCII, **said)) == [(expected, 0.0)]
 
 
@@ -269,13 +269,13 @@ def test_faults_of_the_wire_itself() -> None:
         ("set", {"value": 1.25}, 1.25),
     ],
 )
-def test_of_a_value(name: str, said: dict[str, Any], expected: float) -> None:
+def test_effect_of_each_fault_on_a_value(name: str, said: dict[str, Any], expected: float) -> None:
     fault = made(name, **said)
     assert isinstance(fault, ValueFault)
     assert fault.distort(10.0, 2.0, 3.0, Random(1)) == expected
 
 
-def test_no_number() -> None:
+def test_the_nan_fault_gives_nan() -> None:
     assert math.isnan(made("nan").distort(10.0, 2.0, 3.0, Random(1)))
 
 

@@ -11,7 +11,7 @@ from fieldtwin.emulators.faults.schema import load_faults
 DOCS = Path(__file__).parents[3] / "docs"
 
 
-def test_its_file_is_a_fault_file(tmp_path: Path) -> None:
+def test_the_file_on_the_page_is_a_fault_file(tmp_path: Path) -> None:
     blocks = re.findall(r"```yaml\n(.*?)```", (DOCS / "how-to" / "faults.md").read_text(), re.S)
     assert blocks
     for block in blocks:

@@ -54,7 +54,7 @@ def test_an_error_in_a_fault_file_is_reported_at_its_position(tmp_path: Path, te
     assert str(path) in str(raised.value)
 
 
-def test_a_good_file(tmp_path: Path) -> None:
+def test_a_valid_fault_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "faults.yaml"
     path.write_text(
         "faults:\n  - {name: drop, device: ctd, from: 250ms, until: 2min}\n  - {id: mine, name: delay, by_ms: 5}\n"
@@ -65,7 +65,7 @@ def test_a_good_file(tmp_path: Path) -> None:
     assert second == {"id": "mine", "name": "delay", "by_ms": 5}
 
 
-def test_times() -> None:
+def test_times_with_units_are_read_as_seconds() -> None:
     assert [seconds(t) for t in ("5s", "250ms", "2min", "24h", "7", 1.5)] == [5.0, 0.25, 120.0, 86_400.0, 7.0, 1.5]
 
 
@@ -85,7 +85,7 @@ def test_a_link_knows_neither_names_nor_values(said: dict[str, str], told: str) 
         wire_faults([said], Framing.RTU, 1, 0)
 
 
-def test_every_fault_can_be_put_in_with_its_name_alone() -> None:
+def test_every_fault_can_be_injected_with_its_name_alone() -> None:
     for name, kind in FAULTS.items():
         fault = parse_fault({"name": name}).make()
         assert isinstance(fault, kind)
@@ -94,7 +94,7 @@ def test_every_fault_can_be_put_in_with_its_name_alone() -> None:
             assert not parameter.is_required(), name
 
 
-def test_they_are_listed() -> None:
+def test_the_command_lists_every_fault() -> None:
     told = CliRunner().invoke(command, ["--json"])
     listed = json.loads(told.stdout)
     assert [one["name"] for one in listed] == list(FAULTS)

@@ -246,7 +246,7 @@ def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() 
     run(main())
 
 
-def test_datagrams() -> None:
+def test_faults_change_datagrams() -> None:
     async def main() -> None:
         faults = at_once(
             {"name": "drop", "direction": "request", "nth": 1},

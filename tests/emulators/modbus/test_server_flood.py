@@ -69,7 +69,7 @@ def garbage(kind: str) -> Iterator[bytes]:
 @pytest.mark.timeout(60 + MEGABYTES)
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "colons", "halves"])
 @pytest.mark.parametrize("kind", ["rtu", "ascii", "strict"])
-def test_a_line(kind: str, flood: str) -> None:
+def test_a_line_server_survives_garbage_in_bounded_memory(kind: str, flood: str) -> None:
     server, request = make_line(kind)
     now_ns, heard = NS_PER_S, 0
     with bounded_memory():
@@ -107,7 +107,7 @@ def test_a_request_in_the_middle_of_a_flood_is_found() -> None:
 
 @pytest.mark.timeout(60 + MEGABYTES)
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "protocol 1"])
-def test_a_stream(flood: str) -> None:
+def test_a_tcp_server_survives_garbage_in_bounded_memory(flood: str) -> None:
     """Zeros are ADUs of length 0, each dropped separately; the others are invalid at once."""
     server = MbapServer(make_units())
     heard = bytes.fromhex("0001 0001 0006 01 03 0000 0001") * (CHUNK // 12)

@@ -29,7 +29,7 @@ def ask(unit: ModbusUnit, request: str, now_ns: int = 0) -> str | None:
 # -- 07, 0B, 0C ---------------------------------------------------------------------------------------------------
 
 
-def test_exception_status() -> None:
+def test_function_07_returns_the_exception_status() -> None:
     unit = make_unit()
     assert ask(unit, "07") == "07 00"
     unit.diagnostics.status = 0x6D
@@ -115,7 +115,7 @@ def test_diagnostic_register_and_overruns_are_cleared_apart() -> None:
     assert ask(unit, "08 0002 0000") == "08 00 02 00 00"
 
 
-def test_run_indicator() -> None:
+def test_function_11h_returns_the_run_indicator() -> None:
     unit = make_unit()
     assert ask(unit, "11") == "11 03 66 74 FF"
     unit.running = False
@@ -165,7 +165,7 @@ def make_files() -> FileRecords:
         pytest.param("15 12 06 0003 0000 0001 0005 06 0007 0000 0001 0001", "95 02", id="second group refused"),
     ],
 )
-def test_file_records(request_hex: str, expected: str) -> None:
+def test_file_records_are_read_and_written(request_hex: str, expected: str) -> None:
     files = make_files()
     before = {f: files.peek(f, 0, n) for f, n in ((3, 20), (4, 300), (5, 10))}
     assert ask(make_unit(files=files), request_hex) == expected
@@ -175,7 +175,7 @@ def test_file_records(request_hex: str, expected: str) -> None:
         assert files.peek(4, 7, 3) == [0x06AF, 0x04BE, 0x100D]
 
 
-def test_files_that_cannot_be() -> None:
+def test_impossible_files_are_refused() -> None:
     for sizes in ({0: 1}, {0x10000: 1}, {1: 0}, {1: 10_001}):
         with pytest.raises(UsageError, match="file"):
             FileRecords(sizes)
@@ -273,7 +273,7 @@ def test_mb_045_more_follows() -> None:
     assert frames == 3
 
 
-def test_identification_that_cannot_be() -> None:
+def test_impossible_identifications_are_refused() -> None:
     with pytest.raises(UsageError, match="none numbered 2"):
         Identification({0: b"", 1: b""})
     for number, value in ((256, b""), (3, bytes(MAX_OBJECT + 1))):

@@ -81,7 +81,7 @@ def test_mb_053_more_at_once_than_allowed() -> None:
 
 
 @pytest.mark.parametrize("length", [0xFFFF, 255, 0x8000])
-def test_mb_055_a_length_that_cannot_be(length: int) -> None:
+def test_mb_055_an_impossible_length_gives_the_stream_up(length: int) -> None:
     server = make_server()
     assert server.feed(OURS + adu(7, 1, READ, length=length) + OURS, 0) == [ANSWER]
     assert server.desync is not None

@@ -117,7 +117,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("request_hex", "expected"), ROWS)
-def test_answer(request_hex: str, expected: str | None) -> None:
+def test_each_request_gets_the_expected_answer(request_hex: str, expected: str | None) -> None:
     bank = make_bank()
     unit = ModbusUnit(bank, server_id=b"ft 1")
     before = snapshot(bank)
@@ -132,7 +132,7 @@ def snapshot(bank: MapBank) -> dict[object, int]:
     return {(table, a): value for table, cells in bank._cells.items() for a, value in cells.items()}
 
 
-def test_writes_arrive() -> None:
+def test_written_values_are_in_the_bank() -> None:
     bank = make_bank()
     unit = ModbusUnit(bank)
     ask(unit, "05 00 1E FF 00")

@@ -127,7 +127,7 @@ class Rig:
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=ids)
-def test_whole(vector: dict[str, Any]) -> None:
+def test_vector_in_one_piece(vector: dict[str, Any]) -> None:
     rig = Rig(vector)
     now_ns = rig.play(piece=1000)
     rig.check_cells()
@@ -137,7 +137,7 @@ def test_whole(vector: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("piece", [1, 3])
 @pytest.mark.parametrize("vector", [v for v in VECTORS if not v.get("whole_only")], ids=ids)
-def test_byte_by_byte(vector: dict[str, Any], piece: int) -> None:
+def test_vector_byte_by_byte(vector: dict[str, Any], piece: int) -> None:
     rig = Rig(vector)
     now_ns = rig.play(piece)
     rig.check_cells()
@@ -158,7 +158,7 @@ TAILS = {
     [v for v in VECTORS if v.get("tail", True) and v.get("wire") != "mbap"],
     ids=ids,
 )
-def test_with_trailing_garbage(vector: dict[str, Any], number: int) -> None:
+def test_vector_followed_by_garbage(vector: dict[str, Any], number: int) -> None:
     tails = TAILS[vector.get("wire", "rtu")]
     rig = Rig(vector)
     now_ns = rig.play(1000, tails[number % len(tails)])
@@ -167,7 +167,7 @@ def test_with_trailing_garbage(vector: dict[str, Any], number: int) -> None:
 
 
 @pytest.mark.parametrize("vector", [v for v in VECTORS if v.get("wire") == "mbap" and not v.get("closed")], ids=ids)
-def test_with_half_an_adu_after_it(vector: dict[str, Any]) -> None:
+def test_vector_followed_by_half_an_adu(vector: dict[str, Any]) -> None:
     """In a TCP stream garbage cannot be distinguished; the following bytes are the next request, delivered completely later."""
     following = bytes.fromhex("0099 0000 0006 01 01 0000 0001")
     for cut in range(1, len(following)):

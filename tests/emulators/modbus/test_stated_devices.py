@@ -175,7 +175,7 @@ def test_busy_as_stated(tmp_path: Path, recorded: bool) -> None:
     assert ask(unit, "08 0011 0000", 106) == "0800110003", "diagnostics still work"
 
 
-def test_values_that_cannot_be(tmp_path: Path) -> None:
+def test_impossible_values_are_refused(tmp_path: Path) -> None:
     profile = profile_of(tmp_path)
     for values, told in (
         ({"depth": 1}, "no tag 'depth'"),
@@ -200,7 +200,7 @@ def test_values_that_cannot_be(tmp_path: Path) -> None:
         ("files: {4: 20}", "files: {4: 20000}", "10000"),
     ],
 )
-def test_statements_that_cannot_be(tmp_path: Path, before: str, after: str, told: str) -> None:
+def test_impossible_statements_of_a_profile_are_refused(tmp_path: Path, before: str, after: str, told: str) -> None:
     assert before in PROFILE
     with pytest.raises(FileInvalid) as refused:
         profile_of(tmp_path, PROFILE.replace(before, after))
@@ -281,7 +281,7 @@ def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
         ("model: profile", "recording: tank.jsonl", "`model: profile`"),
     ],
 )
-def test_prototypes_that_cannot_be(tmp_path: Path, before: str, after: str, told: str) -> None:
+def test_impossible_prototype_files_are_refused(tmp_path: Path, before: str, after: str, told: str) -> None:
     (tmp_path / "tank.jsonl").write_text("")
     assert told in why_not(system(tmp_path, PROTOTYPE.replace(before, after)))
 

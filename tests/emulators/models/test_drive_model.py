@@ -147,7 +147,7 @@ def test_every_command_in_every_state(state: DriveState, word: int) -> None:
     assert rig.drive.transitions[before:] == numbers
 
 
-def test_the_arrows_by_itself_and_how_long_they_take() -> None:
+def test_automatic_transitions_and_their_duration() -> None:
     rig = Rig(ready=False)
     assert rig.state() is S.NOT_READY
     rig.command(SHUTDOWN)
@@ -367,7 +367,7 @@ def test_a_mode_that_the_drive_has_not_is_refused_by_sdo_and_ignored_by_pdo() ->
     assert rig.read(0x6061) == 3
 
 
-def test_by_pdo_alone() -> None:
+def test_a_drive_is_controlled_by_pdos_alone() -> None:
     """RPDO4 with controlword and target velocity; TPDO4 answers each change of the statusword by itself."""
     rig = Rig()
     rig.write(0x6060, 3)
@@ -436,7 +436,7 @@ def test_the_table_has_every_number_once_a_pair_and_no_other_way_out_of_a_fault(
      (0x07, TransitionCause.SWITCH_ON), (0x0F, TransitionCause.ENABLE_OPERATION),
      (0x80, TransitionCause.FAULT_RESET), (0x8F, TransitionCause.FAULT_RESET)],
 )  # fmt: skip
-def test_command_coding(word: int, cause: TransitionCause) -> None:
+def test_controlwords_are_decoded_to_commands(word: int, cause: TransitionCause) -> None:
     assert command_of(word, 0) is cause
     assert command_of(word | 0x80, 0x80) is None
 

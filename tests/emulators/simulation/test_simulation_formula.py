@@ -35,7 +35,7 @@ def value(text: str, t: float = 0.0, **names: float) -> float:
         ("x + 500 ms + 2 min", 123.5),
     ],
 )
-def test_arithmetic(text: str, expected: float) -> None:
+def test_arithmetic_of_formulas(text: str, expected: float) -> None:
     assert value(text, x=3.0) == pytest.approx(expected)
 
 

@@ -42,7 +42,7 @@ Happens = Callable[[BusRunner, AttachedConnection], Awaitable[None]]
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row["id"])
 @pytest.mark.parametrize("look_bits", [None, 7], ids=["at the end", "often"])
-def test_row(row: dict[str, Any], look_bits: int | None) -> None:
+def test_row_of_the_edge_cases_of_a_can_bus(row: dict[str, Any], look_bits: int | None) -> None:
     assert row.keys() <= KEYS
     bus = CanBus(125_000, monitored=not row.get("strict"), queue_frames=row.get("queue", 64))
     node = {name: bus.join(0, name) for name in row["nodes"]}

@@ -88,7 +88,7 @@ def test_no_run_of_six_on_the_wire() -> None:
         assert not re.search("0{6}|1{6}", stuff(plain_bits(CanFrame(0x7F, data))))
 
 
-def test_arbitration_order() -> None:
+def test_the_frame_with_the_lower_arbitration_field_wins() -> None:
     in_order = [
         CanFrame(0x001, b"\xff"),
         CanFrame(0x002),

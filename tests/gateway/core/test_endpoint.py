@@ -87,7 +87,7 @@ def test_any_text_is_an_endpoint_or_a_usage_error(text: str) -> None:
         ("can:socketcan/can0", Endpoint("can", interface="socketcan", path="can0")),
     ],
 )
-def test_short_forms(url: str, expected: Endpoint) -> None:
+def test_short_forms_of_endpoints_are_read(url: str, expected: Endpoint) -> None:
     assert Endpoint.parse(url) == expected
 
 

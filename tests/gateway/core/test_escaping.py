@@ -25,5 +25,5 @@ def test_invisible_characters_are_escaped(text: str, shown: str) -> None:
 
 
 @given(text=st.text())
-def test_whatever_comes_can_be_seen(text: str) -> None:
+def test_any_text_becomes_visible(text: str) -> None:
     assert all(c.isprintable() or c in "\n\t" for c in escape_controls(text))

@@ -61,7 +61,9 @@ def test_raw_and_value(form: str, raw: str, value: object) -> None:
         ("type: int16, range: [0, 100]", "0065", Quality.UNCERTAIN, Reason.OUT_OF_RANGE),
     ],
 )
-def test_invalid_values(form: str, raw: str, quality: Quality, reason: Reason) -> None:
+def test_invalid_register_contents_give_a_bad_or_uncertain_value(
+    form: str, raw: str, quality: Quality, reason: Reason
+) -> None:
     got = decode(tag(form), bytes.fromhex(raw), 7)
     assert (got.quality, got.reason) == (quality, reason)
     assert quality is not Quality.BAD or got.value is None
@@ -111,7 +113,7 @@ def test_encoded_bcd_decodes_to_the_same_value(number: int, order: str) -> None:
         ("type: uint16, access: rw, bits: [0, 3]", 1),
     ],
 )
-def test_unwritable_values(form: str, value: float) -> None:
+def test_values_that_a_type_cannot_hold_are_not_written(form: str, value: float) -> None:
     with pytest.raises(NotAllowed):
         encode(tag(form), value)
 

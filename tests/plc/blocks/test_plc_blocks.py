@@ -44,7 +44,9 @@ TP_TABLE = [(0, 0, 0, 0), (10, 1, 1, 0), (20, 0, 1, 10), (25, 1, 1, 15), (30, 1,
 
 
 @pytest.mark.parametrize(("block", "table"), [(TON, TON_TABLE), (TOF, TOF_TABLE), (TP, TP_TABLE)])
-def test_timing_diagram(block: type[TON] | type[TOF] | type[TP], table: list[tuple[int, int, int, int]]) -> None:
+def test_timers_follow_the_timing_diagrams_of_the_standard(
+    block: type[TON] | type[TOF] | type[TP], table: list[tuple[int, int, int, int]]
+) -> None:
     timer = block()
     for t_ms, level, q, et_ms in table:
         timer(t_ms * MS, IN=bool(level), PT=20 * MS)
@@ -107,7 +109,7 @@ def test_a_preset_below_zero_is_zero() -> None:
 
 
 @given(BITS)
-def test_edges(levels: list[bool]) -> None:
+def test_edge_blocks_detect_rising_and_falling_edges(levels: list[bool]) -> None:
     rise, fall = R_TRIG(), F_TRIG()
     for before, level in zip([False, *levels], levels, strict=False):
         assert rise(0, CLK=level).Q == (level and not before)

@@ -86,7 +86,7 @@ def test_every_tag_has_the_details_for_an_engineer(tmp_path: Path) -> None:
         rig.view.describe(["tank.*"], 0, 0)
 
 
-def test_patterns() -> None:
+def test_patterns_select_tags() -> None:
     for pattern in ("pump.speed", "pump.*", "*.speed", "pump", "*"):
         assert matches("pump.speed", pattern)
     for pattern in ("pum", "speed", "pump.spee", "Pump"):

@@ -75,7 +75,7 @@ def or_none(result: str, expression: str, *given_values: tuple[str, Any]) -> Any
 
 @CASES
 @given(st.data(), st.sampled_from(sorted(WIDTH)), st.sampled_from(["+", "-", "*", "/", "MOD"]))
-def test_integers(data: st.DataObject, kind: str, op: str) -> None:
+def test_integer_arithmetic_wraps_around(data: st.DataObject, kind: str, op: str) -> None:
     a, b = data.draw(of(kind)), data.draw(of(kind))
     if op == "/":
         exact: Any = NO_RESULT if b == 0 else int(Decimal(a) / Decimal(b)) if abs(a) < 2**40 else _quotient(a, b)
@@ -121,7 +121,7 @@ def test_shifts_and_rotations(data: st.DataObject, kind: str, name: str) -> None
 
 @CASES
 @given(st.data(), st.sampled_from(sorted(BITS)), st.sampled_from(["AND", "OR", "XOR"]))
-def test_bitwise(data: st.DataObject, kind: str, op: str) -> None:
+def test_bitwise_operators(data: st.DataObject, kind: str, op: str) -> None:
     a, b = data.draw(of(kind)), data.draw(of(kind))
     table = {"AND": {"11"}, "OR": {"01", "10", "11"}, "XOR": {"01", "10"}}[op]
     bits = BITS[kind]
@@ -267,7 +267,7 @@ def test_a_time_of_day_wraps_at_midnight(tod: int, duration: int) -> None:
             assert worked_out("TOD", expression, ("TOD", tod), ("TIME", duration)) == exact % DAY
 
 
-def test_midnight() -> None:
+def test_time_of_day_wraps_at_midnight() -> None:
     assert value("TOD", "TOD#23:00:00 + T#2h") == 3600 * 10**9
     assert value("TOD", "TOD#01:00:00 - T#2h") == 23 * 3600 * 10**9
     assert value("STRING", "TOD_TO_STRING(TOD#23:59:59 + T#1s)") == "TOD#00:00:00"
@@ -276,7 +276,7 @@ def test_midnight() -> None:
 
 @CASES
 @given(st.integers(-(10**12), 10**12), st.integers(-(10**12), 10**12), st.integers(-1000, 1000))
-def test_durations(a: int, b: int, n: int) -> None:
+def test_arithmetic_of_durations(a: int, b: int, n: int) -> None:
     given_values = ("TIME", a), ("TIME", b), ("INT", n)
     assert worked_out("TIME", "x0 + x1", *given_values) == a + b
     assert worked_out("TIME", "SUB_TIME(IN2 := x1, IN1 := x0)", *given_values) == a - b
@@ -292,7 +292,7 @@ def test_durations(a: int, b: int, n: int) -> None:
     st.floats(width=32, allow_nan=False, allow_infinity=False),
     st.floats(width=32, allow_nan=False, allow_infinity=False),
 )
-def test_real_arithmetic(a: float, b: float) -> None:
+def test_real_arithmetic_rounds_to_32_bits(a: float, b: float) -> None:
     def narrow(x: float) -> float:
         try:
             return float(struct.unpack("<f", struct.pack("<f", x))[0])

@@ -108,7 +108,7 @@ INTEGERS = {"SINT": 8, "INT": 16, "DINT": 32, "LINT": 64}
         ("INT", "TO_INT(7.6)", 8),
     ],
 )
-def test_value(kind: str, expression: str, expected: object) -> None:
+def test_value_of_an_expression(kind: str, expression: str, expected: object) -> None:
     got = value(kind, expression)
     assert got == expected
     assert type(got) is type(expected)

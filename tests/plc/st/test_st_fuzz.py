@@ -79,14 +79,14 @@ def test_the_pieces_run_as_they_are() -> None:
 
 @given(st.lists(st.sampled_from(TOKENS), max_size=40))
 @quick
-def test_random_tokens(tokens: list[str]) -> None:
+def test_random_tokens_give_only_typed_errors(tokens: list[str]) -> None:
     survives("PROGRAM p VAR i : INT; END_VAR " + " ".join(tokens) + " END_PROGRAM", scans=0)
     survives(" ".join(tokens), scans=0)
 
 
 @given(st.randoms(use_true_random=False), st.sampled_from((PIECES, RELAY)))
 @quick
-def test_mutated_programs(chance: random.Random, text: str) -> None:
+def test_mutated_programs_give_only_typed_errors(chance: random.Random, text: str) -> None:
     words = text.split(" ")
     for _ in range(chance.randint(1, 3)):
         at = chance.randrange(len(words))
@@ -107,7 +107,7 @@ def test_mutated_programs(chance: random.Random, text: str) -> None:
 @example("\ufeffPROGRAM p END_PROGRAM")
 @example("PROGRAM p\r\nEND_PROGRAM\r")
 @quick
-def test_any_text(text: str) -> None:
+def test_any_text_gives_only_typed_errors(text: str) -> None:
     survives(text)
 
 

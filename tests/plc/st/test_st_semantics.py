@@ -74,7 +74,7 @@ def test_calls_with_outputs_in_conditions_are_made_at_each_evaluation() -> None:
     assert (got["n"], got["s"], got["m"], got["e"], got["k"], got["c"]) == (4, 60, 2, 2, 3, 3)
 
 
-def test_leaving_loops() -> None:
+def test_exit_and_return_leave_loops() -> None:
     before = """FUNCTION first : INT VAR_INPUT m : INT; END_VAR VAR i, j : INT; END_VAR
       FOR i := 1 TO 9 DO FOR j := 1 TO 9 DO IF i * j = m THEN first := 10 * i + j; RETURN; END_IF;
         IF j > i THEN EXIT; END_IF; END_FOR; END_FOR; first := -1; END_FUNCTION"""

@@ -132,7 +132,7 @@ def test_a_simulation_continues_from_its_values() -> None:
     assert outcome.variables["localiser.x"].lowest >= 5.0
 
 
-def test_impossible_plans() -> None:
+def test_impossible_plans_are_refused() -> None:
     with pytest.raises(UsageError, match="the horizon"):
         answer(Fork("observatory", DEEP, 0.0), WhatIfPlan("x"))
     with pytest.raises(UsageError, match="no tag or variable"):

@@ -64,7 +64,7 @@ def look(function: str, name: str) -> Any:
         ("max(ctd.status, 9) == 9 or sqrt(-1) == 1 or min(relay.state, 1) == 1", None),
     ],
 )
-def test_values(text: str, value: bool | None) -> None:
+def test_values_of_scenario_expressions(text: str, value: bool | None) -> None:
     assert Expression(text, KNOWN).evaluate(look) is value
 
 

@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     assert first["exchanges"]["line1"]["gateway"] == first["exchanges"]["line1"]["emulators"]
 
 
-def test_many_seeds() -> None:
+def test_several_seeds_run_in_several_processes() -> None:
     ended = fieldtwin(*SHORT, "--seeds", "1..3", "--jobs", "2")
     told = json.loads(ended.stdout)
     assert [r["seed"] for r in told["results"]] == [1, 2, 3]

@@ -151,7 +151,7 @@ def shaken(folder: Path, framing: str, target: int) -> Iterator[int]:
         yield port
 
 
-def test_over_tcp(tmp_path: Path) -> None:
+def test_a_digital_thread_over_tcp_survives_kills_and_losses(tmp_path: Path) -> None:
     port = free_port()
     with shaken(tmp_path, "thread", port) as far:
         chaos = Chaos(tmp_path, 1, ("--thread", f"tcp://127.0.0.1:{port}"), f"tcp://127.0.0.1:{far}")
@@ -159,7 +159,7 @@ def test_over_tcp(tmp_path: Path) -> None:
     chaos.judge()
 
 
-def test_over_mqtt(tmp_path: Path) -> None:
+def test_a_digital_thread_over_mqtt_survives_kills_and_losses(tmp_path: Path) -> None:
     with broker(tmp_path) as here, shaken(tmp_path, "mqtt", here.port) as far:
         chaos = Chaos(
             tmp_path, 2, ("--thread", f"mqtt://127.0.0.1:{here.port}/sea/obs"), f"mqtt://127.0.0.1:{far}/sea/obs"

@@ -102,7 +102,7 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         ("remote: remote", "remote: remote\ncommands: {per_minute: 6}", "commands.per_minute: 60 -> 6"),
     ],
 )
-def test_reloadable_changes(plant: Path, old: str, new: str, says: str | None) -> None:
+def test_each_change_is_reloadable_or_needs_a_restart(plant: Path, old: str, new: str, says: str | None) -> None:
     before = load_system(str(plant))
     edit(plant, (old, new))
     if says is None:

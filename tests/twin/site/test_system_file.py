@@ -99,7 +99,7 @@ def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "..", "-x", "a" * 41, "a b", "ä"])
-def test_invalid_names(name: str, tmp_path: Path) -> None:
+def test_invalid_instance_names_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="instance name"):
         Instance(name, tmp_path)
 

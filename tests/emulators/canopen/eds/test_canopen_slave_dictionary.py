@@ -20,7 +20,7 @@ SHARED = ROOT.parent / "shared" / "data" / "eds"
 """Real data sheets next to the checkout; tests that need them are skipped without them."""
 
 
-def test_the_inclinometer() -> None:
+def test_the_data_sheet_of_the_inclinometer_is_read() -> None:
     dictionary = load_eds(INCLINOMETER)
     data = NodeData(dictionary, 5)
     assert data.number(0x1000) == 2 << 16 | 410

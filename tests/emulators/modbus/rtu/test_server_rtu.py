@@ -119,7 +119,7 @@ ROWS = [
 
 @pytest.mark.parametrize(("heard", "expected"), ROWS)
 @pytest.mark.parametrize("way", ["whole", "bytewise"])
-def test_line(heard: bytes, expected: list[bytes], way: str) -> None:
+def test_bytes_on_a_line_give_the_expected_replies(heard: bytes, expected: list[bytes], way: str) -> None:
     line = Line(make_server())
     getattr(line, way)(heard)
     assert line.replies == expected

@@ -49,7 +49,7 @@ def test_addresses_as_printed_and_as_sent(text: int | str, expected: RegisterRan
 @pytest.mark.parametrize(
     "text", [20001, 50001, 40000, 465537, "holding:65536", "holding:-1", "register:5", "five", 7, "holding:x", ""]
 )
-def test_invalid_addresses(text: int | str) -> None:
+def test_invalid_addresses_are_refused(text: int | str) -> None:
     with pytest.raises(ValueError):
         resolve_address(text, "printed")
 

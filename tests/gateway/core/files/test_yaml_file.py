@@ -35,7 +35,7 @@ class Outer(BaseModel):
         ("", None), ("'5'", "5"), (".inf", ".inf"), ("=", "="),
     ],
 )  # fmt: skip
-def test_scalars(scalar: str, value: object) -> None:
+def test_scalars_follow_the_core_schema_of_yaml(scalar: str, value: object) -> None:
     read = parse(f"x: {scalar}\n", "f").data["x"]
     assert read == value
     assert type(read) is type(value)

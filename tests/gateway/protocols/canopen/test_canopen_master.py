@@ -63,7 +63,7 @@ async def serve(end: MemoryEnd, values: dict[bytes, bytes]) -> None:
         (NmtCommand.RESET_COMMUNICATION, 1, "000#8201"),
     ],
 )
-def test_nmt_commands(command: NmtCommand, node: int, expected: str) -> None:
+def test_nmt_commands_are_sent_as_frames(command: NmtCommand, node: int, expected: str) -> None:
     async def main() -> None:
         bench = Bench()
         await bench.master.nmt(command, node)

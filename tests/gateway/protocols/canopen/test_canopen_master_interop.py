@@ -146,7 +146,7 @@ def _named(text: str) -> io.StringIO:
     return source
 
 
-def test_objects_come_and_go_expedited_and_segmented() -> None:
+def test_objects_are_read_and_written_expedited_and_segmented() -> None:
     async def main() -> None:
         async with pair() as p:
             assert await p.master.sdo_upload(NODE, 0x1000, 0) == bytes.fromhex("9A010200")
@@ -177,7 +177,7 @@ def test_a_node_that_knows_no_block_transfer_is_asked_without() -> None:
     run(main())
 
 
-def test_its_boot_is_that_of_a_node_without_a_date() -> None:
+def test_localnode_boots_like_a_node_without_a_configuration_date() -> None:
     async def main() -> None:
         async with pair() as p:
             expected = ExpectedIdentity(device_type=0x2019A, vendor=1, serial=4)

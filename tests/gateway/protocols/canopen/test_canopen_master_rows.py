@@ -231,7 +231,7 @@ class Play:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row['case']} {row['title']}")
-def test_row(row: dict[str, Any]) -> None:
+def test_row_of_the_edge_cases_of_a_master(row: dict[str, Any]) -> None:
     async def main() -> None:
         await Play(row).all()
 

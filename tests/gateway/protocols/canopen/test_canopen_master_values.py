@@ -114,7 +114,7 @@ def test_co043_too_short_is_not_used_too_long_gives_its_first_bytes() -> None:
         SLOPES.unpack(bytes.fromhex("0100020003"), exact=True)
 
 
-def test_a_mapping_that_cannot_be() -> None:
+def test_an_impossible_mapping_is_refused() -> None:
     with pytest.raises(UsageError):
         PdoMapping.of([(0x6010, 0, 32), (0x6020, 0, 40)])
     with pytest.raises(UsageError):

@@ -157,7 +157,7 @@ class Play:
 
 @pytest.mark.parametrize("how", ["whole", "bytewise", "garbage"])
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row['case']} {row['title']}")
-def test_row(row: dict[str, Any], how: str) -> None:
+def test_row_of_the_edge_cases_of_a_client(row: dict[str, Any], how: str) -> None:
     async def main() -> None:
         await Play(row, how).all()
 

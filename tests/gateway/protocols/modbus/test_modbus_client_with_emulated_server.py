@@ -263,7 +263,7 @@ def test_both_servers_check_a_request_identically(pdu: bytes) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_rig_itself_is_sound(kind: str) -> None:
+def test_client_and_server_agree_without_damage(kind: str) -> None:
     """Premises of the properties: an undamaged exchange is correct, and a wrong value would be detected."""
     rig = Rig(kind)
     request = ReadRegisters("holding", 5, 3)

@@ -81,7 +81,7 @@ def test_each_row_of_bytes_runs_in_three_ways() -> None:
     assert {int(case[3:]) for case, played in garbage.items() if not played} == {*NO_GARBAGE, 68}
 
 
-def test_mutations_name_rows_that_there_are() -> None:
+def test_mutations_name_existing_rows() -> None:
     """A renamed row would leave its mutation without a test."""
     ways = ("whole", "bytewise", "garbage")
     there = {

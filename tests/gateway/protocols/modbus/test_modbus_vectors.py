@@ -101,13 +101,13 @@ def check(vector: dict[str, Any], chunks: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=ids)
-def test_whole(vector: dict[str, Any]) -> None:
+def test_vector_in_one_piece(vector: dict[str, Any]) -> None:
     received = bytes.fromhex(vector["received"])
     check(vector, [received] if received else [])
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=ids)
-def test_byte_by_byte(vector: dict[str, Any]) -> None:
+def test_vector_byte_by_byte(vector: dict[str, Any]) -> None:
     check(vector, [bytes([b]) for b in bytes.fromhex(vector["received"])])
 
 
@@ -115,7 +115,7 @@ def test_byte_by_byte(vector: dict[str, Any]) -> None:
     "tail", [b"\x00\x00\x00", b"\xff\x55", b"\x11\x03\x02\x00\x07"], ids=["zeros", "noise", "half"]
 )
 @pytest.mark.parametrize("vector", [v for v in VECTORS if v.get("tail", True)], ids=ids)
-def test_with_trailing_garbage(vector: dict[str, Any], tail: bytes) -> None:
+def test_vector_followed_by_garbage(vector: dict[str, Any], tail: bytes) -> None:
     check(vector, [bytes.fromhex(vector["received"]) + tail])
 
 

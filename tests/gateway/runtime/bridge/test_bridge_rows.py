@@ -153,7 +153,7 @@ class Play:
 
 @pytest.mark.parametrize("how", ["whole", "bytewise", "garbage"])
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row['case']} {row['title']}")
-def test_row(row: dict[str, Any], how: str, tmp_path: Path) -> None:
+def test_row_of_the_edge_cases_of_a_bridge(row: dict[str, Any], how: str, tmp_path: Path) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)

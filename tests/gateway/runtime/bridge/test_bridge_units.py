@@ -27,7 +27,7 @@ def test_a_client_reads_units_of_the_line(tmp_path: Path) -> None:
     run(main())
 
 
-def test_mb_058_no_route(tmp_path: Path) -> None:
+def test_mb_058_a_unit_without_a_route_gets_exception_0a(tmp_path: Path) -> None:
     async def main() -> None:
         config = BridgeConfig("b", ANY_PORT, routes={11: Route("line", 1), 255: Route("line", 2)})
         async with rig(tmp_path, config) as r, r.client() as client:

@@ -65,7 +65,7 @@ def play(device: Device, seconds: float) -> None:
     run_virtually(main())
 
 
-def test_its_pause_doubles_once_for_all_its_groups() -> None:
+def test_the_pause_of_a_busy_device_doubles_once_for_all_its_groups() -> None:
     device = Device(lambda now_s, register: BUSY_FROM_S <= now_s < READY_S)
     play(device, 15)
     pauses = [0.25 * 2**n for n in range(4)]  # from 2 s on: until 2.25, 2.75, 3.75 and 5.75 s

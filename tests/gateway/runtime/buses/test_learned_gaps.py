@@ -136,7 +136,7 @@ def test_a_damaged_file_counts_as_missing(site: Site) -> None:
 
 
 @given(data=st.binary(max_size=300))
-def test_no_file_does_any_harm(data: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_any_content_of_the_file_is_tolerated(data: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.getbasetemp() / "learnt_fuzz.json"
     path.write_bytes(data)
     driver = SensorDriver(DeviceConfig("meter", profile(TAGS), "line", 1), TagTable(WallClock()))

@@ -45,7 +45,7 @@ def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
     loop.close()
 
 
-def test_nor_is_the_far_ends(tmp_path: Path) -> None:
+def test_the_mailbox_of_the_remote_end_is_not_checked_too_often_either(tmp_path: Path) -> None:
     loop = VirtualLoop()
 
     async def main() -> None:

@@ -491,7 +491,9 @@ def _rpdo(number: int, *objects: tuple[int, int, int], enabled: bool = True) -> 
         ([_rpdo(1, (0x6040, 0, 16), (0x6040, 0, 16))], WRITABLE, []),
     ],
 )
-def test_which_rpdos_may_be_sent(held: list[PdoConfig], writable: set[str], expected: list[int]) -> None:
+def test_only_rpdos_with_writable_objects_are_sent(
+    held: list[PdoConfig], writable: set[str], expected: list[int]
+) -> None:
     by_object = {tag.object: tag for tag in DRIVE.tags.values()}
     assert [config.number for config in usable(held, by_object, writable)] == expected
     assert usable(held, by_object, writable, writable) == []

@@ -74,7 +74,7 @@ PDOMapping=1
 """
 
 
-def test_a_clean_file() -> None:
+def test_a_correct_file_is_read_without_corrections() -> None:
     od = parse_dictionary(EDS, 5)
     assert (od.vendor_name, od.vendor_number, od.product_name, od.product_number) == ("Nobody", 0x55, "Probe", 7)
     assert (od.node_id, od.mended, len(od)) == (5, (), 5)

@@ -57,11 +57,11 @@ def refused(step: Step, code: int) -> None:
         ("43 08 10 00 01 02 03 04", "01020304"),
     ],
 )
-def test_expedited_upload(reply: str, data: str) -> None:
+def test_an_expedited_upload_returns_its_data(reply: str, data: str) -> None:
     assert feed(upload(), reply) == Done(bytes.fromhex(data))
 
 
-def test_segmented_upload() -> None:
+def test_a_segmented_upload_returns_its_data() -> None:
     transfer = upload()
     assert feed(transfer, "41 08 10 00 09 00 00 00") == SendFrame(frame("605#60 00 00 00 00 00 00 00"))
     assert feed(transfer, "00 61 62 63 64 65 66 67") == SendFrame(frame("605#70 00 00 00 00 00 00 00"))
@@ -69,7 +69,7 @@ def test_segmented_upload() -> None:
 
 
 @pytest.mark.parametrize("size", range(1, 5))
-def test_expedited_download(size: int) -> None:
+def test_an_expedited_download_sends_its_data(size: int) -> None:
     transfer = SdoDownload(5, 0x1017, 0, TIMEOUT, b"\x01\x02\x03\x04"[:size])
     request = transfer.start(0)
     assert request.data[0] == {1: 0x2F, 2: 0x2B, 3: 0x27, 4: 0x23}[size]
@@ -77,7 +77,7 @@ def test_expedited_download(size: int) -> None:
     assert feed(transfer, "60 17 10 00 00 00 00 00") == Done(b"")
 
 
-def test_segmented_download() -> None:
+def test_a_segmented_download_sends_its_data() -> None:
     transfer = SdoDownload(5, 0x2000, 1, TIMEOUT, b"abcdefghi")
     assert transfer.start(0) == frame("605#21 00 20 01 09 00 00 00")
     assert feed(transfer, "60 00 20 01 00 00 00 00") == SendFrame(frame("605#00 61 62 63 64 65 66 67"))
@@ -95,7 +95,7 @@ def test_co030_nothing_at_all_is_one_empty_segment() -> None:
     assert feed(up, "0F 00 00 00 00 00 00 00") == Done(b"")
 
 
-def test_an_abort_is_the_node_saying_no() -> None:
+def test_an_abort_of_the_node_is_a_refusal() -> None:
     step = feed(upload(), "80 08 10 00 00 00 02 06")
     assert isinstance(step, Failed)
     assert isinstance(step.error, SdoAborted)

@@ -216,7 +216,7 @@ def test_lengths_of_replies_are_within_a_frame(pdu: bytes, head: bytes) -> None:
 # -- permissions and cache ------------------------------------------------------------------------------------------------
 
 
-def test_networks() -> None:
+def test_a_network_contains_addresses_in_each_notation() -> None:
     nets = (network("10.1.0.0/16"), network("fd00::/8"))
     assert within("10.1.200.3", nets)
     assert within("::ffff:10.1.200.3", nets)  # how a dual-stack socket shows an IPv4 client

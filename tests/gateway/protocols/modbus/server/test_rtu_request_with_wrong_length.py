@@ -60,7 +60,7 @@ def test_a_request_to_another_unit_of_a_wrong_length_gets_silence(hexadecimal: s
 
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)
-def test_a_good_request_after_it_is_answered(hexadecimal: str) -> None:
+def test_a_good_request_after_a_wrong_length_is_answered(hexadecimal: str) -> None:
     server = RtuServer({7: make_unit()})
     server.feed(with_crc(b"\x07" + bytes.fromhex(hexadecimal)), 0)
     replies = server.feed(with_crc(bytes.fromhex("07 03 0000 0001")), FRAME_GAP_NS)
@@ -78,7 +78,7 @@ def test_noise_is_answered_only_if_its_check_sum_is_right(data: bytes, piece: in
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)
 @pytest.mark.parametrize("piece", [256, 1])
-def test_the_bridge_passes_it_on_to_the_requested_device(hexadecimal: str, piece: int) -> None:
+def test_the_bridge_passes_a_wrong_length_on_to_the_requested_device(hexadecimal: str, piece: int) -> None:
     pdu = bytes.fromhex(hexadecimal)
     line = RtuRequests(500_000, [7])
     frame = with_crc(b"\x07" + pdu)

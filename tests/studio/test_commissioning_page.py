@@ -13,6 +13,8 @@ import pytest
 from studio_rig import OPERATE, VIEW, Studio, studio, until
 
 pytest.importorskip("selenium", reason="needs selenium, which is in the extra dev")
+from accessibility_rules import MISSING as NO_AXE
+from accessibility_rules import violations
 from browser import MISSING, Window, browser
 
 METER = Path(__file__).parents[2] / "examples" / "unknown-device" / "flow_meter.py"
@@ -63,8 +65,11 @@ def opened(window: Window, running: Studio, token: str = OPERATE) -> None:
 
 
 def go_to(window: Window, title: str) -> None:
-    window.click(".steps a", title)
-    window.sees("h1", title)
+    def there() -> bool:
+        window.click(".steps a", title)  # again, if the page moved under the pointer
+        return title in window.text("h1")
+
+    until(there, f"the step {title} is shown")
 
 
 def play(window: Window, title: str, ends: str, **values: str) -> str:
@@ -138,6 +143,26 @@ def test_the_first_hour_with_an_unknown_device(tmp_path: Path) -> None:
         page.driver.refresh()
         page.sees(".top", "rtu:near")
         assert page.complaints() == []
+
+
+@pytest.mark.skipif(bool(NO_AXE), reason=NO_AXE)
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_no_step_violates_a_rule_of_wcag_2_a_or_aa(tmp_path: Path, dark: bool) -> None:
+    (tmp_path / "meter.yaml").write_text(PROFILE.replace("float32", "float33"))
+    with studio(folder=tmp_path) as running, browser() as page:
+        page.dark(dark)
+        opened(page, running)
+        page.type("#field-endpoint", "tcp://127.0.0.1:1")
+        play(page, "Listen", "f")  # it fails, or names findings: nothing listens there
+        found = {}
+        for link in range(len(page.elements(".steps a"))):
+            title = page.elements(".steps a")[link].text.split("\n")[0].split(" ")[-1]
+            go_to(page, title)
+            if title == "Edit":
+                page.sees(".problems", "line 6")
+            found[title] = violations(page)
+        assert len(found) == 12
+        assert {title: broken for title, broken in found.items() if broken} == {}
 
 
 def test_the_guide_is_tried_with_an_emulated_device_and_the_role_view_only_looks(tmp_path: Path) -> None:

@@ -49,11 +49,15 @@ function Field({ field: f, value, disabled, onChange }) {
   </div>`;
 }
 
-/** The command line of a request, from the server: [text, what is wrong with the form]. */
+/** The command line of a request, from the server; null for a form that is not filled in: [text, what is wrong with the form]. */
 export function useCommand(request) {
   const key = JSON.stringify(request);
   const [shown, setShown] = useState({ text: "", problem: "" });
   useEffect(() => {
+    if (!request) {
+      setShown({ text: "", problem: "" });
+      return undefined;
+    }
     let current = true;
     const timer = setTimeout(() => {
       post("/commissioning/command", { step: request }).then(

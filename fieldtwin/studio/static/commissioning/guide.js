@@ -91,6 +91,12 @@ export function Guide({ step: wanted, children }) {
   }, [latest.scan?.number, latest.scan?.state]);
   const at = STEPS.find((s) => s.id === wanted) ?? STEPS[0];
   const mayOperate = guide?.role === "operate";
+  const main = useRef(null);
+  const first = useRef(true);
+  useEffect(() => {
+    if (!first.current) main.current.focus(); // so that the tab key goes on in the step
+    first.current = false;
+  }, [at]);
   const stateOf = (s) => {
     if (s.id === "port") return choices.endpoint ? "done" : "";
     if (s.id === "edit") return choices.draft ? (choices.draftValid ? "done" : "failed") : "";
@@ -103,7 +109,7 @@ export function Guide({ step: wanted, children }) {
       setDraft(emptyDraft);
       location.hash = "#/commissioning";
     });
-  return html`<div class="frame">
+  return html`<div class="frame guided">
     <header class="top">
       <a class="brand" href="#/">fieldtwin Studio</a>
       <strong>Commissioning</strong>
@@ -125,7 +131,7 @@ export function Guide({ step: wanted, children }) {
       })}
       ${mayOperate && html`<button type="button" class="quiet" disabled=${busy} onClick=${anew}>Begin with another device</button>`}
     </nav>
-    <main id="view">
+    <main id="view" ref=${main} tabindex="-1">
       <${Failure} text=${error || failed} />
       ${!guide && !error && html`<p class="empty">Reading the working folder …</p>`}
       ${guide &&
@@ -160,7 +166,8 @@ function CommandStep({ step, ctx, choices, change, mayOperate, again }) {
   const fields = step.fields(ctx);
   const values = valuesOf(fields, choices.forms[step.id]);
   const request = { step: step.id, ...step.request(ctx, values) };
-  const [text, problem] = useCommand(request);
+  const unfilled = fields.some((f) => (f.kind === "number" || f.kind === "out") && String(values[f.name]) === "");
+  const [text, problem] = useCommand(unfilled ? null : request);
   const [run, error, busy] = useAction();
   const [asking, setAsking] = useState(false);
   const job = ctx.latest[step.id];

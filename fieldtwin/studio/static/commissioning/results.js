@@ -119,7 +119,7 @@ const Check = ({ r }) => {
 
 const Report = ({ r, job }) => html`
   <p>${r.devices.length} ${r.devices.length === 1 ? "device" : "devices"}, ${r.deviations.length} findings. Open the document, print it, and sign it: <${Download} name=${job.form.out} /></p>
-  <${Table} head=${["Where", "What", "Expected", "Found", "Weight"]} rows=${r.deviations.map((d) => [d.where, d.what, d.expected, d.found, d.weight])} empty="No deviation." />`;
+  <${Table} head=${["Where", "What", "Expected", "Found", "Weight"]} rows=${r.deviations.map((d) => [html`<span class="mono">${d.where}</span>`, d.what, d.expected, d.found, d.weight])} empty="No deviation." />`;
 
 export const Download = ({ name }) => html`<a href=${`/api/v1/commissioning/files/${encodeURIComponent(name)}`} download=${name}>${name}</a>`;
 

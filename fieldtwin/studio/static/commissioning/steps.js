@@ -195,7 +195,7 @@ export const STEPS = [
     fields: (ctx) => [
       { name: "files", label: "Results", kind: "files", options: of(ctx, "dump", "check", "comparison"), value: [made(ctx, "dump") || newest(ctx, "dump"), made(ctx, "check")].filter(Boolean), missing: "No results yet: the steps Dump, Check and Compare write some." },
       { name: "site", label: "Site", kind: "text", value: "" },
-      { name: "label", label: "Name of the device", kind: "text", value: "", placeholder: "as on the drawing" },
+      { name: "label", label: "Device name", kind: "text", value: "", placeholder: "as on the drawing" },
       { name: "serial", label: "Serial number", kind: "text", value: "", placeholder: "as on the name plate" },
       { name: "customer", label: "Operator", kind: "text", value: "", placeholder: "printed at the signature" },
       { name: "out", label: "File", kind: "out", value: free(ctx, `${ctx.name}-acceptance`, ".html") },

@@ -136,10 +136,13 @@ def test_the_shown_command_line_is_the_command_that_runs(running: Studio) -> Non
     }
     with running.client(VIEW) as client:
         shown = client.post(f"{GUIDE}/command", json={"step": form}).json()["command"]
+        unfinished = client.post(f"{GUIDE}/command", json={"step": form | {"out": "../r.html"}}).json()
     assert shlex.split(shown) == [
         *("fieldtwin", "report", "a.jsonl", "-o", "r.html"),
         *("--site=Pump; house's", "--label=unit 3=-o x"),
     ]
+    assert unfinished["command"] == ""
+    assert "plain name" in unfinished["problem"]
 
 
 @pytest.mark.parametrize(

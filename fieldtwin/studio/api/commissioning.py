@@ -12,7 +12,7 @@ from starlette.responses import FileResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fieldtwin.gateway.connections.serial.port import local_ports
-from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.studio.api.common import of_server
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
@@ -58,10 +58,16 @@ async def get_guide(request: Request) -> dict[str, Any]:
 
 
 async def show_command(request: Request) -> dict[str, Any]:
-    """Return the command line of a step, without running it."""
-    form = await body_of(request, StepForm)
-    command = form.step.command(_jobs(request).folder)
-    return {"command": command.line, "writes": command.writes}
+    """Return the command line of a step, without running it.
+
+    A form that is being filled in is often invalid, so that is a normal answer: `problem` says what is wrong with it.
+    """
+    try:
+        form = await body_of(request, StepForm)
+        command = form.step.command(_jobs(request).folder)
+    except UsageError as e:
+        return {"command": "", "writes": (), "problem": str(e)}
+    return {"command": command.line, "writes": command.writes, "problem": ""}
 
 
 async def start_step(request: Request) -> dict[str, Any]:

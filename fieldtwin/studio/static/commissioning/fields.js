@@ -61,7 +61,7 @@ export function useCommand(request) {
     let current = true;
     const timer = setTimeout(() => {
       post("/commissioning/command", { step: request }).then(
-        (got) => current && setShown({ text: got.command, problem: "" }),
+        (got) => current && setShown({ text: got.command, problem: got.problem }),
         (e) => current && setShown({ text: "", problem: e.message }),
       );
     }, PAUSE_MS);

@@ -42,11 +42,12 @@ ONCE = ("identity", "setup")
 def read_only_once(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
     """Return a warning for each poll group of measured values that is read once, because the device's `poll` lacks it.
 
-    A tag of `writable` has its own warning (`never_read_back`), and a transmitter's mailbox is read without an entry.
+    A tag of `writable` has its own warning (`never_read_back`), a transmitter's mailbox is read without an entry, and any
+    value of a CANopen node grows stale, so that it does not stay good.
     """
     found = []
     for name, device in devices.items():
-        if device.profile.inbox is not None:
+        if device.profile.inbox is not None or device.profile.protocol != "modbus":
             continue
         writable = file.data["devices"][name].get("writable", [])
         groups: dict[str, list[Tag]] = {}

@@ -13,7 +13,7 @@ import pytest
 def test_a_virtual_run_ends_and_names_file_and_line(tmp_path: Path) -> None:
     """Defect: only a signal ended it."""
     code = (
-        "import sys; sys.path[:0] = ['tests/scenarios', 'tests/unit', 'tests'];"
+        "import sys; sys.path[:0] = ['tests/scenarios/judging', 'tests/unit', 'tests'];"
         "from pathlib import Path; import test_stopped_programs_fail as t;"
         "r = t.run(t.plant(Path(sys.argv[1]), t.PYTHON.replace('raise ValueError(\"no such pump\")', "
         "'n = 0\\n        while True:\\n            n += 1'), t.NO_FAULT));"

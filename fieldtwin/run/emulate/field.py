@@ -72,9 +72,14 @@ def _say(side: FieldSimulator, process: FieldProcess, options: FieldOptions) -> 
 
 
 def _word(name: str, options: FieldOptions) -> str:
-    """Return the system as the user can give it to another command: a bare name if it finds this file, else the path."""
+    """Return the system as the user can give it to another command: a bare name if it finds this file from every folder,
+    else the path. A folder of that name finds it only from the present working directory.
+    """
     try:
-        if find("systems", name, extra=options.profiles).resolve() == options.system.resolve():
+        if (
+            not Path(name).is_dir()
+            and find("systems", name, extra=options.profiles).resolve() == options.system.resolve()
+        ):
             return name
     except UsageError:
         pass

@@ -118,7 +118,7 @@ def attempts_of(monkeypatch: pytest.MonkeyPatch, verdicts: list[Verdict]) -> lis
     """Let attempts end with these verdicts; the number of remaining verdicts shows how many attempts were made."""
     left = list(verdicts)
 
-    def attempt(scenario: object, target: object, trace_file: object) -> ScenarioResult:
+    def attempt(scenario: object, target: object, trace_file: object, progress: object) -> ScenarioResult:
         verdict = left.pop(0)
         return ScenarioResult("a test", verdict, reason="step 1: too late" if verdict is Verdict.INCONCLUSIVE else "")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import signal
 from collections import deque
 from collections.abc import Iterator
 from typing import Any
@@ -17,9 +16,9 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import EndpointBusy, NotAllowed, UsageError
 from fieldtwin.gateway.core.escaping import escape_controls
+from fieldtwin.studio import child_process
 from fieldtwin.studio.commissioning.steps import Command, Step, check_may_start
 from fieldtwin.studio.commissioning.work_folder import WorkFolder
-from fieldtwin.twin.plant.child import command as child_command
 
 MOST_RUNNING = 6
 MOST_KEPT = 40
@@ -30,7 +29,6 @@ LAST_LINES = 8
 """Lines of a job in an overview of all jobs."""
 MOST_RESULT_BYTES = 8 << 20
 LONGEST_S = 86_400.0
-STOPS_WITHIN_S = 10.0
 MOST_LISTENERS = 50
 _INTERRUPTED = 130
 
@@ -146,15 +144,8 @@ class Job:
     async def begin(self) -> None:
         """Start the process."""
         arguments = [*self.command.arguments, *(["--json"] if self.command.as_json else [])]
-        self._process = await asyncio.create_subprocess_exec(
-            *child_command("fieldtwin", *arguments),
-            cwd=self._folder.path,
-            env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,
-        )
+        environment = os.environ | {"COLUMNS": "120", "NO_COLOR": "1"}
+        self._process = await child_process.start(*arguments, cwd=self._folder.path, env=environment)
         self._following = asyncio.ensure_future(self._follow())
 
     @property
@@ -204,32 +195,32 @@ class Job:
         assert self._process is not None
         assert self._process.stdout is not None
         assert self._process.stderr is not None
-        output = bytearray()
-        stdout = self._process.stdout
-        reading = self._read(stdout, output) if self.command.as_json else self._read_lines(stdout)
         try:
             async with asyncio.timeout(LONGEST_S):
-                await asyncio.gather(reading, self._read_lines(self._process.stderr))
+                output, _ = await asyncio.gather(
+                    self._read(self._process.stdout), self._read_lines(self._process.stderr)
+                )
                 self._exit_code = await self._process.wait()
         except TimeoutError:
             self._trouble = f"stopped after {LONGEST_S:g} s"
-        except _TooLongError:
+        except child_process.OutputTooLong:
             self._trouble = f"stopped: the result is longer than {MOST_RESULT_BYTES} bytes"
         else:
-            self._take(bytes(output))
+            self._take(output)
         finally:
             self._took_s = asyncio.get_running_loop().time() - self._began_s
-            self._kill()
+            child_process.kill(self._process)
             await self._process.wait()
             if self._was_stopped and self._lines and self._lines[-1] == "KeyboardInterrupt":
                 self._forget_traceback()
             asyncio.get_running_loop().call_soon(self._changed)
 
-    async def _read(self, stream: asyncio.StreamReader, output: bytearray) -> None:
-        while chunk := await stream.read(65_536):
-            output += chunk
-            if len(output) > MOST_RESULT_BYTES:
-                raise _TooLongError
+    async def _read(self, stream: asyncio.StreamReader) -> bytes:
+        """Return the result, without one if the output is text for the user."""
+        if self.command.as_json:
+            return await child_process.read_whole(stream, MOST_RESULT_BYTES)
+        await self._read_lines(stream)
+        return b""
 
     async def _read_lines(self, stream: asyncio.StreamReader) -> None:
         rest = b""
@@ -273,23 +264,10 @@ class Job:
                 self._trouble = f"cannot write {self.command.out}: {e.strerror or e}"
 
     async def stop(self) -> None:
-        """Interrupt the command as Ctrl-C does, and kill it if it does not end within `STOPS_WITHIN_S`."""
+        """Interrupt the command as Ctrl-C does, and kill it if it does not end."""
         if self._process is None or self._following is None:
             return
         if self.is_running:
             self._was_stopped = True
-            with contextlib.suppress(ProcessLookupError):
-                self._process.send_signal(signal.SIGINT)
-            await asyncio.wait([self._following], timeout=STOPS_WITHIN_S)
-            self._kill()
+            await child_process.interrupt(self._process, self._following)
         await asyncio.gather(self._following, return_exceptions=True)
-
-    def _kill(self) -> None:
-        """Kill what is left of the process group; nothing is left of a command that has ended."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            assert self._process is not None
-            os.killpg(self._process.pid, signal.SIGKILL)
-
-
-class _TooLongError(Exception):
-    pass

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, UsageError
 from fieldtwin.run.processes.run_record import read_record
+from fieldtwin.studio import child_process
 from fieldtwin.studio.live.instances import GATEWAY_SOCKET, accepts, find_instance
-from fieldtwin.twin.plant.child import command
 from fieldtwin.twin.plant.instance import capture_path, runtime_root
 from fieldtwin.twin.site.data_files import search_path
 
@@ -89,12 +89,8 @@ class Launcher:
         if found is not None and found.running:
             raise EndpointBusy(f"the instance {instance!r} is running already")
         arguments = ["run", system, "--prototype", "--instance", instance, "--capture", str(capture_path(instance))]
-        process = await asyncio.create_subprocess_exec(
-            *command("fieldtwin", *arguments, "--commands", "none", "--log", "text"),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            start_new_session=True,
+        process = await child_process.start(
+            *arguments, "--commands", "none", "--log", "text", stderr=asyncio.subprocess.STDOUT
         )
         run = self._runs[instance] = _Run(instance, process)
         try:

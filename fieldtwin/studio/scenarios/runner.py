@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
 import shutil
-import signal
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +13,8 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.studio import child_process
 from fieldtwin.studio.scenarios.progress import RunProgress
-from fieldtwin.twin.plant.child import command
 
 SUFFIX = ".scenario.yaml"
 MOST_FILES = 200
@@ -26,7 +23,6 @@ MOST_OUTPUT_BYTES = 8 << 20
 MOST_MESSAGE_BYTES = 16_384
 LONGEST_S = 1800.0
 LOOK_EVERY_S = 0.1
-STOPS_WITHIN_S = 10.0
 TARGETS = ("virtual", "local")
 
 
@@ -92,13 +88,7 @@ class ScenarioRunner:
             raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
         folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
         progress = folder / "progress.jsonl"
-        process = await asyncio.create_subprocess_exec(
-            *command("fieldtwin", "test", path, "--target", target, "--json", "--progress", str(progress)),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,
-        )
+        process = await child_process.start("test", path, "--target", target, "--json", "--progress", str(progress))
         self._count += 1
         self._run = _Run(self._count, path, target, process, progress)
 
@@ -147,17 +137,17 @@ class _Run:
         looking = asyncio.ensure_future(self._look())
         try:
             async with asyncio.timeout(LONGEST_S):
-                output = await _whole(self._process.stdout)
+                output = await child_process.read_whole(self._process.stdout, MOST_OUTPUT_BYTES)
                 await self._process.wait()
         except TimeoutError:
             self._trouble = self._trouble or f"stopped after {LONGEST_S:g} s"
-        except _TooLongError:
+        except child_process.OutputTooLong:
             self._trouble = f"stopped: the result is longer than {MOST_OUTPUT_BYTES} bytes"
         else:
             self._take(output, await messages)
         finally:
             self._took_s = asyncio.get_running_loop().time() - self._began_s
-            self._kill()
+            child_process.kill(self._process)
             await self._process.wait()
             messages.cancel()
             looking.cancel()
@@ -181,29 +171,8 @@ class _Run:
         """Interrupt the run, and kill it with its processes if it does not end."""
         if self.is_running:
             self._trouble = "stopped"
-            with contextlib.suppress(ProcessLookupError):
-                self._process.send_signal(signal.SIGINT)
-            await asyncio.wait([self._following], timeout=STOPS_WITHIN_S)
-            self._kill()
+            await child_process.interrupt(self._process, self._following)
         await asyncio.gather(self._following, return_exceptions=True)
-
-    def _kill(self) -> None:
-        """Kill what is left of the process group; the processes of a finished run are gone already."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-
-
-class _TooLongError(Exception):
-    pass
-
-
-async def _whole(stream: asyncio.StreamReader) -> bytes:
-    output = bytearray()
-    while chunk := await stream.read(65_536):
-        output += chunk
-        if len(output) > MOST_OUTPUT_BYTES:
-            raise _TooLongError
-    return bytes(output)
 
 
 async def _tail(stream: asyncio.StreamReader) -> bytes:

@@ -196,8 +196,8 @@ class VirtualStuckAlarm(StuckAlarm):
         signal.setitimer(signal.ITIMER_REAL, self._s, self._s)
 
     def arm(self) -> None:
+        self._expired = False  # first: the timer may expire between the two lines
         self._armed = True
-        self._expired = False
 
     def disarm(self) -> None:
         self._armed = False

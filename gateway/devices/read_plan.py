@@ -60,6 +60,11 @@ def read_request(at: RegisterRange) -> Request[BitsReply | RegistersReply]:
     return ReadRegisters(at.table, at.address, at.count)
 
 
+def cells(reply: BitsReply | RegistersReply) -> bytes:
+    """Return registers as the bytes that were received, and bits as one byte each."""
+    return bytes(reply.bits) if isinstance(reply, BitsReply) else reply.raw
+
+
 def place_of(at: RegisterRange, read: RegisterRange) -> slice:
     """Return the position of the bytes of `at` in the data of the read `read`: two bytes per register, one per bit."""
     width = 1 if read.table in ("coil", "discrete") else 2

@@ -26,11 +26,11 @@ from fieldtwin.gateway.devices.read_plan import (
     GroupPlan,
     Learnt,
     Read,
+    cells,
     place_of,
     read_request,
 )
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
-from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
 """The most that one request may write (AP 6.11 and 6.12)."""
@@ -217,7 +217,7 @@ class RegisterDriver(DeviceDriver):
             return
         reading.todo.popleft()
         plan.taken(read)
-        raw, t_ns, values = _cells(reply), reply.t_ns, reading.values
+        raw, t_ns, values = cells(reply), reply.t_ns, reading.values
         reading.blocks.append((read, raw))
         for tag, place in read.places:
             values[tag.name] = self._decode(tag, raw[place], t_ns)
@@ -247,7 +247,7 @@ class RegisterDriver(DeviceDriver):
 
     async def _read_tag(self, tag: Tag) -> TagValue:
         reply = await self.client.execute(self.config.address, read_request(tag.registers))
-        value = decode(tag, _cells(reply), reply.t_ns)
+        value = decode(tag, cells(reply), reply.t_ns)
         self._publish(tag.name, value)
         return value
 
@@ -403,8 +403,3 @@ class SensorDriver(RegisterDriver):
     """SPEC row SensorDriver: a register device on RS232."""
 
     wire_types = frozenset({PROTOCOL.RS232})
-
-
-def _cells(reply: BitsReply | RegistersReply) -> bytes:
-    """Return registers as the bytes that were received, and bits as one byte each."""
-    return bytes(reply.bits) if isinstance(reply, BitsReply) else reply.raw

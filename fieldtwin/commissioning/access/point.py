@@ -25,14 +25,21 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, T
 from fieldtwin.gateway.core.files.profile_schema import Limits, ProfileForm
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
-from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
+from fieldtwin.gateway.devices.read_plan import (
+    ILLEGAL_ADDRESS,
+    TOO_LONG,
+    GroupPlan,
+    Learnt,
+    Read,
+    cells,
+    plan_reads,
+    read_request,
+)
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.canopen.sdo.transfers import SdoDownload, SdoUpload
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
 from fieldtwin.gateway.protocols.modbus.requests.data import (
-    ReadBits,
-    ReadRegisters,
     WriteCoil,
     WriteCoils,
     WriteRegister,
@@ -224,11 +231,8 @@ class ModbusPoint:
 
     async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
         self.requests += 1
-        if at.table == "coil" or at.table == "discrete":
-            bits = await self.client.read_bits(self.unit, at.table, at.address, at.count)
-            return bytes(bits.bits), bits.t_ns
-        reply = await self.client.read_registers(self.unit, at.table, at.address, at.count)
-        return reply.raw, reply.t_ns
+        reply = await self.client.execute(self.unit, read_request(at))
+        return cells(reply), reply.t_ns
 
     def _with_scales(self, tags: Sequence[Tag]) -> list[Tag]:
         known = {t.name: t for t in tags}
@@ -347,13 +351,6 @@ def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Req
     if len(words) == 1 and (functions is None or 6 in functions):
         return WriteRegister(at.address, words[0])
     return WriteRegisters(at.address, words)
-
-
-def read_request(at: RegisterRange) -> Request[Any]:
-    """Return the request that reads a range."""
-    if at.table == "coil" or at.table == "discrete":
-        return ReadBits(at.table, at.address, at.count)
-    return ReadRegisters(at.table, at.address, at.count)
 
 
 def _bad(

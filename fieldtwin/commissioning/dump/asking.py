@@ -24,6 +24,7 @@ from fieldtwin.gateway.core.errors import (
     WrongSize,
 )
 from fieldtwin.gateway.core.files.profile import RegisterRange
+from fieldtwin.gateway.devices.read_plan import cells, read_request
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import TIMED_OUT
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
@@ -103,11 +104,8 @@ class ModbusAsker:
         return await self._patiently(once, self._retries)
 
     async def _read(self, at: RegisterRange) -> tuple[bytes, int]:
-        if at.table == "coil" or at.table == "discrete":
-            bits = await self._client.read_bits(self._unit, at.table, at.address, at.count)
-            return bytes(bits.bits), bits.t_ns
-        reply = await self._client.read_registers(self._unit, at.table, at.address, at.count)
-        return reply.raw, reply.t_ns
+        reply = await self._client.execute(self._unit, read_request(at))
+        return cells(reply), reply.t_ns
 
     async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]], retries: int) -> AskResult:
         lost = busy = 0

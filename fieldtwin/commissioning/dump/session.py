@@ -13,7 +13,7 @@ from pathlib import Path
 from fieldtwin.commissioning.access.address import raw_tag
 from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modbus_at
 from fieldtwin.commissioning.access.frame_log import FrameLog
-from fieldtwin.commissioning.access.point import CanopenPoint, read_request
+from fieldtwin.commissioning.access.point import CanopenPoint
 from fieldtwin.commissioning.dump.asking import CanopenAsker, DeviceReader, ModbusAsker
 from fieldtwin.commissioning.dump.dump import Dumper, DumpJob, DumpResult, Progress, check_resumable, started
 from fieldtwin.commissioning.dump.file import TABLES, Dump, DumpWriter, load_dump
@@ -25,6 +25,7 @@ from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import RegisterRange, resolve_gap
+from fieldtwin.gateway.devices.read_plan import read_request
 from fieldtwin.gateway.wallclock import WallClock
 
 REPLY_S = 0.01

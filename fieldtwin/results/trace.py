@@ -61,6 +61,15 @@ _Noted = tuple[int, TraceKind, str, dict[str, Any]]
 """An event's fields."""
 
 
+_decoder = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]])
+
+
+def decode_event(line: bytes) -> TraceEvent:
+    """Return the event of a line that a sink received. Raises `msgspec.MsgspecError` or `ValueError` for any other line."""
+    t_ns, kind, where, data = _decoder.decode(line)
+    return TraceEvent(t_ns, TraceKind(kind), where, data)
+
+
 class Trace:
     """The latest `capacity` events, the hash of all, and the listeners. `sink`: a file that takes every event as a JSON
     line.

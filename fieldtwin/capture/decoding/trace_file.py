@@ -12,7 +12,7 @@ from fieldtwin.capture.decoding.decoder import frame_events
 from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
-from fieldtwin.results.trace import TraceEvent, TraceKind, refusal_data
+from fieldtwin.results.trace import TraceEvent, TraceKind, decode_event, refusal_data
 from fieldtwin.twin.site.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin simulate --trace` writes it"
@@ -39,15 +39,13 @@ def read_events(path: Path, system: System) -> Iterator[TraceEvent]:
 
 
 def _trace(path: Path) -> Iterator[TraceEvent]:
-    decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in TraceKind}
     with open_input(path) as file:
         number = 0
         while line := file.readline(MAX_LINE_BYTES):
             number += 1
             try:
-                t_ns, kind, where, data = decoder.decode(line)
-                event = TraceEvent(t_ns, kinds[kind], where, data)
-            except (msgspec.DecodeError, KeyError) as e:
+                event = decode_event(line)
+            except (msgspec.DecodeError, ValueError) as e:
                 if not line.endswith(b"\n") and not file.read(1):
                     return
                 raise FileInvalid(f"no event: {e}", path=str(path), line=number, expected=_EXPECTED) from e

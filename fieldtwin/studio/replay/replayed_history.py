@@ -22,9 +22,8 @@ class ReplayedHistory:
 
     def at(self, name: str, t_ns: int) -> Point | None:
         """Return the point that was valid at an instant, None before the first one."""
-        series = self._series(name)
-        position = -1 if series is None else series.last_at(t_ns)
-        return None if series is None or position < 0 else self._point(name, series, position)
+        point = self._log.at(self._series(name), t_ns)
+        return None if point is None else self._without_secret(name, point)
 
     def state_at(self, name: str, t_ns: int) -> Point | None:
         """Return the value of a program's variable at an instant, None before the first one. The PLC may write a tag that the
@@ -60,5 +59,7 @@ class ReplayedHistory:
         return self._log.tags.get(name) or self._log.states.get(name)
 
     def _point(self, name: str, series: Series, position: int) -> Point:
-        point = self._log.point(series, position)
+        return self._without_secret(name, self._log.point(series, position))
+
+    def _without_secret(self, name: str, point: Point) -> Point:
         return point._replace(value=SECRET) if name in self._secrets else point

@@ -7,18 +7,15 @@ from bisect import bisect_left, insort
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
-
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
-from fieldtwin.results.trace import TraceEvent, TraceKind
+from fieldtwin.results.trace import TraceEvent, TraceKind, decode_event
 from fieldtwin.studio.live.frame_log import FrameLog, FrameRow
 from fieldtwin.studio.replay.trace_log import AfterCheck
 from fieldtwin.twin.site.system import System
 
-_decoder = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]])
 _FRAME, _STEP = (f'"{kind.value}"'.encode() for kind in (TraceKind.FRAME, TraceKind.STEP))
 HEAD_BYTES = 40
 """The beginning of a line that holds time and kind."""
@@ -77,21 +74,19 @@ class TraceFrames(FrameLog):
     def _event_of(self, line: bytes) -> TraceEvent | None:
         if _FRAME not in line[:HEAD_BYTES] and _STEP not in line[:HEAD_BYTES]:
             return None
-        t_ns, kind, where, data = _decoder.decode(line)
-        t_ns = self._after_check.time_of(t_ns, TraceKind(kind), data)
-        event = TraceEvent(t_ns, TraceKind(kind), where, data)
-        if event.kind is not TraceKind.FRAME or where not in self._system.buses:
+        event = decode_event(line)
+        event = event._replace(t_ns=self._after_check.time_of(event.t_ns, event.kind, event.data))
+        if event.kind is not TraceKind.FRAME or event.where not in self._system.buses:
             return None
-        if self._times and t_ns < self._times[-1]:
+        if self._times and event.t_ns < self._times[-1]:
             raise ValueError("the time goes back")
         self._item(event)  # a frame that cannot be read is not listed
         return event
 
     def _captured_of(self, line: bytes) -> Captured:
-        t_ns, kind, where, data = _decoder.decode(line)
-        event = TraceEvent(t_ns, TraceKind(kind), where, data)
-        direction = Direction.SENT if data.get("dir") == "sent" else Direction.RECEIVED
-        return Captured(t_ns, self._system.buses[where].endpoint, direction, self._item(event))
+        event = decode_event(line)
+        direction = Direction.SENT if event.data.get("dir") == "sent" else Direction.RECEIVED
+        return Captured(event.t_ns, self._system.buses[event.where].endpoint, direction, self._item(event))
 
     def _item(self, event: TraceEvent) -> bytes | CanFrame:
         data = event.data

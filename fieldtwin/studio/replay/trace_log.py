@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.results.model import Verdict
-from fieldtwin.results.trace import TraceKind
+from fieldtwin.results.trace import TraceKind, decode_event
 from fieldtwin.studio.live.tag_history import Point
 from fieldtwin.studio.replay.series import Kind, Kinds, Series, encoded
 
@@ -92,7 +92,6 @@ class TraceLog:
         self._line = 0
         self._read_to = 0
         self._rest = b""
-        self._decoder = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]])
         try:
             self._file, self._lines = open_input(path), open_input(path)
         except OSError as e:
@@ -167,8 +166,7 @@ class TraceLog:
     def _text(self, at: int) -> Any:
         """Return a value that has stayed in the file."""
         self._lines.seek(at)
-        _, _, _, data = self._decoder.decode(self._lines.readline(MAX_LINE_BYTES))
-        value = data.get("value")
+        value = decode_event(self._lines.readline(MAX_LINE_BYTES)).data.get("value")
         return value if isinstance(value, str | int) else str(value)
 
     def _check_length(self, line: bytes) -> None:
@@ -176,8 +174,7 @@ class TraceLog:
             raise ValueError(f"the line is longer than {MAX_LINE_BYTES} bytes")
 
     def _add(self, line: bytes, at: int) -> None:
-        t_ns, word, where, data = self._decoder.decode(line)
-        kind = TraceKind(word)
+        t_ns, kind, where, data = decode_event(line)
         if not 0 <= t_ns <= LONGEST_NS:
             raise ValueError(f"the time {t_ns} ns is not within a run")
         if t_ns < self.last_ns - LATE_NS:

@@ -16,6 +16,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.studio.api.common import of_server
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
+from fieldtwin.studio.api.stream import FULL, SENT_WITHIN_S, until_left
 from fieldtwin.studio.commissioning.drafts import check_draft
 from fieldtwin.studio.commissioning.jobs import Job, Jobs
 from fieldtwin.studio.commissioning.practice import practice_devices, profile_names
@@ -23,8 +24,6 @@ from fieldtwin.studio.commissioning.steps import AnyStep
 
 AT_MOST_EVERY_S = 0.2
 LOOK_AGAIN_S = 1.0
-SENT_WITHIN_S = 10.0
-FULL = 4503
 
 
 class StepForm(msgspec.Struct, forbid_unknown_fields=True):
@@ -147,7 +146,7 @@ async def stream_jobs(socket: WebSocket) -> None:
 
 
 async def _send_states(socket: WebSocket, jobs: Jobs, changed: asyncio.Event) -> None:
-    leaving = asyncio.ensure_future(_until_left(socket))
+    leaving = asyncio.ensure_future(until_left(socket))
     try:
         while not leaving.done():
             changed.clear()
@@ -162,12 +161,6 @@ async def _send_states(socket: WebSocket, jobs: Jobs, changed: asyncio.Event) ->
             waiting.cancel()
     finally:
         leaving.cancel()
-
-
-async def _until_left(socket: WebSocket) -> None:
-    with contextlib.suppress(WebSocketDisconnect):
-        while True:
-            await socket.receive_text()
 
 
 def _jobs(request: HTTPConnection) -> Jobs:

@@ -37,6 +37,18 @@ FILTERS = (
     Parameter("service", "string", "only frames of this function or service"),
     Parameter("problems", "boolean", "only frames of failed exchanges"),
 )
+PAGE = (
+    Parameter("start", "integer", "position of the first frame; by default the latest frames are returned"),
+    Parameter("count", "integer", f"how many, at most {MOST_ROWS}"),
+    Parameter("at_ns", "integer", "frames around this instant, in place of start"),
+    *FILTERS,
+)
+EXPORT = (
+    Parameter("format", "string", "pcap, candump or recording"),
+    Parameter("first", "integer", "number of the first frame"),
+    Parameter("last", "integer", "number of the last frame"),
+    *FILTERS,
+)
 
 
 def _frames(attachment: Attachment) -> FrameLog:
@@ -210,12 +222,7 @@ OPERATIONS = (
         f"{INSTANCE}/frames",
         list_frames,
         "Read a page of frames",
-        (
-            Parameter("start", "integer", "position of the first frame; by default the latest frames are returned"),
-            Parameter("count", "integer", f"how many, at most {MOST_ROWS}"),
-            Parameter("at_ns", "integer", "frames around this instant, in place of start"),
-            *FILTERS,
-        ),
+        PAGE,
     ),
     Operation("GET", f"{INSTANCE}/frames/services", list_services, "List the functions and services seen so far"),
     Operation(
@@ -223,12 +230,7 @@ OPERATIONS = (
         f"{INSTANCE}/frames/export",
         export_frames,
         "Export frames",
-        (
-            Parameter("format", "string", "pcap, candump or recording"),
-            Parameter("first", "integer", "number of the first frame"),
-            Parameter("last", "integer", "number of the last frame"),
-            *FILTERS,
-        ),
+        EXPORT,
     ),
     Operation("GET", INSTANCE + "/frames/{number}", get_frame, "Read one frame and the frames linked with it"),
 )

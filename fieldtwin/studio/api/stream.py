@@ -18,6 +18,7 @@ from fieldtwin.studio.api.common import attached
 from fieldtwin.studio.live.subscription import Subscription
 
 FULL = 4503
+"""The code with which a further client is refused."""
 SENT_WITHIN_S = 10.0
 """A client that takes nothing for so long is disconnected."""
 
@@ -49,7 +50,7 @@ async def stream(socket: WebSocket) -> None:
 
 async def _serve(socket: WebSocket, subscription: Subscription) -> None:
     told = 0
-    leaving = asyncio.ensure_future(_until_left(socket))
+    leaving = asyncio.ensure_future(until_left(socket))
     try:
         while not leaving.done():
             waiting = asyncio.ensure_future(subscription.next())
@@ -72,7 +73,7 @@ async def _serve(socket: WebSocket, subscription: Subscription) -> None:
         leaving.cancel()
 
 
-async def _until_left(socket: WebSocket) -> None:
+async def until_left(socket: WebSocket) -> None:
     """Return when the client has left. Messages from the client are ignored."""
     with contextlib.suppress(WebSocketDisconnect):
         while True:

@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from fieldtwin.studio.api.common import of_server
 from fieldtwin.studio.api.errors import NotFound
-from fieldtwin.studio.api.frames import FILTERS, MOST_ROWS, file_of, frame_of, page_of
+from fieldtwin.studio.api.frames import EXPORT, PAGE, file_of, frame_of, page_of
 from fieldtwin.studio.api.operation import Operation, Parameter, whole
 from fieldtwin.studio.live.tag_history import MOST_POINTS
 from fieldtwin.studio.replay.instant import recent_at, state_at, transitions_at
@@ -158,12 +158,7 @@ OPERATIONS = (
         f"{TRACE}/frames",
         list_trace_frames,
         "Read a page of frames of a trace",
-        (
-            Parameter("start", "integer", "position of the first frame; by default the latest frames are returned"),
-            Parameter("count", "integer", f"how many, at most {MOST_ROWS}"),
-            Parameter("at_ns", "integer", "frames around this instant, in place of start"),
-            *FILTERS,
-        ),
+        PAGE,
     ),
     Operation("GET", f"{TRACE}/frames/services", list_trace_services, "List the functions and services of a trace"),
     Operation(
@@ -171,12 +166,7 @@ OPERATIONS = (
         f"{TRACE}/frames/export",
         export_trace_frames,
         "Export frames of a trace",
-        (
-            Parameter("format", "string", "pcap, candump or recording"),
-            Parameter("first", "integer", "number of the first frame"),
-            Parameter("last", "integer", "number of the last frame"),
-            *FILTERS,
-        ),
+        EXPORT,
     ),
     Operation("GET", TRACE + "/frames/{number}", get_trace_frame, "Read one frame of a trace"),
     Operation("GET", f"{TRACE}/plc/programs", get_trace_programs, "Describe the programs of a trace"),

@@ -45,6 +45,6 @@ async def interrupt(process: Process, following: asyncio.Future[None]) -> None:
 
 
 def kill(process: Process) -> None:
-    """Kill what is left of the process group; nothing is left of a command that has ended with its own children."""
+    """Kill the remaining processes of the group. There are none if the command has ended with its own children."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)

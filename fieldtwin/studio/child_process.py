@@ -1,4 +1,4 @@
-"""A command of the command line as a child process of Studio, in a process group of its own, so that all of it can be ended."""
+"""Run a command of the command line as a child process of Studio. Each has its own process group, which can be ended as a whole."""
 
 from __future__ import annotations
 
@@ -45,6 +45,6 @@ async def interrupt(process: Process, following: asyncio.Future[None]) -> None:
 
 
 def kill(process: Process) -> None:
-    """Kill the remaining processes of the group. There are none if the command has ended with its own children."""
+    """Kill the remaining processes of the group, if there are any."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Run a command of the command line as a child process of Studio. Each has its own process group, which can be ended as a whole."""
+"""Run a command of the command line as a child process of Studio. Each has its own process group, so that all of it can end."""
 
 from __future__ import annotations
 

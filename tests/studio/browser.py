@@ -31,6 +31,13 @@ _REDRAWN = (
     NoSuchElementException,
     StaleElementReferenceException,
 )
+# One script looks at all elements at once: a list that follows a bus replaces its rows faster than a loaded computer can ask for
+# each of them. A state diagram has no innerText, because it is an SVG.
+_VISIBLE = """
+const visible = (css) => [...document.querySelectorAll(css)].filter(
+  (e) => e.getClientRects().length && e.checkVisibility({opacityProperty: true, visibilityProperty: true}));
+const text = (e) => (e.innerText ?? e.textContent).trim();
+"""
 T = TypeVar("T")
 
 
@@ -45,15 +52,12 @@ class Window:
 
     def elements(self, css: str, text: str = "") -> list[WebElement]:
         """Return the visible elements whose text contains `text`."""
-        found = self.driver.find_elements(By.CSS_SELECTOR, css)
-        return [e for e in found if e.is_displayed() and text in e.text]
+        source = _VISIBLE + "return visible(arguments[0]).filter(e => text(e).includes(arguments[1]))"
+        return list(self.script(source, css, text))
 
     def text(self, css: str) -> str:
         """Return the visible text of all elements that match. Without such an element the text is empty."""
-        try:
-            return "\n".join(e.text for e in self.elements(css))
-        except StaleElementReferenceException:
-            return ""
+        return str(self.script(_VISIBLE + "return visible(arguments[0]).map(text).join('\\n')", css))
 
     def sees(self, css: str, text: str) -> str:
         """Wait until an element shows a text, and return the text of all elements that match."""

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from fieldtwin.testing.scenario_file import ScenarioFile
     from fieldtwin.testing.wire import RecordedTraffic
 
-SUFFIX = ".scenario.yaml"
 MARKER = "fieldtwin"
 _RUNNER: pytest.StashKey[WorkerProcess] = pytest.StashKey()
 _RESULTS: pytest.StashKey[Results] = pytest.StashKey()
@@ -51,7 +50,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="FILE",
         help="write an HTML page with verdicts and the requirement matrix to this file",
     )
-    parser.addini("fieldtwin_scenarios", f"collect *{SUFFIX} as tests", type="bool", default=True)
+    parser.addini("fieldtwin_scenarios", "collect *.scenario.yaml as tests", type="bool", default=True)
     parser.addini("fieldtwin_profiles", "folders with devices/ and systems/", type="paths", default=[])
 
 
@@ -77,7 +76,11 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
-    if not file_path.name.endswith(SUFFIX) or not parent.config.getini("fieldtwin_scenarios"):
+    if file_path.suffix != ".yaml" or not parent.config.getini("fieldtwin_scenarios"):
+        return None
+    from fieldtwin.scenarios.language.file_name import SUFFIX
+
+    if not file_path.name.endswith(SUFFIX):
         return None
     from fieldtwin.testing.scenario_file import ScenarioFile
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
+from fieldtwin.scenarios.language.file_name import case_of
 from fieldtwin.testing.outcome import ScenarioOutcome, run_scenario
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, command_of
 
-SUFFIX = ".scenario.yaml"
 ABOUT = ("case", "role", "impact")
 
 
@@ -31,7 +31,7 @@ class ScenarioFile(pytest.File):
     """One file."""
 
     def collect(self) -> Iterator[ScenarioItem]:
-        made: ScenarioItem = ScenarioItem.from_parent(self, name=self.path.name.removesuffix(SUFFIX))
+        made: ScenarioItem = ScenarioItem.from_parent(self, name=case_of(self.path))
         yield made
 
 

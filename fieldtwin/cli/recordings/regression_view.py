@@ -14,6 +14,7 @@ from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.cli.recordings.regression_options import ToleranceOptions
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.scenarios.language.file_name import SUFFIX
 from fieldtwin.scenarios.regression.as_scenario import ScenarioOptions, as_scenario
 from fieldtwin.scenarios.regression.comparing import Allowed, RunComparison, compare
 from fieldtwin.scenarios.regression.run_history import run_history
@@ -22,7 +23,6 @@ from fieldtwin.twin.site.system import System
 SHOWN = 30
 LENGTHS_S = 1.0
 """A larger difference between the lengths of two runs is reported."""
-SUFFIX = ".scenario.yaml"
 
 
 def allowed_of(options: ToleranceOptions) -> Allowed:

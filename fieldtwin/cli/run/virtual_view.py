@@ -170,6 +170,7 @@ def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
     from fieldtwin.run.campaigns.confirming import confirm_run
     from fieldtwin.run.campaigns.many_seeds import shrunk
     from fieldtwin.run.campaigns.shrink import as_scenario
+    from fieldtwin.scenarios.language.file_name import SUFFIX
 
     stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrunk(options, failed)
@@ -178,7 +179,7 @@ def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
             f"seed {failed.seed} does not fail again with the same faults, so no scenario is written", soft_wrap=True
         )
         return
-    path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
+    path = Path(f"{Path(options.system).stem}-seed{failed.seed}{SUFFIX}")
     title = f"what failed with seed {failed.seed}"
     acts = [(one.at_s, {"send": {"period_s": one.period_s}}) for one in small.scripted]
     text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)

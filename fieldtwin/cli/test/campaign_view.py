@@ -15,6 +15,7 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of, shrink_seed
+from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
 FAULTS_SHOWN = 12
@@ -94,7 +95,7 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
             f"seed {small.seed} does not fail again with the same faults, so no scenario is written", markup=False
         )
         return []
-    path = Path(f"{campaign.path.name.removesuffix('.scenario.yaml')}-seed{small.seed}.scenario.yaml")
+    path = Path(f"{case_of(campaign.path)}-seed{small.seed}{SUFFIX}")
     write_text(path, scenario_of(campaign, small, Path()))
     confirmed = confirm(path, campaign, small)
     lines = shrunk_texts(

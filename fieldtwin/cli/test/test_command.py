@@ -25,10 +25,11 @@ from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.check_options import JunitOptions
 from fieldtwin.cli.test.target_options import TargetOptions
-from fieldtwin.cli.test.trace_files import SUFFIX, trace_files
+from fieldtwin.cli.test.trace_files import trace_files
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.scenarios.language.file_name import SUFFIX
 
 if TYPE_CHECKING:
     from fieldtwin.results.model import Machine, ScenarioResult, SystemKey

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-
-SUFFIX = ".scenario.yaml"
+from fieldtwin.scenarios.language.file_name import case_of
 
 
 def trace_files(scenarios: Sequence[Path], trace: str | None, folder: Path | None) -> list[Path | None]:
@@ -26,7 +25,7 @@ def trace_files(scenarios: Sequence[Path], trace: str | None, folder: Path | Non
     count: dict[str, int] = {}
     found: list[Path | None] = []
     for scenario in scenarios:
-        name = scenario.name.removesuffix(SUFFIX)
+        name = case_of(scenario)
         count[name] = count.get(name, 0) + 1
         found.append(folder / (f"{name}-{count[name]}.jsonl" if count[name] > 1 else f"{name}.jsonl"))
     return found

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.conformance.core.waivers import Waivers
 from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.scenarios.language.about import case_of
+from fieldtwin.scenarios.language.file_name import case_of
 
 _WAIVED = "waived: "
 

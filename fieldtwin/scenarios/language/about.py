@@ -6,24 +6,18 @@ This module uses no bench and runs nothing.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.scenarios.language.file_name import case_of
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.words import Step, word_of
 
-SUFFIX = ".scenario.yaml"
 ROLE = "controller"
 """The role under test: the gateway and PLC of the system, or the controller that the scenario's probes read."""
 _DANGER = {"send": Impact.WRITE, "set": Impact.WRITE, "fault": Impact.DISRUPT, "clear": Impact.DISRUPT}
 """Impact levels of steps; all other steps observe."""
-
-
-def case_of(path: Path) -> str:
-    """Return the case id: the file's name without its suffix."""
-    return path.name.removesuffix(SUFFIX)
 
 
 def impacts(scenario: Scenario) -> Iterator[tuple[Impact, str]]:

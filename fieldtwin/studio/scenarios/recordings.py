@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.scenarios.language.file_name import SUFFIX
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.scenarios.proposal import as_scenario
 from fieldtwin.studio.scenarios.recorder import Recorder
-from fieldtwin.studio.scenarios.runner import SUFFIX
 from fieldtwin.twin.site.data_files import search_path
 
 MOST_RECORDINGS = 8

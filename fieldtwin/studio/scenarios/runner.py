@@ -13,10 +13,10 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.scenarios.language.file_name import SUFFIX
 from fieldtwin.studio import child_process
 from fieldtwin.studio.scenarios.progress import RunProgress
 
-SUFFIX = ".scenario.yaml"
 MOST_FILES = 200
 MOST_FILE_BYTES = 1 << 20
 MOST_OUTPUT_BYTES = 8 << 20

@@ -19,7 +19,8 @@ from fieldtwin.acoustic.schema import SHIP
 from fieldtwin.acoustic.session import NetworkOptions, NetworkSession
 from fieldtwin.acoustic.ship import scripted_commands
 from fieldtwin.acoustic.summary import summarise_network
-from fieldtwin.cli.run.live_view import print_faults, troubles
+from fieldtwin.cli.run.summary_view import print_faults
+from fieldtwin.cli.run.troubles import troubles
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.live.session import RunSession

@@ -9,7 +9,9 @@ from msgspec import structs
 from rich.console import Console
 from statuses import gateway_status
 
-from fieldtwin.cli.run.live_view import age_text, interference, line, render, troubles, value_text
+from fieldtwin.cli.run.live_view import age_text, line, render
+from fieldtwin.cli.run.plc_views import value_text
+from fieldtwin.cli.run.troubles import interference, troubles
 from fieldtwin.plc.status import PlcStatus, Spread
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession

@@ -6,97 +6,36 @@ import asyncio
 import json
 import sys
 from collections.abc import Callable, Coroutine
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.table import Table
 
-from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
+from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, pairs_of, request_of
 from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
 from fieldtwin.capture.recordings.rotating_file import exchanges_of, header_of, parts_of
 from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logged
-from fieldtwin.cli.option_groups import GroupedCommand, group, option
-from fieldtwin.cli.options import Duration, json_option, pairs
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import json_option
+from fieldtwin.cli.recordings.compare_options import LiveOptions, RuleOptions
+from fieldtwin.cli.recordings.compare_view import SHOWN, print_comparison
 from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
 from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
-from fieldtwin.console import stderr, stdout
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import SCHEMES
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
-from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.protocols.canopen.sdo.transfers import SdoUpload
 from fieldtwin.gateway.wallclock import run as run_precise
 from fieldtwin.reports.site.about import headed
 from fieldtwin.twin.site.data_files import find
 
-SHOWN = 20
 INCONCLUSIVE = 4
 """Exit code: all compared values agree, but some could not be compared."""
-
-
-@dataclass(frozen=True)
-class RuleOptions:
-    """How much the two may differ, as texts."""
-
-    tolerances: tuple[str, ...] = option(
-        "--tolerance",
-        multiple=True,
-        metavar="[TAG=]AMOUNT",
-        help="Tolerance of values, such as 2 or 1% or frequency=0.05; repeatable. Default: 0.",
-    )
-    latency: str = option(
-        "--latency",
-        default="20ms/50%",
-        show_default=True,
-        metavar="AMOUNT",
-        help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
-    )
-    least: float = option(
-        "--least",
-        type=click.FloatRange(0, 100),
-        default=100.0,
-        show_default=True,
-        metavar="PERCENT",
-        help="Required share of equal exchanges.",
-    )
-
-    @property
-    def rules(self) -> Rules:
-        """Return the parsed rules. Raises `UsageError`."""
-        return Rules(*_tolerances(self.tolerances), _latency(self.latency), self.least / 100)
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """The requests to a live device, and the confirmation of writes. `most` None: every request of the recording."""
-
-    most: int | None = option(
-        "--most", type=click.IntRange(1), default=None, help="With a live device: send only this many requests."
-    )
-    listen_s: float = option(
-        "--listen",
-        type=Duration(),
-        default="0s",
-        help="With a live bus: listen for this time, and compare messages too.",
-    )
-    spacing_s: float = option(
-        "--spacing", type=Duration(), default="0s", help="With a live device: pause after every exchange."
-    )
-    writes: bool = option(
-        "--writes", is_flag=True, help="With a live device: repeat the recorded writes as well, after a confirmation."
-    )
-    yes: bool = option("--yes", is_flag=True, help="With --writes: do not ask for confirmation.")
-    i_know: bool = option(
-        "--i-know", is_flag=True, help="With --writes: repeat broadcasts and restarts (FC08) as well."
-    )
-    dry_run: bool = option(
-        "--dry-run", is_flag=True, help="With a live device: print the frames that would be sent; send nothing."
-    )
 
 
 @click.command("compare", cls=GroupedCommand)
@@ -161,7 +100,7 @@ def command(
         )
         sys.stdout.write("\n")
     else:
-        _show(result, recording, other, everything)
+        print_comparison(result, recording, other, everything)
     return 0 if result.met else INCONCLUSIVE if result.inconclusive else 1
 
 
@@ -194,45 +133,6 @@ def _dry(recording: Path, url: str, device: DeviceOptions, sending: LiveOptions)
             asked += 1
             click.echo(frame.hex(" "))
     return 0
-
-
-# -- tolerances -----------------------------------------------------------------------------------------------------------
-
-
-def _tolerances(texts: tuple[str, ...]) -> tuple[Tolerance, dict[str, Tolerance]]:
-    plain = [t for t in texts if "=" not in t]
-    named = pairs(tuple(t for t in texts if "=" in t), "--tolerance")
-    if len(plain) > 1:
-        raise UsageError("one tolerance for all, others by tag", got=", ".join(plain))
-    return (_tolerance(plain[0]) if plain else Tolerance()), {tag: _tolerance(text) for tag, text in named.items()}
-
-
-def _tolerance(text: str) -> Tolerance:
-    try:
-        if text.endswith("%"):
-            return Tolerance(share=_positive(text[:-1]) / 100)
-        return Tolerance(_positive(text))
-    except ValueError:
-        raise UsageError("cannot read a tolerance", expected="a number such as 2, or 1%", got=text) from None
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < 1e300:
-        raise ValueError
-    return value
-
-
-def _latency(text: str) -> Tolerance | None:
-    if text == "any":
-        return None
-    absolute = share = 0.0
-    for part in text.split("/"):
-        if part.endswith("%"):
-            share = _tolerance(part).share
-        else:
-            absolute = float(Duration().convert(part, None, None))
-    return Tolerance(absolute, share)
 
 
 # -- the four cases -----------------------------------------------------------------------------------------------------
@@ -351,61 +251,3 @@ def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, A
             await work(stop, lambda done: status.update(f"comparing: {done} exchanges"))
 
     run_precise(main())
-
-
-# -- output --------------------------------------------------------------------------------------------------------------
-
-
-def _show(result: Comparison, recording: Path, other: str, everything: bool) -> None:
-    name = recording.name if recording.suffix == ".log" else shown(parts_of(recording)[0])
-    stdout.print(f"{other} against {name}", soft_wrap=True, markup=False)
-    if result.differences:
-        table = Table("at s", "unit", "what", "asked", "where", "recorded", "there", box=None, pad_edge=False)
-        for d in result.differences if everything else result.differences[:SHOWN]:
-            table.add_row(f"{d.t_s:.3f}", str(d.unit), d.what, d.request, d.where, d.recorded, d.other)
-        stdout.print(table)
-        left = sum(result.by_kind.values()) - min(len(result.differences), SHOWN)
-        if left > 0 and not everything:
-            stderr.print("  and more: --all", soft_wrap=True)
-    if result.latency:
-        table = Table(
-            "latency, ms", "n", "recorded p50", "p90", "p99", "there p50", "p90", "p99", box=None, pad_edge=False
-        )
-        for row in result.latency:
-            times = [f"{1000 * t:.1f}" for t in (*row.recorded_s, *row.other_s)]
-            table.add_row(row.service, str(row.count), *times, "" if row.alike else "beyond tolerance")
-        stdout.print(table)
-    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(result.by_kind.items()))
-    stdout.print(
-        f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
-    )
-    if result.extra:
-        stdout.print(f"{result.extra} more in the other one, which the recording does not contain", soft_wrap=True)
-    if result.left_out:
-        stdout.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
-    if result.left_out_writes and result.by_kind:
-        stdout.print(
-            f"{result.after_left_out} of the differences are in what {result.left_out_writes} left-out writes had set; "
-            "others may follow from these writes: --writes makes them again", soft_wrap=True,
-        )  # fmt: skip
-    _show_shifts(result)
-    timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
-    verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
-    alike = f"{100 * result.values:.1f} %" if result.compared else "not known"
-    stdout.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
-
-
-def _show_shifts(result: Comparison) -> None:
-    """Print at which positions the live dialogue continued the recorded one, and which exchanges the recording does not cover."""
-    for shift in result.shifts[:SHOWN]:
-        stdout.print(
-            f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
-    if len(result.shifts) > SHOWN:
-        stdout.print(f"and {len(result.shifts) - SHOWN} more registers or bits", soft_wrap=True)
-    if result.not_compared:
-        stdout.print(
-            f"{result.not_compared} not compared: the recording has no values after that position. "
-            "Restart the emulator to compare everything", soft_wrap=True,
-        )  # fmt: skip

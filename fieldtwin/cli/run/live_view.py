@@ -1,4 +1,4 @@
-"""A run on the terminal: a live table (elsewhere one line a second), and the summary at the end.
+"""A run on the terminal: a live table, or one line a second where stderr is not a terminal.
 
 Everything comes from the session's statuses; this module only formats text.
 """
@@ -10,31 +10,23 @@ from itertools import islice
 from types import TracebackType
 from typing import Any
 
-import msgspec
 from rich.console import Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
-from fieldtwin.console import stderr, stdout
-from fieldtwin.gateway.runtime.gateway_status import BusStatus, FrontStatus, GatewayStatus
+from fieldtwin.cli.run.plc_views import value_text
+from fieldtwin.cli.run.troubles import fronts_of, interference, troubles, waiting_once
+from fieldtwin.console import stderr
+from fieldtwin.gateway.runtime.gateway_status import BusStatus
 from fieldtwin.plc.status import PlcStatus
-from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.twin.prototype.field_status import StruckStatus
 
 COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
 REFRESH_S = 0.25
 LINE_S = 1.0
 MAX_TAGS = 40
 MAX_TROUBLES = 5
-MAX_FORCES = 6
-MAX_REFUSED = 5
-READ_ONLY = "read-only"
-"""The cause of a refusal that is intended: the plant runs read-only."""
-MOST_FAULTS = 20
 
 
 def print_mapping(session: RunSession) -> None:
@@ -115,7 +107,7 @@ class LiveView:
         while True:
             await asyncio.sleep(LINE_S)
             open_ports = self._tell_once(open_ports)
-            now = [*troubles(self._session), *_waiting_once(self._session)]
+            now = [*troubles(self._session), *waiting_once(self._session)]
             for trouble in now:
                 if trouble not in told:  # a problem is printed once, and again only after it had disappeared
                     stderr.print(f"! {trouble}", soft_wrap=True, markup=False)
@@ -134,88 +126,7 @@ class LiveView:
 
 def ports(session: RunSession) -> list[str]:
     """Return where the gateway serves tags and lets clients reach units."""
-    return [f"{kind} {name}  ←  {front.listening}" for kind, name, front in _fronts(session) if front.listening]
-
-
-def _fronts(session: RunSession) -> list[tuple[str, str, FrontStatus]]:
-    """Return kind, name and status of each server and bridge."""
-    gateway = session.gateway_status
-    if gateway is None:
-        return []
-    return [
-        (kind, name, front)
-        for kind, fronts in (("serve", gateway.serve), ("bridge", gateway.bridge))
-        for name, front in fronts.items()
-    ]
-
-
-def troubles(session: RunSession) -> list[str]:
-    """Return the present problems with their reasons.
-
-    They are errors of the run, buses that cannot be opened, devices that do not answer, and what stopped the PLC, the digital
-    thread's carrier or its store.
-    """
-    gateway = session.gateway_status
-    found = list(session.errors)
-    if session.field_return is not None and (trouble := session.field_return.trouble):
-        found.append(trouble)
-    closed = {name: bus.error for name, bus in (gateway.buses if gateway else {}).items() if bus.error}
-    found += [f"{name}: {error}" for name, error in closed.items()]
-    found += [f"{kind} {name}: {front.error}" for kind, name, front in _fronts(session) if front.error]
-    for name, device in (gateway.devices if gateway else {}).items():
-        if device.error and device.error != closed.get(device.bus):
-            found.append(f"{name}: {device.error}")
-        if device.unstarted:
-            found.append(f"{name}: {device.unstarted}")
-    if session.plc_status is not None and session.plc_status.error:
-        found.append(f"PLC: {session.plc_status.error}")
-    if gateway is not None:
-        found += refused(gateway)
-    if (thread := session.thread_status) is not None:
-        found += [f"thread: {thread.trouble}"] if thread.trouble else []
-        found += [f"store of the thread: {thread.store_trouble}"] if thread.store_trouble else []
-    return found
-
-
-def refused(gateway: GatewayStatus) -> list[str]:
-    """Return the refused outputs, each with its value, the reason and the program's line.
-
-    In a read-only plant one line stands for all outputs that are not written by design.
-    """
-    entries = [e for e in gateway.refusals.entries if e.standing]
-    by_design = {e.tag for e in entries if e.cause == READ_ONLY}
-    found = [refusal_text(e.tag, msgspec.structs.asdict(e)) for e in entries if e.cause != READ_ONLY]
-    if by_design:
-        found.append(f"read-only plant: {', '.join(sorted(by_design))} not written (--allow-writes)")
-    return found
-
-
-def interference(session: RunSession) -> list[str]:
-    """Return why the PLC does not follow its programs: it is paused, a program waits for its start, or a tag is forced."""
-    plc = session.plc_status
-    if plc is None:
-        return []
-    found = ["PAUSED: the PLC executes no program, its outputs keep their values"] if plc.state == "paused" else []
-    found += waiting_texts(plc.waiting)
-    if plc.forces:
-        found.append(f"FORCED: {forces_text(plc.forces)}")
-    return found
-
-
-def _waiting_once(session: RunSession) -> list[str]:
-    """Return the waiting programs without the seconds, so that a log reports each once."""
-    waiting = session.plc_status.waiting if session.plc_status is not None else {}
-    return [f"program {program} has not started; missing {start.reason}" for program, start in waiting.items()]
-
-
-def forces_text(forces: dict[str, Any]) -> str:
-    """Return ``ctd.pressure = 5 by ada, ...``: the first few forces and the number of the rest."""
-    shown = [
-        f"{tag} = {value_text(force['value'])}" + (f" by {force['by']}" if force["by"] else "")
-        for tag, force in list(forces.items())[:MAX_FORCES]
-    ]
-    more = len(forces) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    return [f"{kind} {name}  ←  {front.listening}" for kind, name, front in fronts_of(session) if front.listening]
 
 
 def line(session: RunSession) -> str:
@@ -323,13 +234,6 @@ def _tags(session: RunSession) -> Table:
     return table
 
 
-def value_text(value: Any) -> str:
-    """Return a value as text: floats with six digits, a missing value as a dash."""
-    if value is None:
-        return "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
 def age_text(age_s: float | None) -> str:
     return "-" if age_s is None else f"{age_s:.2f} s" if age_s < 100 else f"{age_s:.0f} s"
 
@@ -359,125 +263,3 @@ def _foot(session: RunSession) -> Text:
 def _us(late: dict[str, Any], key: str) -> str:
     value = late.get(key)
     return "-" if value is None else f"{value / 1000:.2f} ms"
-
-
-def print_summary(summary: dict[str, Any]) -> None:
-    """Print the summary of a run on stdout."""
-    kind = "prototype" if summary["prototype"] else "plant"
-    stdout.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
-    for name, device in summary["devices"].items():
-        mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
-        plays = f", from {device['plays']}" if "plays" in device else ""
-        note = f", but {device['note']}" if device.get("note") else ""
-        stdout.print(f"  {name:<14} {mark}{plays}{note}", soft_wrap=True, highlight=False)
-    for program, states in summary["states"].items():
-        stdout.print(f"  {program:<14} {' → '.join(states) or 'no scan observed'}")
-    for bus, row in summary["exchanges"].items():
-        stdout.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
-    print_faults(summary["faults"])
-    published = summary["published"]
-    if summary["prototype"]:
-        checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
-        if published.get("unknown"):
-            checked += f"; {published['unknown']} not verifiable, because the field simulator was lost"
-        stdout.print(f"  published      {checked}", soft_wrap=True)
-    else:
-        values = "not known" if published["values"] is None else f"{published['values']} good values"
-        stdout.print(f"  published      {values}")
-    if (field := summary["field"]) and field["losses"]:
-        stdout.print(
-            f"  simulator      lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True
-        )
-    if far := summary["topside"]:
-        stdout.print(f"  topside        commands {far['commands_sent']}, responses {far['responses']}")
-    stdout.print(f"  logged         {summary['logged']} exchanges")
-    if thread := summary["thread"]:
-        stdout.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
-    for name, learnt in summary["learnt"].items():
-        stdout.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
-    for text in without_texts(summary["plc"].get("started_without", {})):
-        stdout.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
-    if acts := summary["plc"].get("acts"):
-        left = summary["plc"].get("forces")
-        stdout.print(f"  [yellow]manual[/yellow]         actions on the PLC: {acts_text(acts)}", soft_wrap=True)
-        if left:
-            stdout.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
-    _print_refused(summary)
-    for one in summary["invariants"]:
-        if one["verdict"] != "failed":  # the failed ones are among the errors
-            said = "holds" if one["verdict"] == "passed" else "not checked"
-            text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
-            stdout.print(text, soft_wrap=True, markup=False, highlight=False)
-    told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
-    for error in summary["errors"]:
-        if error in told:  # listed with the device, above
-            continue
-        stdout.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
-    for what in summary["not_judged"]:
-        stdout.print(f"  [yellow]not checked[/yellow]    {what}", soft_wrap=True, highlight=False)
-    stdout.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
-
-
-def _print_refused(summary: dict[str, Any]) -> None:
-    """Print the writes that did not reach their device and are not errors: by design, retried, or requested by a client."""
-    by_design = sorted({e["tag"] for e in summary["refused"] if e["cause"] == READ_ONLY})
-    if by_design:
-        text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
-        stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
-    others = [e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]]
-    for entry in others[:MAX_REFUSED]:
-        text = refusal_text(entry["tag"], entry)
-        stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
-    if len(others) > MAX_REFUSED:
-        stdout.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
-
-
-def print_faults(faults: list[dict[str, Any]]) -> None:
-    """Print how often each fault of a run took effect."""
-    from fieldtwin.results.fault_counts import struck_of
-
-    for fault in msgspec.convert(faults[:MOST_FAULTS], list[StruckStatus]):
-        colour = "yellow" if not fault.struck and not fault.optional else "default"
-        stdout.print(
-            f"  [{colour}]fault[/{colour}]          {escape(struck_of(fault).text)}", soft_wrap=True, highlight=False
-        )
-    if len(faults) > MOST_FAULTS:
-        idle = sum(not fault["struck"] for fault in faults)
-        stdout.print(f"  faults         {len(faults)} in all, {idle} of them never took effect", soft_wrap=True)
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _thread_text(thread: dict[str, Any]) -> str:
-    """Return what the plant's side of the digital thread stored and sent, and the problems of its store or carrier."""
-    text = f"{thread['written']} events kept, {thread['waiting']} not confirmed by the other side"
-    troubles = [t for t in (thread["store_trouble"], thread["trouble"]) if t]
-    return "; ".join([text, *troubles])
-
-
-def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
-    """Return the gaps that were learnt about a device. The last line is ready to be copied into its profile."""
-    parts = []
-    if learnt["missing"]:
-        parts.append(f"does not have {', '.join(learnt['missing'])}")
-    if learnt["borders"]:
-        parts.append(f"accepts fewer registers per read than `limits: read_registers`: {', '.join(learnt['borders'])}")
-    if learnt["line"]:
-        parts.append(f"for the profile of {learnt['profile']}: {learnt['line']}")
-    return f"learnt from the {kind}: " + "; ".join(parts)
-
-
-def _exchange_text(row: dict[str, Any]) -> str:
-    gateway = row["gateway"]
-    text = f"gateway {gateway['requests']} requests, {gateway['replies']} replies"
-    if "pdos" in gateway:
-        text += f", {gateway['pdos']} PDOs, {gateway['heartbeats']} heartbeats"
-    if "emulators" in row:
-        text += f"; emulators {row['emulators']['requests']} / {row['emulators']['replies']}"
-        text += f", with those of {row['shared']}" if "shared" in row else ""
-        text += f", and {row['others']['requests']} requests of other clients" if "others" in row else ""
-    if row["timeouts"] or row["crc_errors"]:
-        text += f"; {row['timeouts']} timeouts, {row['crc_errors']} CRC errors"
-    return text

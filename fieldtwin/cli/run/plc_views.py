@@ -103,7 +103,7 @@ def tag_table(rows: list[Row]) -> Table:
 
 def _named(row: Row, value: Any) -> str:
     """Return a value by its name if it has one, such as a state's."""
-    return str(row["words"].get(str(value), _value(value)))
+    return str(row["words"].get(str(value), value_text(value)))
 
 
 def _limits(limits: list[float] | None) -> str:
@@ -117,7 +117,7 @@ def _quality(row: Row) -> str:
     """Return the quality with its reason, and the substitute value that programs see."""
     text = str(row["quality"]) + ("" if row["reason"] == "none" else f": {row['reason']}")
     for variable, seen in row["seen"].items():
-        text += f"; {variable} sees {_value(seen['value'])} ({seen['quality']})"
+        text += f"; {variable} sees {value_text(seen['value'])} ({seen['quality']})"
     return text
 
 
@@ -244,12 +244,13 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
     for change in changes:
         by = "a force, through" if change["forced"] else ""
         stdout.print(
-            f"{_age(change['age_ms'])} ago, scan {change['scan']}: {_value(change['before'])} to {_value(change['after'])}, "
+            f"{_age(change['age_ms'])} ago, scan {change['scan']}: "
+            f"{value_text(change['before'])} to {value_text(change['after'])}, "
             f"by {by + ' ' if by else ''}program {change['program']}",
             markup=False,
         )
         for name, value in change["inputs"].items():
-            stdout.print(f"    {name} was {_value(value)}", markup=False)
+            stdout.print(f"    {name} was {value_text(value)}", markup=False)
 
 
 def print_proof(name: str, proof: Proof, result: SearchResult, text: str) -> None:
@@ -275,5 +276,8 @@ def _age(ms: float) -> str:
     return f"{ms:.0f} ms" if ms < 10_000 else f"{ms / 1000:.0f} s" if ms < 600_000 else f"{ms / 60_000:.0f} min"
 
 
-def _value(value: Any) -> str:
-    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+def value_text(value: Any) -> str:
+    """Return a value as text: floats with six digits, a missing value as a dash."""
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -248,7 +248,8 @@ def command(
 
 
 async def _run(options: RunOptions, service_options: ServiceOptions, studio: str, as_json: bool) -> int:
-    from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_studio, print_summary
+    from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_studio
+    from fieldtwin.cli.run.summary_view import print_summary
     from fieldtwin.console import show_warnings
 
     check(service_options)

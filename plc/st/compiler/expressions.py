@@ -4,14 +4,13 @@ is written to the `CodeWriter` first, in order."""
 from __future__ import annotations
 
 from math import isfinite
-from typing import NoReturn
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.literals import Malformed, constant
+from fieldtwin.plc.st.compiler.operators import binary, unary
 from fieldtwin.plc.st.compiler.scope import (
-    COMPARISONS,
     CodeWriter,
     Environment,
     Parameter,
@@ -22,14 +21,13 @@ from fieldtwin.plc.st.compiler.scope import (
     wrapped,
 )
 from fieldtwin.plc.st.compiler.standard import FUNCTIONS
-from fieldtwin.plc.st.compiler.time_arithmetic import with_time
+from fieldtwin.plc.st.compiler.variables import bit, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 80
 """How deep calls, parentheses and indices may be nested."""
 MAX_OPEN = 40
 """How deep brackets may be nested in one line of Python: a deeper part is computed on a line before it."""
-_LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_ELSE": "or"}
 
 
 class Expressions:
@@ -124,10 +122,10 @@ class Expressions:
         before, self.wanted = self.wanted, wanted
         try:
             if isinstance(expr, t.Ref):
-                return self.reference(expr)
+                return variable(self, expr)
             if isinstance(expr, t.Call):
-                return self._flat(self.call(expr), expr.pos)
-            return self._flat(self._unary(expr) if isinstance(expr, t.Unary) else self._binary(expr), expr.pos)
+                return self.flat(self.call(expr), expr.pos)
+            return self.flat(unary(self, expr) if isinstance(expr, t.Unary) else binary(self, expr), expr.pos)
         finally:
             self._deep -= 1
             self.wanted = before
@@ -158,7 +156,7 @@ class Expressions:
                 kind = members[name][1] if name in members else None
         return kind
 
-    def _flat(self, value: Value, pos: t.Pos) -> Value:
+    def flat(self, value: Value, pos: t.Pos) -> Value:
         """Return `value`. If it has more nested brackets than Python can parse, write it on a preceding line."""
         if value.code.count("(") + value.code.count("[") <= MAX_OPEN or _open(value.code) <= MAX_OPEN:
             return value
@@ -193,216 +191,6 @@ class Expressions:
         if number is None:
             self.env.unknown(literal.pos, f"in {enum}, a value", name, list(enum.values))
         return Value(repr(number), enum, number)
-
-    def _unary(self, expr: t.Unary) -> Value:
-        wanted = self.wanted
-        value = self.value(expr.operand, wanted)
-        kind = ty.plain(value.type)
-        if expr.op == "NOT":
-            if isinstance(kind, ty.AnyInt) and ty.takes_bits(wanted, kind):
-                value, kind = Value(self.coerced(value, wanted, expr.pos), wanted), wanted
-            if ty.is_kind(kind, "bool"):
-                return Value(f"(not {value.code})", ty.BOOL, None if value.constant is None else not value.constant)
-            if isinstance(kind, ty.Elementary) and kind.kind == "bits":
-                return Value(f"({value.code} ^ {kind.high})", kind)
-            self.env.fail(expr.pos, "NOT", expected="BOOL or a bit string", got=str(kind))
-        if not ty.is_kind(kind, "int", "real", "duration"):
-            self.env.fail(expr.pos, f"the sign {expr.op}", expected="a number or a duration", got=str(kind))
-        if expr.op == "+":
-            return value
-        if isinstance(kind, ty.AnyInt | ty.AnyReal):
-            return Value(f"(-{value.code})", kind) if value.constant is None else self.known(expr, -value.constant)
-        assert isinstance(kind, ty.Elementary)
-        return Value(wrapped(f"-{value.code}", kind), kind)
-
-    def _binary(self, expr: t.Binary) -> Value:
-        """Compile a chain of operators from its left end, so that a long chain does not nest deeply."""
-        chain, first = [expr], expr.left
-        while isinstance(first, t.Binary):
-            chain.append(first)
-            first = first.left
-        wanted = self.wanted if expr.op in _LOGIC else None
-        value = self.value(first, wanted or self.declared(*(link.right for link in reversed(chain))))
-        for link in reversed(chain):
-            value = self._flat(self._joined(link, value), link.pos)
-        return value
-
-    def _joined(self, expr: t.Binary, left: Value) -> Value:
-        mark = len(self.out.lines)
-        wanted = left.type if ty.of_bits(left.type) else self.wanted if expr.op in _LOGIC else None
-        right = self.value(expr.right, wanted)
-        if expr.op in ("AND_THEN", "OR_ELSE") and len(self.out.lines) > mark:
-            left, right = self._only_if_needed(expr, left, right, self.out.since(mark))
-        if expr.op in _LOGIC:
-            return self._logic(expr, left, right)
-        if expr.op in COMPARISONS:
-            return self._comparison(expr, left, right)
-        timed = with_time(expr.op, left, right)
-        if timed is not None:
-            return timed
-        kind = ty.common(left.type, right.type)
-        if kind is None or not ty.is_kind(kind, "int", "real"):
-            self._mismatch(expr, left, right, "numbers of compatible types")
-        if isinstance(kind, ty.AnyInt | ty.AnyReal):
-            return self._folded(expr, left, right)
-        assert isinstance(kind, ty.Elementary)
-        if expr.op == "**":
-            kind = kind if kind.kind == "real" else ty.LREAL
-            power = f"_v.power({left.code}, {right.code})"
-            return Value(f"_v.real({power})" if kind.bits == 32 else power, kind)
-        a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
-        if expr.op == "MOD":
-            if kind.kind != "int":
-                self._mismatch(expr, left, right, "integers")
-            return Value(f"_v.modulo({a}, {b})", kind)
-        if expr.op == "/":
-            return Value(wrapped(f"_v.{'divide' if kind.kind == 'int' else 'divide_real'}({a}, {b})", kind), kind)
-        return Value(wrapped(f"{a} {expr.op} {b}", kind), kind)
-
-    def _only_if_needed(
-        self, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, int]]
-    ) -> tuple[Value, Value]:
-        """Return both sides of AND or OR.
-
-        Lines that the right side needs run only if the left side does not decide the result.
-        """
-        name = self.out.temporary()
-        self.out.line(f"{name} = {left.code}", expr.pos)
-        decided = "not " if expr.op == "OR_ELSE" else ""
-        with self.out.block(f"if {decided}{name}:", expr.pos):
-            self.out.again(prepared)
-            self.out.line(f"{name} = {right.code}", expr.pos)
-        known = Value(name, left.type)
-        return known, Value(name, right.type)
-
-    def _logic(self, expr: t.Binary, left: Value, right: Value) -> Value:
-        a, b = left.constant, right.constant
-        untyped = isinstance(left.type, ty.AnyInt) and isinstance(right.type, ty.AnyInt)
-        if untyped and expr.op in ("AND", "&", "OR", "XOR") and min(a, b) >= 0:  # the context determines the width
-            return self.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
-        kind = ty.common(left.type, right.type)
-        if kind is None or not ty.is_kind(kind, "bool", "bits"):
-            self._mismatch(expr, left, right, "BOOL, or bit strings of compatible types")
-        x, y = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
-        if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
-            self._mismatch(expr, left, right, "BOOL")
-        return Value(f"({x} {_LOGIC[expr.op]} {y})", kind)
-
-    def _comparison(self, expr: t.Binary, left: Value, right: Value) -> Value:
-        kind = ty.common(left.type, right.type)
-        if kind is None or not isinstance(kind, ty.Elementary | ty.AnyInt | ty.AnyReal | ty.String | ty.Enum):
-            self._mismatch(expr, left, right, "two values of compatible types")
-        if isinstance(kind, ty.AnyInt | ty.AnyReal | ty.String):
-            a, b = left.code, right.code
-        else:
-            a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
-        return Value(f"({a} {COMPARISONS[expr.op]} {b})", ty.BOOL)
-
-    def _folded(self, expr: t.Binary, left: Value, right: Value) -> Value:
-        a, b = left.constant, right.constant
-        if a is None or b is None:  # a choice between constants (SEL, MAX)
-            if expr.op == "MOD":
-                self._mismatch(expr, left, right, "integers")
-            return Value(_of_reals(expr.op, left.code, right.code), ty.AnyReal(0.0))
-        whole = isinstance(a, int) and isinstance(b, int)
-        try:
-            if expr.op == "/":
-                result = values.divide(a, b) if whole else values.divide_real(a, b)
-            elif expr.op == "MOD" and whole:
-                result = values.modulo(a, b)
-            elif expr.op == "**":
-                result = values.power(a, b)
-            elif expr.op in ("+", "-", "*"):
-                result = a + b if expr.op == "+" else a - b if expr.op == "-" else a * b
-            else:
-                self._mismatch(expr, left, right, "integers")
-        except values.LogicError as e:
-            self.env.fail(expr.pos, e.message)
-        return self.known(expr, result)
-
-    def _mismatch(self, expr: t.Binary, left: Value, right: Value, expected: str) -> NoReturn:
-        self.env.fail(expr.pos, f"operands of {expr.op}", expected=expected, got=f"{left.type} and {right.type}")
-
-    # -- variables --------------------------------------------------------------------------------------------------------
-
-    def reference(self, ref: t.Ref) -> Value:
-        symbol = self.symbols.get(ref.name.lower()) or self.env.globals.get(ref.name.lower())
-        if symbol is None:
-            return self._enum_value(ref)
-        if self.only_constants and symbol.constant is None:
-            self.env.fail(ref.pos, f"{ref.name} is not a constant", expected="a constant expression")
-        owner, _, own = symbol.code.rpartition(".")
-        reference = symbol.reference or (f"_v.MemberReference({owner}, {own!r})" if owner else "")
-        value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference)
-        for selector in ref.selectors:
-            if isinstance(selector, t.Member):
-                value = self._member(value, selector)
-            elif isinstance(selector, t.Index):
-                value = self._index(value, selector)
-            else:
-                value = self._bit(value, selector)
-        return value
-
-    def _enum_value(self, ref: t.Ref) -> Value:
-        found = self.env.enum_values.get(ref.name.lower(), [])
-        if not found or ref.selectors:
-            known = [s.name for s in (*self.symbols.values(), *self.env.globals.values())]
-            self.env.unknown(ref.pos, "a variable", ref.name, known)
-        if len(found) > 1:
-            names = ", ".join(f"{enum}#{ref.name}" for enum, _ in found)
-            self.env.fail(ref.pos, f"{ref.name} is a value of several types", expected=names)
-        enum, number = found[0]
-        return Value(repr(number), enum, number)
-
-    def _member(self, value: Value, member: t.Member) -> Value:
-        kind, name = value.type, member.name.lower()
-        if isinstance(kind, ty.Struct) and name in kind.fields:
-            reference = f"_v.MemberReference({value.code}, {f'm_{name}'!r})"
-            return Value(f"{value.code}.m_{name}", kind.fields[name][1], None, True, value.writable, reference)
-        if isinstance(kind, ty.Block):
-            for members, writable in ((kind.inputs, True), (kind.outputs, False)):
-                if name in members:
-                    attribute = members[name][0] if kind.standard else f"v_{name}"
-                    reference = f"_v.MemberReference({value.code}, {attribute!r})"
-                    return Value(f"{value.code}.{attribute}", members[name][1], None, True, writable, reference)
-        known: list[str] = []
-        if isinstance(kind, ty.Struct):
-            known = [f for f, _ in kind.fields.values()]
-        elif isinstance(kind, ty.Block):
-            known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values())]
-        raise self.env.unknown(member.pos, f"in {kind}, a member", member.name, known)
-
-    def _index(self, value: Value, selector: t.Index) -> Value:
-        kind = value.type
-        if not isinstance(kind, ty.Array):
-            self.env.fail(selector.pos, "an index into a value that is not an array", got=str(kind))
-        if len(selector.indices) != len(kind.ranges):
-            self.env.fail(
-                selector.pos, "indices", expected=f"{len(kind.ranges)} for {kind}", got=str(len(selector.indices))
-            )
-        code, owner, at = value.code, "", ""
-        for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
-            index = self._flat(self.value(expr), expr.pos)
-            if not ty.is_kind(index.type, "int", "bits"):
-                self.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
-            if isinstance(index.constant, int):
-                if not low <= index.constant <= high:
-                    self.env.fail(expr.pos, "an index outside its array", expected=f"{low} to {high}", got=index.code)
-                at = str(index.constant - low)
-            else:
-                at = f"_v.index({index.code}, {low}, {high})"
-            owner, code = code, f"{code}[{at}]"
-        return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})")
-
-    def _bit(self, value: Value, selector: t.Bit) -> Value:
-        kind = ty.plain(value.type)
-        if not (isinstance(kind, ty.Elementary) and kind.kind in ("int", "bits")):
-            self.env.fail(
-                selector.pos, "a bit of a value without bits", expected="an integer or a bit string", got=str(kind)
-            )
-        if selector.number >= kind.bits:
-            self.env.fail(selector.pos, f"{kind} has bits 0 to {kind.bits - 1}", got=str(selector.number))
-        return Value(f"bool({value.code} >> {selector.number} & 1)", ty.BOOL)
 
     # -- calls ------------------------------------------------------------------------------------------------------------
 
@@ -470,7 +258,7 @@ class Expressions:
         """Write an assignment. An assignment to a bit of a variable keeps all other bits."""
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
             whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
-            self._bit(whole, ref.selectors[-1])
+            bit(self, whole, ref.selectors[-1])
             code = f"_v.set_bit({whole.code}, {ref.selectors[-1].number}, {self.coerced(value, ty.BOOL, pos)})"
             kind = ty.plain(whole.type)
             assert isinstance(kind, ty.Elementary)
@@ -489,7 +277,7 @@ class Expressions:
             self.out.line(f"{target.code} = {code}", pos)
 
     def writable(self, ref: t.Ref) -> Value:
-        target = self.reference(ref)
+        target = variable(self, ref)
         if not target.writable:
             self.env.fail(
                 ref.pos, f"{ref.name} cannot be assigned to", hint="it is a constant, an input, or a block's output"
@@ -544,12 +332,6 @@ def _open(code: str) -> int:
 
 def _value_of(argument: t.Argument | None) -> t.Expr | None:
     return None if argument is None else argument.value
-
-
-def _of_reals(op: str, a: str, b: str) -> str:
-    if op in ("/", "**"):
-        return f"_v.{'divide_real' if op == '/' else 'power'}({a}, {b})"
-    return f"({a} {op} {b})"
 
 
 def _into(p: Parameter, signature: Signature) -> str:

@@ -98,16 +98,20 @@ class Environment:
 
 
 class Compiling(Protocol):
-    """The compiler of expressions (`expressions.Expressions`), as a standard function uses it."""
+    """The compiler of expressions (`expressions.Expressions`), as standard functions, operators and references use it."""
 
     env: Environment
     symbols: dict[str, Symbol]
+    out: CodeWriter
+    only_constants: bool
     program_inputs: set[str]
     wanted: ty.Type | None
 
     def value(self, expr: Expr, wanted: ty.Type | None = None) -> Value: ...
 
     def declared(self, *exprs: Expr) -> ty.Type | None: ...
+
+    def flat(self, value: Value, pos: Pos) -> Value: ...
 
     def known(self, expr: Expr, result: float) -> Value: ...
 

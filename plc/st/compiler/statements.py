@@ -9,6 +9,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, wrapped
+from fieldtwin.plc.st.compiler.variables import variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 60
@@ -49,7 +50,7 @@ class Statements(Expressions):
         call = s.call
         known = call.ref.name.lower() in self.symbols or call.ref.name.lower() in self.env.globals
         if call.ref.selectors or known:
-            instance = self.reference(call.ref)
+            instance = variable(self, call.ref)
             if not isinstance(instance.type, ty.Block):
                 self.env.fail(
                     call.pos, f"{call.ref.name} cannot be called", expected="a function block", got=str(instance.type)

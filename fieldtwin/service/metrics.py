@@ -18,7 +18,7 @@ from msgspec import UnsetType
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.sdo.channel import SdoCounters as CanopenCounters
-from fieldtwin.gateway.protocols.modbus.client import ClientCounters
+from fieldtwin.gateway.protocols.modbus.client_counters import ClientCounters
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
 from fieldtwin.service.exposition import Family

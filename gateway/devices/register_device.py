@@ -30,7 +30,8 @@ from fieldtwin.gateway.devices.read_plan import (
     place_of,
     read_request,
 )
-from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.unit_timing import UnitPace
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
 """The most that one request may write (AP 6.11 and 6.12)."""
@@ -104,7 +105,7 @@ class RegisterDriver(DeviceDriver):
         """Use `client`, which communicates over `connection`, from now on."""
         self.attach(connection)
         self._client = client
-        client.set_pace(self.config.address, UnitPace(self.config.timeout_s, self.config.spacing_s))
+        client.units.set_pace(self.config.address, UnitPace(self.config.timeout_s, self.config.spacing_s))
 
     def reconfigure(self, config: DeviceConfig) -> None:
         if config.profile != self.profile:
@@ -114,7 +115,7 @@ class RegisterDriver(DeviceDriver):
             self._scales = any(tag.scale_by is not None for tag in config.profile.tags.values())
         super().reconfigure(config)
         if self._client is not None:
-            self._client.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
+            self._client.units.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
         """Return the value of a tag's stored bytes, decoded with the present configuration.

@@ -7,8 +7,7 @@ retries, reconnects or scales values: the runtime and the drivers do that. It op
 from __future__ import annotations
 
 from collections.abc import Coroutine, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.fair_lock import FairLock
@@ -25,6 +24,7 @@ from fieldtwin.gateway.core.errors import (
     VerifyFailed,
 )
 from fieldtwin.gateway.core.histogram import response_times
+from fieldtwin.gateway.protocols.modbus.client_counters import ClientCounters
 from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing_of, make_framer
 from fieldtwin.gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
 from fieldtwin.gateway.protocols.modbus.requests.data import (
@@ -44,60 +44,9 @@ from fieldtwin.gateway.protocols.modbus.requests.refusals import GatewayRefusal
 from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, RegistersReply, Reply, WriteReply
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.protocols.modbus.unit_timing import UnitTiming, checked_pause, checked_timeout
 
 R = TypeVar("R", bound=Reply)
-
-
-@dataclass(frozen=True, slots=True)
-class UnitPace:
-    """The timing of one unit: its timeout, and the pause that it needs. It applies to all users of the client.
-
-    If `timeout_s` is None, the timeout of the client applies. The pause is the time from the end of an exchange with the unit to
-    the next request for it; other units may use the line meanwhile. Both are in seconds.
-    """
-
-    timeout_s: float | None = None
-    spacing_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.timeout_s is not None:
-            _checked_timeout(self.timeout_s)
-        _checked_pause(self.spacing_s)
-
-
-class Hold(NamedTuple):
-    """A unit that did not answer within a shortened timeout.
-
-    The request was sent at `sent_ns`; its reply may arrive until `until_ns`.
-    """
-
-    sent_ns: int
-    until_ns: int
-
-
-@dataclass(slots=True)
-class ClientCounters:
-    """Counters of this connection since it was opened.
-
-    Every request sent is counted in `requests` and, when it ends, in exactly one other counter: requests = broadcasts + replies +
-    exceptions + timeouts + crc_errors + desyncs + verify_failures + abandoned, plus the request in progress. `replies` counts
-    normal replies only, `broadcasts` all requests that are never answered, and `abandoned` the requests that were cancelled or
-    lost with the connection. `late_bytes` counts bytes of late or duplicate replies, and `noise_bytes` those that are not part of
-    any reply to this client.
-    """
-
-    requests: int = 0
-    broadcasts: int = 0
-    replies: int = 0
-    exceptions: int = 0
-    timeouts: int = 0
-    crc_errors: int = 0
-    desyncs: int = 0
-    verify_failures: int = 0
-    abandoned: int = 0
-    late_bytes: int = 0
-    noise_bytes: int = 0
-    foreign_frames: int = 0
 
 
 class ModbusClient:
@@ -136,29 +85,13 @@ class ModbusClient:
             accepts_zero_id=accepts_zero_id,
         )
         self._line = LineSilence(
-            t35_ns=self._framer.t35_ns if silence_s is None else round(_checked_pause(silence_s) * NS_PER_S),
+            t35_ns=self._framer.t35_ns if silence_s is None else round(checked_pause(silence_s) * NS_PER_S),
             settle_ns=self._framer.rest_ns,
             quarantines=not self._framer.confirms_transmission,
-            turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
-            spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
+            turnaround_ns=round(checked_timeout(turnaround_s) * NS_PER_S),
+            spacing_ns=round(checked_pause(spacing_s) * NS_PER_S),
         )
-        self._paces: dict[int, UnitPace] = {}
-        self._spaces = False
-        """Whether any unit needs pauses."""
-        self._spaced_ns: dict[int, int] = {}
-        self._timeout_s = _checked_timeout(timeout_s)
-        self._timeouts_ns: dict[int, int] = {}
-        """Timeouts by unit ID, in ns; kept until the timing is changed."""
-        self._hurried_ns: dict[int, int] = {}
-        self._held: dict[int, Hold] = {}
-        self.late_ns: dict[int, int] = {}
-        """By unit ID: the time in ns until a reply arrived after its shortened timeout. The code that shortens timeouts
-        removes the entries.
-        """
-        self.hurried_timeouts = 0
-        """The number of `timeouts` that were of units with a shortened timeout."""
-        self.not_waited = 0.0
-        """The sum of the time saved by shortened timeouts, each as a fraction of the unit's normal timeout."""
+        self.units = UnitTiming(timeout_s, has_broadcast=self._framer.has_broadcast)
         self._turn = FairLock()
         self._closed = False
         self.counters = ClientCounters()
@@ -197,45 +130,11 @@ class ModbusClient:
 
     def restate(self, *, timeout_s: float, turnaround_s: float, spacing_s: float) -> None:
         """Change the timing of the whole connection from the next request on; parameters as in the constructor."""
-        self._timeout_s = _checked_timeout(timeout_s)
-        self._timeouts_ns.clear()
+        self.units.restate(timeout_s)
         self._line.restate(
-            turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
-            spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
+            turnaround_ns=round(checked_timeout(turnaround_s) * NS_PER_S),
+            spacing_ns=round(checked_pause(spacing_s) * NS_PER_S),
         )
-
-    def set_pace(self, unit: int, pace: UnitPace) -> None:
-        """Use this timing for `unit` (0 to 255) from now on."""
-        self._paces[unit] = pace
-        self._timeouts_ns.clear()
-        self._spaces = self._spaces or bool(pace.spacing_s)
-
-    def hurry(self, unit: int, timeout_s: float) -> None:
-        """Shorten the timeout of `unit` to `timeout_s`, and let other units use the line while its reply is outstanding.
-
-        This ends with the first reply of `unit`, or with `relax`. Without a reply, the next request to `unit` waits
-        until its normal timeout is also over, because a late reply does not say which request it answers (case MB-013).
-        """
-        self._hurried_ns[unit] = round(_checked_timeout(timeout_s) * NS_PER_S)
-
-    def relax(self, unit: int) -> None:
-        """Restore the normal timeout of `unit`."""
-        self._hurried_ns.pop(unit, None)
-
-    def hurried(self, unit: int) -> bool:
-        """Return whether the timeout of `unit` is shortened and the unit has not answered since then."""
-        return unit in self._hurried_ns
-
-    def spaced_ns(self, unit: int) -> int:
-        """Return the time (ns) from which `unit` may be asked, or 0 if it may be asked now.
-
-        That is when its pause is over and a late reply can no longer arrive. A broadcast (unit 0) waits for the pauses of all
-        units.
-        """
-        if unit == 0 and self._framer.has_broadcast:
-            return max(self._spaced_ns.values(), default=0)
-        spaced_ns, hold = self._spaced_ns.get(unit, 0), self._held.get(unit)
-        return spaced_ns if hold is None else max(spaced_ns, hold.until_ns)
 
     @property
     def clear_ns(self) -> int:
@@ -330,15 +229,16 @@ class ModbusClient:
         sent; `ConnectionLost` when the client can no longer be used. Cancelling is safe: the reply is never taken for
         the reply to a different request.
         """
+        units = self.units
         if timeout_s is not None:
-            timeout_ns = round(_checked_timeout(timeout_s) * NS_PER_S)
-        elif (known_ns := self._timeouts_ns.get(unit)) is not None:
+            timeout_ns = round(checked_timeout(timeout_s) * NS_PER_S)
+        elif (known_ns := units.timeouts_ns.get(unit)) is not None:
             timeout_ns = known_ns
         else:
-            timeout_ns = self._timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
+            timeout_ns = units.timeout_ns(unit)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
-        if self._hurried_ns and (hurried_ns := self._hurried_ns.get(unit)) is not None:
+        if units.hurried_ns and (hurried_ns := units.hurried_ns.get(unit)) is not None:
             timeout_ns = min(timeout_ns, hurried_ns)
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
         if unanswered:
@@ -348,9 +248,9 @@ class ModbusClient:
         try:
             if self._closed:
                 raise closed_locally(self._connection.endpoint)
-            if self._spaced_ns or self._held:
+            if units.spaced or units.held:
                 await self._await_spacing(unit)
-                self._held.pop(unit, None)
+                units.held.pop(unit, None)
             if not self._is_silent():
                 await self._await_silence()
             transaction = Transaction(
@@ -361,8 +261,8 @@ class ModbusClient:
                     return await self._send_only(transaction, request)
                 return await self._exchange(unit, transaction, timeout_ns)
             finally:
-                if self._spaces:
-                    self._space(unit)
+                if units.have_pauses:
+                    units.used(unit, self._clock.monotonic_ns())
         finally:
             self._turn.pass_on()
 
@@ -379,8 +279,8 @@ class ModbusClient:
             settled = True
             line.answered(reply.t_ns, transaction.sent_ns)
             self.latency.record(reply.t_ns - transaction.sent_ns)
-            if self._hurried_ns:
-                self.relax(unit)
+            if self.units.hurried_ns:
+                self.units.relax(unit)
             return reply
         except ModbusExceptionReply as e:
             counters.exceptions += 1
@@ -389,7 +289,7 @@ class ModbusClient:
             line.answered(now_ns, transaction.sent_ns)
             self.latency.record(now_ns - transaction.sent_ns)
             if not isinstance(e, GatewayRefusal):
-                self.relax(unit)
+                self.units.relax(unit)
             self._place(e)
             raise
         except CrcError as e:
@@ -401,8 +301,10 @@ class ModbusClient:
             raise
         except (Desync, ReplyTimeout, VerifyFailed) as e:
             self._count(e)
-            if unit in self._hurried_ns and isinstance(e, ReplyTimeout):
-                self._pass_over(unit, transaction.sent_ns, timeout_ns)
+            if self.units.hurried(unit) and isinstance(e, ReplyTimeout):
+                now_ns = self._clock.monotonic_ns()
+                self.units.pass_over(unit, transaction.sent_ns, now_ns, timeout_ns, self._line.longest_latency_ns)
+                self._line.passed_over(now_ns)
                 settled = True
             self._place(e)
             raise
@@ -417,7 +319,7 @@ class ModbusClient:
             counters.noise_bytes += self._framer.noise_bytes - noise
             counters.foreign_frames += self._framer.foreign_frames - foreign
             if self._framer.strays:
-                self._note_strays()
+                self.units.note_strays(self._framer.strays, self._clock.monotonic_ns())
 
     async def _send_and_await(self, transaction: Transaction[R]) -> R:
         clock, connection = self._clock, self._connection
@@ -460,17 +362,9 @@ class ModbusClient:
 
     async def _await_spacing(self, unit: int) -> None:
         """Wait for the pause of `unit`. Bytes that arrive meanwhile belong to no request."""
-        while (until_ns := self.spaced_ns(unit)) > self._clock.monotonic_ns() and self._connection.lost is None:
+        while (until_ns := self.units.spaced_ns(unit)) > self._clock.monotonic_ns() and self._connection.lost is None:
             data = await self._read_until(until_ns)
             self._drain(data, self._clock.monotonic_ns(), live=True)
-
-    def _space(self, unit: int) -> None:
-        now_ns = self._clock.monotonic_ns()
-        everybody = unit == 0 and self._framer.has_broadcast
-        for one in self._paces if everybody else (unit,):
-            pace = self._paces.get(one)
-            if pace is not None and pace.spacing_s:
-                self._spaced_ns[one] = now_ns + round(pace.spacing_s * NS_PER_S)
 
     async def _await_silence(self) -> None:
         """Return when a request may be sent. Bytes that arrive before that belong to no request and are drained.
@@ -497,29 +391,6 @@ class ModbusClient:
             raise ConnectionLost(lost.message, where=lost.where)
         self._line.may_go(now_ns)
 
-    def _pass_over(self, unit: int, sent_ns: int, timeout_ns: int) -> None:
-        """Delay only the next request to a unit that did not answer within its shortened `timeout_ns`.
-
-        Other units can use the line.
-        """
-        now_ns = self._clock.monotonic_ns()
-        own_ns = round(self._timeout_of(unit) * NS_PER_S)
-        self.hurried_timeouts += 1
-        self.not_waited += max(0.0, 1.0 - timeout_ns / own_ns)
-        # As long as the quarantine of a line after a normal timeout: a late reply must not answer the next request (MB-013).
-        until_ns = max(now_ns, sent_ns + own_ns) + max(own_ns, self._line.longest_latency_ns)
-        self._held[unit] = Hold(sent_ns, until_ns)
-        self._line.passed_over(now_ns)
-
-    def _note_strays(self) -> None:
-        """Note late replies of units with a shortened timeout: such a unit answers, and its reply is no longer outstanding."""
-        now_ns = self._clock.monotonic_ns()
-        for unit, t_ns in self._framer.strays.items():
-            hold = self._held.pop(unit, None)
-            if hold is not None:
-                self.late_ns[unit] = (t_ns or now_ns) - hold.sent_ns
-        self._framer.strays.clear()
-
     def _drain(self, data: bytes, now_ns: int, *, live: bool) -> None:
         if data:
             before = self._framer.late_bytes, self._framer.noise_bytes
@@ -528,7 +399,7 @@ class ModbusClient:
             self.counters.noise_bytes += self._framer.noise_bytes - before[1]
             self._line.heard(now_ns, live=live)
             if self._framer.strays:
-                self._note_strays()
+                self.units.note_strays(self._framer.strays, self._clock.monotonic_ns())
 
     def _read_until(self, deadline_ns: int) -> Coroutine[Any, Any, bytes]:
         """Return the bytes that arrive next, or b"" if none arrive before `deadline_ns`."""
@@ -547,10 +418,6 @@ class ModbusClient:
 
     # -- helpers -------------------------------------------------------------------------------------------------
 
-    def _timeout_of(self, unit: int) -> float:
-        pace = self._paces.get(unit)
-        return self._timeout_s if pace is None or pace.timeout_s is None else pace.timeout_s
-
     def _count(self, error: FieldtwinError) -> None:
         if isinstance(error, Desync):
             self.counters.desyncs += 1
@@ -561,15 +428,3 @@ class ModbusClient:
 
     def _place(self, error: FieldtwinError) -> None:
         error.at(str(self._connection.endpoint))
-
-
-def _checked_timeout(timeout_s: float) -> float:
-    if not 0.0 < timeout_s <= 3600.0:
-        raise UsageError("Modbus timeout out of range", expected="over 0 to 3600 s", got=f"{timeout_s} s")
-    return timeout_s
-
-
-def _checked_pause(pause_s: float) -> float:
-    if not 0.0 <= pause_s <= 3600.0:
-        raise UsageError("Modbus pause out of range", expected="0 to 3600 s", got=f"{pause_s} s")
-    return pause_s

@@ -326,7 +326,7 @@ class ModbusBus:
         stream = self.config.endpoint.scheme in STREAMS
         while True:
             self._awake = False
-            if client.late_ns:
+            if client.units.late_ns:
                 self._heard_late(client)
             if stream and unanswered.too_many(any(device.online for device in self.devices)):
                 raise ConnectionLost(
@@ -347,7 +347,7 @@ class ModbusBus:
                     await self._run_job(job)
                     continue
             seen_ns, timeout_s = self.latency.recent_longest_ns, self.config.timeout_s
-            device, group, at_ns = self._turns.next(client.spaced_ns, now_ns, seen_ns, timeout_s)
+            device, group, at_ns = self._turns.next(client.units.spaced_ns, now_ns, seen_ns, timeout_s)
             due = at_ns <= now_ns
             if self.guests.size and not (due and self._guest_was_last) and await self._carry_guest():
                 backoff.reset()
@@ -362,7 +362,7 @@ class ModbusBus:
         """Return the first queued job whose unit needs no more pause, or None, and the time at which to check again."""
         wake_ns = now_ns + NS_PER_S
         for place, job in enumerate(self._jobs):
-            ready_ns = client.spaced_ns(job.driver.config.address)
+            ready_ns = client.units.spaced_ns(job.driver.config.address)
             if ready_ns <= now_ns:
                 del self._jobs[place]
                 return job, now_ns
@@ -405,10 +405,10 @@ class ModbusBus:
             if probed:
                 device.tried, device.asked_ns = True, begun_ns
                 if device.timeout_ns:
-                    client.hurry(unit, device.timeout_ns / NS_PER_S)
+                    client.units.hurry(unit, device.timeout_ns / NS_PER_S)
                 group = await self._bring_online(device)
             elif not device.alone:
-                client.hurry(unit, self._patience_s(device, begun_ns))
+                client.units.hurry(unit, self._patience_s(device, begun_ns))
             await self._turn(device, group)
         except ConnectionLost:
             raise
@@ -424,8 +424,8 @@ class ModbusBus:
             device.answered_ns = self._clock.monotonic_ns()
             device.backoff.reset()
         finally:
-            if client.hurried(unit):
-                client.relax(unit)
+            if client.units.hurried(unit):
+                client.units.relax(unit)
 
     def _patience_s(self, device: DeviceState, now_ns: int) -> float:
         """Return the timeout in seconds for a device that is online, while other devices also need the bus."""
@@ -468,7 +468,7 @@ class ModbusBus:
         self._offline(device, error)
         now_ns = self._clock.monotonic_ns()
         clear_ns = max(now_ns, client.clear_ns)
-        answered_first = probed and not client.hurried(device.driver.config.address)
+        answered_first = probed and not client.units.hurried(device.driver.config.address)
         device.fits = device.fits and probed and not answered_first
         device.last_cost_ns = clear_ns - begun_ns if answered_first else 0
         self._turns.failed(device, begun_ns, now_ns, clear_ns)
@@ -478,10 +478,10 @@ class ModbusBus:
 
         They are present, so they are asked again at once, with more time."""
         for device in self.devices:
-            late_ns = client.late_ns.get(device.driver.config.address)
+            late_ns = client.units.late_ns.get(device.driver.config.address)
             if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
                 device.late_ns, device.next_try_ns = max(device.late_ns, late_ns), self._clock.monotonic_ns()
-        client.late_ns.clear()
+        client.units.late_ns.clear()
 
     async def _bring_online(self, device: DeviceState) -> str:
         """Contact a device for the first time, or again after a loss, and return the group to read first.

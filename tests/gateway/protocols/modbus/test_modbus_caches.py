@@ -10,7 +10,8 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.memory_stream import MemoryWire
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ReplyTimeout
-from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.unit_timing import UnitPace
 
 
 def test_a_changed_timeout_counts_from_the_next_request_on() -> None:
@@ -30,9 +31,9 @@ def test_a_changed_timeout_counts_from_the_next_request_on() -> None:
         seen = [await waited()]
         client.restate(timeout_s=2.0, turnaround_s=0.1, spacing_s=0.0)
         seen.append(await waited())
-        client.set_pace(1, UnitPace(timeout_s=0.5))
+        client.units.set_pace(1, UnitPace(timeout_s=0.5))
         seen.append(await waited())
-        client.set_pace(1, UnitPace())
+        client.units.set_pace(1, UnitPace())
         seen.append(await waited())
         await client.aclose()
         return seen

@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
 from fieldtwin.studio.access import Access, AccessMiddleware
-from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces
+from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces, twin
 from fieldtwin.studio.api.common import INSTANCE
 from fieldtwin.studio.api.errors import on_error
 from fieldtwin.studio.api.openapi import describe
@@ -30,6 +30,7 @@ from fieldtwin.studio.live.launching import Launcher
 from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.scenarios.recordings import Recordings
 from fieldtwin.studio.scenarios.runner import ScenarioRunner
+from fieldtwin.studio.twin.forecast import Forecaster
 
 STATIC = Path(__file__).parent / "static"
 OPERATIONS: tuple[Operation, ...] = (
@@ -41,6 +42,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *scenarios.OPERATIONS,
     *traces.OPERATIONS,
     *commissioning.OPERATIONS,
+    *twin.OPERATIONS,
 )
 
 
@@ -57,11 +59,13 @@ def application(access: Access, clock: Clock, folder: Path, known: Traces | None
             Recordings() as recordings,
             ScenarioRunner() as runner,
             known or Traces(folder) as shown,
+            Forecaster() as forecaster,
             Jobs(WorkFolder(folder)) as jobs,
         ):
             app.state.launcher, app.state.gallery, app.state.folder = launcher, gallery, folder
             app.state.recordings, app.state.runner, app.state.jobs = recordings, runner, jobs
             app.state.traces = shown
+            app.state.forecaster = forecaster
             yield
 
     return Starlette(

@@ -14,6 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.store.event import Event
 from fieldtwin.twin.model.mape.analyze import Analyze
+from fieldtwin.twin.model.mape.decisions import DecisionLog
 from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.mape.monitor import Monitor
 from fieldtwin.twin.model.mape.upkeep import Upkeep
@@ -28,7 +29,7 @@ class DigitalShadow:
     """SPEC row DigitalShadow: its own digital model, thread processes, and a receive-only connection.
 
     `step` runs the stages one after the other on the arrived events. `declared` are the variables of the model, which
-    only events change. `verdicts` is a consumer for callers that want to read the verdicts.
+    only events change. `verdicts` is a consumer for callers that want to read the verdicts; `decisions` keeps the newest ones.
     """
 
     def __init__(
@@ -44,6 +45,9 @@ class DigitalShadow:
         self.analyze.emitter.subscribe(self.upkeep.analyzed)
         self.verdicts: Consumer[AnalysisFinding] = Consumer(self.analyze.emitter.event, VERDICTS)
         self.analyze.emitter.subscribe(self.verdicts)
+        self.decisions = DecisionLog()
+        self._found: Consumer[AnalysisFinding] = Consumer(self.analyze.emitter.event, VERDICTS)
+        self.analyze.emitter.subscribe(self._found)
         self._clock = clock
 
     @property
@@ -74,6 +78,8 @@ class DigitalShadow:
             count += 1
         self.analyze.look()
         self.upkeep.keep_up()
+        for finding in self._found.drain():
+            self.decisions.observed(finding)
         return count
 
     def describe(self) -> dict[str, Any]:

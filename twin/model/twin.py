@@ -37,8 +37,10 @@ class DigitalTwin(DigitalShadow):
         question: Question | None = None,
     ) -> None:
         super().__init__(receiving, clock, declared=declared, stale_after_ms=stale_after_ms)
-        self.plan = Plan(self.digital_model, planner, clock)
-        self.execute = Execute(self.digital_model, clock, bounds=bounds, what_if=what_if, question=question)
+        self.plan = Plan(self.digital_model, planner, clock, self.decisions)
+        self.execute = Execute(
+            self.digital_model, clock, bounds=bounds, what_if=what_if, question=question, decisions=self.decisions
+        )
         self.analyze.emitter.subscribe(self.plan.consumer)
         self.plan.emitter.subscribe(self.execute.plans)
 

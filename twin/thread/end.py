@@ -18,7 +18,7 @@ from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Ref
 from fieldtwin.twin.thread.incoming import Effect, IncomingLogs, Keep, NoteLost, Open
 from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
 from fieldtwin.twin.thread.outgoing import OutgoingLog
-from fieldtwin.twin.thread.status import ThreadStatus
+from fieldtwin.twin.thread.status import ReceivedLog, ThreadStatus
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S
@@ -73,6 +73,8 @@ class ThreadEnd:
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
+        self._lost: dict[str, int] = {}
+        self._since_ms: int | None = None
 
     def _knows(self, schema: bytes) -> bool:
         return self._link is not None and self._link.knows(schema)
@@ -109,6 +111,7 @@ class ThreadEnd:
             first, last = await self._store.span(self._origin)
             self.out = OutgoingLog(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
         retry_ns, opened_ns = FIRST_RETRY_NS, 0
+        self._since_ms = self._utc_ms()
         while True:
             try:
                 self._link = await self._carrier.open()
@@ -119,6 +122,8 @@ class ThreadEnd:
                 if isinstance(e, Unwelcome) and not self._insists and not self.links:
                     raise
             finally:
+                if self.connected:
+                    self._since_ms = self._utc_ms()
                 self.connected = False
                 if self._link is not None:
                     self.trouble = self.trouble or self._link.trouble
@@ -131,6 +136,7 @@ class ThreadEnd:
 
     async def _converse(self, link: Link) -> None:
         self.connected = True
+        self._since_ms = self._utc_ms()
         self.links += 1
         self.trouble = ""
         self.silent = self.silent and link.quiet
@@ -142,6 +148,9 @@ class ThreadEnd:
             nursery.start(self._listen(link), f"{self._carrier.name}: incoming")
             nursery.start(self._talk(link), f"{self._carrier.name}: outgoing")
             await nursery.wait()
+
+    def _utc_ms(self) -> int:
+        return self._clock.utc_ns() // NS_PER_MS
 
     # -- what goes --------------------------------------------------------------------------------------------------------
 
@@ -242,6 +251,7 @@ class ThreadEnd:
         missing = [*gaps, (last + 1, max(last + 1, effect.last))]
         for first, end in without([(effect.first, effect.last)], without([(1, effect.last)], missing)):
             await self._store.note_lost(effect.origin, first, end)
+            self._lost[effect.origin] = self._lost.get(effect.origin, 0) + end - first + 1
         self.into.noted(effect.origin, effect.first, effect.last, self._clock.monotonic_ns())
 
     async def _tell(self, origin: str) -> None:
@@ -258,12 +268,17 @@ class ThreadEnd:
         return ThreadStatus(
             carrier=self._carrier.name,
             connected=self.connected,
+            since_ms=self._since_ms,
             links=self.links,
             origin=self._origin,
             sent_through=self.out.through if self.out is not None else None,
             waiting=self.waiting,
             resent=self.out.resent if self.out is not None else 0,
             duplicates=self.into.duplicates,
+            received={
+                origin: ReceivedLog(through=self.into.through(origin), lost=self._lost.get(origin, 0))
+                for origin in self._told
+            },
             silent=self.silent,
             trouble=self._refused_by_store or self.trouble or (self._link.trouble if self._link is not None else ""),
         )

@@ -8,11 +8,22 @@ from __future__ import annotations
 import msgspec
 
 
+class ReceivedLog(msgspec.Struct, frozen=True, kw_only=True):
+    """A log that this end receives."""
+
+    through: int
+    """The last event up to which everything is stored, or recorded as lost."""
+    lost: int
+    """Events that the sender's store no longer had, since this process began."""
+
+
 class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One end of a thread."""
 
     carrier: str
     connected: bool
+    since_ms: int | None
+    """Since when it is connected, or not (UTC); None before the thread began."""
     links: int
     """How many links were opened so far."""
     origin: str
@@ -22,6 +33,8 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Events that the other end has not acknowledged."""
     resent: int
     duplicates: int
+    received: dict[str, ReceivedLog]
+    """The logs of the other end, by their origin."""
     silent: str
     """Why nothing arrives although the link is open; empty if data arrive."""
     trouble: str

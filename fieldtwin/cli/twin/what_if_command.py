@@ -67,6 +67,12 @@ from fieldtwin.run.what_if.state import KnownState
 @group(
     "Output",
     json_option,
+    click.option(
+        "--series",
+        multiple=True,
+        metavar="NAME",
+        help="With --json: also the values of this tag or variable over time.",
+    ),
 )
 def command(
     system: str | None,
@@ -85,6 +91,7 @@ def command(
     save_state: Path | None,
     sources: TemplateSearchOptions,
     as_json: bool,
+    series: tuple[str, ...],
 ) -> int:
     """Simulate SYSTEM in virtual time from its present state, and show the effect of a plan.
 
@@ -96,6 +103,8 @@ def command(
     from fieldtwin.run.what_if.plan import command as parsed
     from fieldtwin.twin.site.system import load_system
 
+    if series and not as_json:
+        raise UsageError("--series is for machines", expected="--json with it")
     plans: list[WhatIfPlan] = []
     if plan_file is not None:
         named, plans = load_plans(plan_file)
@@ -120,7 +129,7 @@ def command(
         faults = _faults(fault_file, loaded)
         own = tuple(parsed(c) for c in commands)
         plans.append(WhatIfPlan(in_words(own, faults), own, faults, require, finally_))
-    fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
+    fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s, series)
     stderr.print(
         f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {_ahead(horizon_s)} ahead, from {escape(state.source)}",
         soft_wrap=True,

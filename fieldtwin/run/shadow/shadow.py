@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.shadow.status import MOST_DECISIONS, LagStatus, TwinStatus, VariableStatus
 from fieldtwin.run.what_if.known import recall
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
 from fieldtwin.twin.model.mape.messages import AnalysisFinding
@@ -53,8 +54,8 @@ def limits_of(system: System) -> dict[str, Limits]:
 class Shadowing:
     """A digital shadow of a plant: ``await Shadowing(...).run(stop)``. `on_verdict` is called with each verdict.
 
-    While it runs it serves two commands on `KIND.sock` in the run directory, for health checks: ready (an event of the
-    plant arrived and the thread is connected) and get.
+    While it runs it serves commands on `KIND.sock` in the run directory: ready (an event of the plant arrived and the thread
+    is connected) and get for health checks, and status (`TwinStatus`) for programs that show it.
     """
 
     kind = "shadow"
@@ -99,7 +100,7 @@ class Shadowing:
         """Shadow the plant until `stop`, or for `for_s` seconds. Raises `FieldtwinError` for a store that cannot be used."""
         system, clock = self._system, self.clock
         store = await open_knowledge(self._store)
-        server = ControlServer({"ready": self._ready, "get": self._get})
+        server = ControlServer({"ready": self._ready, "get": self._get, "status": self._status})
         try:
             await server.listen_unix(self._socket)
             own = await store.own("shadow", system=system.name, prototype=False, log=secrets.token_hex(4))
@@ -154,6 +155,9 @@ class Shadowing:
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
         return self.describe()
 
+    async def _status(self, args: dict[str, Any]) -> TwinStatus:
+        return self.status()
+
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
         self.origins.add(origin)
         await to_receivers(self.receiving)(origin, events)
@@ -200,9 +204,38 @@ class Shadowing:
     def _kept(self, event: Event) -> None:
         """Handle an event of this side's own knowledge before it is stored."""
 
+    def status(self) -> TwinStatus:
+        """Return the present status, with the newest decisions."""
+        shadow = self.shadow
+        figures = shadow.analyze.figures()
+        variables = shadow.digital_model.variables
+        return TwinStatus(
+            kind=self.kind,
+            system=self._system.name,
+            place=self._place,
+            now_ms=self.clock.utc_ns() // NS_PER_MS,
+            origins=sorted(self.origins),
+            state=shadow.digital_model.state.name,
+            period_s=shadow.digital_model.period_s,
+            thread=self._end.status() if self._end is not None else None,
+            store=self._store,
+            store_trouble=self._troubles.get("store", ""),
+            variables=msgspec.convert(variables.describe(), dict[str, VariableStatus]),
+            undeclared=variables.undeclared,
+            statuses=figures["statuses"],
+            agreed=figures["agreed"],
+            measurements=figures["measurements"],
+            backfilled=figures["backfilled"],
+            twinning_rate_hz=figures["twinning_rate_hz"],
+            lag_ms=msgspec.convert(figures["lag_ms"], LagStatus | None),
+            wrong=figures["wrong"],
+            decisions=shadow.decisions.newest(MOST_DECISIONS),
+            decided=shadow.decisions.count,
+        )
+
     def describe(self) -> dict[str, Any]:
         """Return the shadow's knowledge and the status of its thread."""
-        thread = msgspec.structs.asdict(self._end.status()) if self._end is not None else {}
+        thread = msgspec.to_builtins(self._end.status()) if self._end is not None else {}
         return {
             "system": self._system.name,
             "prototype": bool(self.prototypes),

@@ -10,12 +10,15 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import msgspec
+
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.run.shadow.shadow import STALE_AFTER_MS, Shadowing
+from fieldtwin.run.shadow.status import CommandCounts, TwinStatus
 from fieldtwin.run.what_if.asking import Asking
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
 from fieldtwin.twin.model.mape.execute import CommandLimits
@@ -101,6 +104,7 @@ class Twinning(Shadowing):
         for event in events:
             if event.kind == Kind.REFUSAL:
                 self.refused_by_plant += 1
+                self.shadow.decisions.refused_by_plant(str(event.value), event.t_ms)
                 if self.clock.utc_ns() // NS_PER_MS - event.t_ms <= OLD_MS:
                     self._on_refusal(f"by the plant: {event.value!s}")
         await super()._arrived(origin, events)
@@ -117,6 +121,7 @@ class Twinning(Shadowing):
 
     def _plan_by_hand(self) -> None:
         for command in self._by_hand:
+            self.shadow.decisions.planned(command, self.clock.utc_ns() // NS_PER_MS, None)
             self.shadow.execute.plans.observe(command)
         self._by_hand.clear()
 
@@ -140,6 +145,18 @@ class Twinning(Shadowing):
 
     def _store_trouble(self, writer: KnowledgeWriter) -> str:
         return writer.trouble or (self._commands.trouble if self._commands is not None else "")
+
+    def status(self) -> TwinStatus:
+        execute = self.shadow.execute
+        counts = CommandCounts(
+            planned=self.shadow.plan.planned,
+            simulated=execute.asked,
+            sent=execute.sent,
+            refused=execute.refused,
+            refused_by_plant=self.refused_by_plant,
+            unconfirmed=self._end.waiting if self._end is not None else 0,
+        )
+        return msgspec.structs.replace(super().status(), commands=counts)
 
     def describe(self) -> dict[str, Any]:
         waiting = self._end.waiting if self._end is not None else 0

@@ -27,7 +27,7 @@ from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.what_if.begin import begin, otherwise, retain_for
-from fieldtwin.run.what_if.outcome import PlanOutcome, Requirement
+from fieldtwin.run.what_if.outcome import PlanOutcome, Requirement, Series
 from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 from fieldtwin.scenarios.language.expression import Expression
@@ -56,6 +56,8 @@ class Fork:
     prototype_file: Path | None = None
     seed: int | None = None
     settle_s: float = 5.0
+    series: tuple[str, ...] = ()
+    """Tags and variables whose values over time are wanted."""
 
 
 def answer(fork: Fork, plan: WhatIfPlan) -> PlanOutcome:
@@ -106,6 +108,12 @@ class _ForkRun:
         self._variables = [t.name for region in twin.ecs.layout.regions for t in region.tags]
         self._requirements = [self._requirement("require", text) for text in plan.require]
         self._at_the_end = [self._requirement("finally", text) for text in plan.finally_]
+        for name in fork.series:
+            if name not in self._known and name not in self._variables:
+                raise UsageError(
+                    f"the system has no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE"
+                )
+            self.outcome.series[name] = Series(fork.horizon_s)
         self._run: VirtualPrototype | None = None
         self._over = False
 
@@ -142,6 +150,7 @@ class _ForkRun:
         )
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(run)
+            self.outcome.started_ns = run.started_ns
             unsubscribe = run.gateway.tags.subscribe(self.outcome.saw_tag)
             if self.plan.commands or run.field.far:  # without a topside controller, the modems would stay full
                 nursery = await stack.enter_async_context(Nursery())

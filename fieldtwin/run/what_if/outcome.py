@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.values import Quality, TagValue
 
 
@@ -69,6 +70,37 @@ class VariableOutcome:
         return shown
 
 
+MOST_POINTS = 2000
+
+
+class Series:
+    """The changes of a tag or variable over the horizon: (seconds from the start, value); None while it has no good value.
+
+    It holds at most `MOST_POINTS` changes. When there are more, changes that follow each other closely are merged.
+    """
+
+    def __init__(self, horizon_s: float) -> None:
+        self.points: list[tuple[float, float | None]] = []
+        self._horizon_s = horizon_s
+        self._least_s = 0.0
+
+    def saw(self, t_s: float, value: Any, good: bool) -> None:
+        """Record a value."""
+        number = float(value) if good and isinstance(value, int | float) and math.isfinite(value) else None
+        if self.points and self.points[-1][1] == number:
+            return
+        if self.points and t_s - self.points[-1][0] < self._least_s:
+            self.points[-1] = (self.points[-1][0], number)
+            return
+        self.points.append((t_s, number))
+        if len(self.points) >= MOST_POINTS:
+            self.points = self.points[::2]
+            self._least_s = max(2 * self._least_s, 2 * self._horizon_s / MOST_POINTS)
+
+    def described(self) -> list[list[float | None]]:
+        return [[round(t_s, 3), value] for t_s, value in self.points]
+
+
 @dataclass(slots=True)
 class Requirement:
     """A requirement. `kind` is ``require`` or ``finally``.
@@ -105,6 +137,10 @@ class PlanOutcome:
     requirements: list[Requirement] = field(default_factory=list)
     not_taken: list[str] = field(default_factory=list)
     states: dict[str, list[tuple[float, str]]] = field(default_factory=dict)
+    series: dict[str, Series] = field(default_factory=dict)
+    """The tags and variables whose values over time are wanted."""
+    started_ns: int = 0
+    """The start of the horizon on the fork's monotonic clock."""
     error: str = ""
     took_s: float = 0.0
 
@@ -114,16 +150,24 @@ class PlanOutcome:
 
     def saw_tag(self, name: str, value: TagValue) -> None:
         """Record a published tag."""
-        self._of(name).saw(value.value, value.quality is not Quality.BAD, value.t_ns)
+        good = value.quality is not Quality.BAD
+        self._of(name).saw(value.value, good, value.t_ns)
+        self._follow(name, value.value, good, value.t_ns)
 
     def saw_variable(self, name: str, value: Any, t_ns: int) -> None:
         """Record a program's change of a variable."""
         self._of(name).saw(value, True, t_ns)
+        self._follow(name, value, True, t_ns)
 
     def ends(self, t_ns: int) -> None:
         """End the statistics at the horizon."""
         for variable in self.variables.values():
             variable.ends(t_ns)
+
+    def _follow(self, name: str, value: Any, good: bool, t_ns: int) -> None:
+        series = self.series.get(name)
+        if series is not None:
+            series.saw(max(0.0, (t_ns - self.started_ns) / NS_PER_S), value, good)
 
     def _of(self, name: str) -> VariableOutcome:
         found = self.variables.get(name)
@@ -133,6 +177,7 @@ class PlanOutcome:
 
     def described(self) -> dict[str, Any]:
         """Return JSON data, which is the same for every run of the same fork, except for `took_s`."""
+        series = {"series": {name: s.described() for name, s in self.series.items()}} if self.series else {}
         return {
             "plan": self.plan,
             "met": self.met,
@@ -141,6 +186,7 @@ class PlanOutcome:
             "requirements": [r.described() for r in self.requirements],
             "states": {p: [[round(t, 3), s] for t, s in seen] for p, seen in self.states.items()},
             "variables": {name: v.described() for name, v in sorted(self.variables.items())},
+            **series,
             "not_taken": self.not_taken,
             "took_s": round(self.took_s, 3),
         }

@@ -16,6 +16,7 @@ import { Faults } from "./views/faults.js";
 import { Scenario } from "./views/scenario.js";
 import { FailedChecks, Timeline } from "./views/timeline.js";
 import { Guide } from "./commissioning/guide.js";
+import { Twin } from "./views/twin.js";
 
 const VIEWS = {
   overview: { title: "Overview", view: Overview },
@@ -25,6 +26,7 @@ const VIEWS = {
   trends: { title: "Trends", view: Trends },
   faults: { title: "Faults", view: Faults, prototype: true },
   scenario: { title: "Scenario", view: Scenario, live: true },
+  twin: { title: "Twin", view: Twin, live: true },
 };
 
 const GUIDE = "commissioning"; // an instance of this name is opened at commissioning/overview

@@ -21,7 +21,7 @@ from fieldtwin.run.what_if.fork import Fork, answer
 from fieldtwin.run.what_if.known import known_state
 from fieldtwin.run.what_if.last_known import of_period
 from fieldtwin.run.what_if.many import answers
-from fieldtwin.run.what_if.outcome import VariableOutcome
+from fieldtwin.run.what_if.outcome import MOST_POINTS, Series, VariableOutcome
 from fieldtwin.run.what_if.plan import WhatIfPlan, load_plans
 from fieldtwin.run.what_if.plan import command as parsed
 from fieldtwin.run.what_if.state import KnownState, read_state
@@ -273,3 +273,42 @@ def test_a_wrong_file_of_plans(tmp_path: Path, old: str, new: str, message: str)
     path.write_text(PLANS.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(FileInvalid, match=message):
         load_plans(path)
+
+
+def test_a_series_has_each_change_once_and_none_where_there_is_no_good_value() -> None:
+    series = Series(100.0)
+    for t_s, value, good in (
+        (0, 1, True),
+        (1, 1, True),
+        (2, 2.5, True),
+        (3, 2.5, False),
+        (4, "text", True),
+        (5, 3, True),
+    ):
+        series.saw(float(t_s), value, good)
+    assert series.described() == [[0.0, 1.0], [2.0, 2.5], [3.0, None], [5.0, 3.0]]
+
+
+def test_a_long_series_is_bounded_and_keeps_its_newest_value() -> None:
+    series = Series(1000.0)
+    for n in range(100_000):
+        series.saw(n / 100, n, True)
+    points = series.described()
+    assert 500 < len(points) < MOST_POINTS
+    assert points[-1][1] == 99_999
+    assert [t for t, _ in points] == sorted(t for t, _ in points)
+
+
+def test_a_fork_returns_the_values_of_a_tag_and_a_variable_over_time() -> None:
+    fork = Fork("observatory", KnownState(), 12.0, series=("ctd.sample_period_s", "relay.period"))
+    outcome = answer(fork, WhatIfPlan("go", (Scripted(1.0, 2),)))
+    described = outcome.described()["series"]
+    assert [value for _, value in described["relay.period"]] == [0.0, 2.0]
+    assert described["ctd.sample_period_s"][-1][1] == 2.0
+    assert all(0 <= t <= 12 for t, _ in described["relay.period"])
+    assert "series" not in answer(Fork("observatory", KnownState(), 1.0), WhatIfPlan("go")).described()
+
+
+def test_a_series_of_an_unknown_name_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"no tag or variable 'ctd\.depth'"):
+        answer(Fork("observatory", KnownState(), 1.0, series=("ctd.depth",)), WhatIfPlan("go"))

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Desync
 from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, decode_period
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.model.mape.decisions import DecisionLog
 from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question, WhatIf
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
@@ -71,7 +72,7 @@ class Execute(DTDigitalThreadProcess):
     """SPEC row Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
 
     If the planner gives a command no question, `what_if` is asked the twin's default `question`. The command is sent only
-    after an answer without an objection.
+    after an answer without an objection. `decisions` records the outcomes.
     """
 
     def __init__(
@@ -82,8 +83,10 @@ class Execute(DTDigitalThreadProcess):
         bounds: CommandLimits,
         what_if: WhatIf | None = None,
         question: Question | None = None,
+        decisions: DecisionLog | None = None,
     ) -> None:
         super().__init__("execute", clock)
+        self.decisions = decisions or DecisionLog()
         self.plans: Consumer[COMMAND] = Consumer("planned", CAPACITY)
         self.transmitter: Producer[COMMAND] = Producer("to the plant")
         self.digital_model = model
@@ -133,6 +136,7 @@ class Execute(DTDigitalThreadProcess):
                 return command, "a what-if simulation is required first, and this process cannot run one"
             self._pending = command
             self.asked += 1
+            self.decisions.asked(command, question)
             self._what_if.ask(command, question)
         assert self._what_if is not None
         command, answer = self._pending, self._what_if.answer()
@@ -141,6 +145,7 @@ class Execute(DTDigitalThreadProcess):
         return command, answer
 
     def _settle(self, command: COMMAND, objection: str) -> None:
+        self.decisions.settled(command, objection, self._clock.utc_ns() // NS_PER_MS)
         if objection:
             self.refused += 1
             self.share(Kind.REFUSAL, self.name, _told(command, objection))

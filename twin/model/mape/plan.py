@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.model.mape.decisions import DecisionLog
 from fieldtwin.twin.model.mape.messages import AnalysisFinding
 from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question
 from fieldtwin.twin.model.model import DigitalModel
@@ -86,10 +87,14 @@ class Plan(DTDigitalThreadProcess):
 
     `take` consumes findings, and `plan_next` plans for the first of them. Findings may wait while a prototype is asked
     about a command; `overtaken` counts those that `only_newest` dropped because a newer finding superseded them.
+    `decisions` records what is planned.
     """
 
-    def __init__(self, model: DigitalModel, planner: Planner, clock: Clock) -> None:
+    def __init__(
+        self, model: DigitalModel, planner: Planner, clock: Clock, decisions: DecisionLog | None = None
+    ) -> None:
         super().__init__("plan", clock)
+        self.decisions = decisions or DecisionLog()
         self.consumer: Consumer[AnalysisFinding] = Consumer("analyzed", CAPACITY)
         self.emitter: Producer[COMMAND] = Producer("planned")
         self.digital_model = model
@@ -103,6 +108,7 @@ class Plan(DTDigitalThreadProcess):
         for message in self.consumer.drain():
             if now_ms - message.t_ms > OLD_MS:
                 self.too_old += 1
+                self.decisions.observed(message, "older than 10 s when it arrived, so nothing is planned for it")
             else:
                 self._waiting.append(message)
 
@@ -121,14 +127,17 @@ class Plan(DTDigitalThreadProcess):
         """Plan for the first waiting finding. Return False if none is waiting."""
         if not self._waiting:
             return False
+        finding = self._waiting.popleft()
         try:
-            command = self._planner.plan(self._waiting.popleft(), self.digital_model)
+            command = self._planner.plan(finding, self.digital_model)
         except FieldtwinError as e:
             self.failed += 1
+            self.decisions.failed(finding, str(e), self._clock.utc_ns() // NS_PER_MS)
             self.share(Kind.REFUSAL, self.name, str(e))
             return True
         if command is not None:
             self.planned += 1
+            self.decisions.planned(command, self._clock.utc_ns() // NS_PER_MS, finding)
             self.emitter.emit(command)
         return True
 

@@ -1,0 +1,125 @@
+"""A command of fieldtwin that runs as a child process and prints its result as JSON, such as a scenario or a forecast."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+
+from fieldtwin.twin.plant.child import command
+
+MOST_OUTPUT_BYTES = 8 << 20
+MOST_MESSAGE_BYTES = 16_384
+LONGEST_S = 1800.0
+STOPS_WITHIN_S = 10.0
+
+
+class ChildRun:
+    """``await ChildRun.started(arguments, parse)``: the run ends by itself, after `LONGEST_S`, or with `stop`.
+
+    `parse` returns the result from the standard output. It raises a `msgspec.MsgspecError` or a `ValueError` if there is none;
+    the messages of the process are then the reason (`trouble`).
+    """
+
+    def __init__(self, process: asyncio.subprocess.Process, parse: Callable[[bytes], Any]) -> None:
+        self.trouble = ""
+        """Why there is no result; empty while it runs."""
+        self.result: Any = None
+        self._process = process
+        self._parse = parse
+        self._began_s = asyncio.get_running_loop().time()
+        self._took_s = 0.0
+        self._following = asyncio.ensure_future(self._follow())
+
+    @classmethod
+    async def started(cls, arguments: Sequence[str], parse: Callable[[bytes], Any]) -> ChildRun:
+        """Start ``fieldtwin ARGUMENTS``."""
+        process = await asyncio.create_subprocess_exec(
+            *command("fieldtwin", *arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,
+        )
+        return cls(process, parse)
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether the process runs."""
+        return not self._following.done()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Return for how long it has been running, or how long it took."""
+        return asyncio.get_running_loop().time() - self._began_s if self.is_running else self._took_s
+
+    async def ended(self) -> None:
+        """Wait for the end of the run."""
+        await asyncio.gather(self._following, return_exceptions=True)
+
+    async def _follow(self) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        messages = asyncio.ensure_future(_tail(self._process.stderr))
+        try:
+            async with asyncio.timeout(LONGEST_S):
+                output = await _whole(self._process.stdout)
+                await self._process.wait()
+        except TimeoutError:
+            self.trouble = self.trouble or f"stopped after {LONGEST_S:g} s"
+        except _TooLongError:
+            self.trouble = f"stopped: the result is longer than {MOST_OUTPUT_BYTES} bytes"
+        else:
+            self._take(output, await messages)
+        finally:
+            self._took_s = asyncio.get_running_loop().time() - self._began_s
+            self._kill()
+            await self._process.wait()
+            messages.cancel()
+
+    def _take(self, output: bytes, messages: bytes) -> None:
+        try:
+            self.result = self._parse(output)
+        except (msgspec.MsgspecError, ValueError):
+            said = messages.decode(errors="replace").strip()[-800:]
+            self.trouble = self.trouble or said or "the run ended without a result"
+
+    async def stop(self) -> None:
+        """Interrupt the run, and kill it with its processes if it does not end."""
+        if self.is_running:
+            self.trouble = "stopped"
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGINT)
+            await asyncio.wait([self._following], timeout=STOPS_WITHIN_S)
+            self._kill()
+        await self.ended()
+
+    def _kill(self) -> None:
+        """Kill what is left of the process group; the processes of a finished run are gone already."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+
+class _TooLongError(Exception):
+    pass
+
+
+async def _whole(stream: asyncio.StreamReader) -> bytes:
+    output = bytearray()
+    while chunk := await stream.read(65_536):
+        output += chunk
+        if len(output) > MOST_OUTPUT_BYTES:
+            raise _TooLongError
+    return bytes(output)
+
+
+async def _tail(stream: asyncio.StreamReader) -> bytes:
+    tail = b""
+    while chunk := await stream.read(4096):
+        tail = (tail + chunk)[-MOST_MESSAGE_BYTES:]
+    return tail

@@ -1,4 +1,4 @@
-"""A command of fieldtwin that runs as a child process and prints its result as JSON, such as a scenario or a forecast."""
+"""A command of fieldtwin that runs as a child process and prints its result as JSON, such as a forecast."""
 
 from __future__ import annotations
 

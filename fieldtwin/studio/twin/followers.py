@@ -57,7 +57,7 @@ async def look(attachment: Attachment) -> tuple[PlantThreadStatus | None, list[F
     folders = sorted(p for p in root.iterdir() if p.is_dir()) if root.is_dir() else []
     sockets = [folder / f"{kind}.sock" for folder in folders[:MOST] for kind in KINDS]
     looks = (_look(socket, attachment) for socket in sockets if socket.is_socket())
-    thread, *found = await asyncio.gather(_plant_thread(attachment), *looks)
+    thread, found = await asyncio.gather(_plant_thread(attachment), asyncio.gather(*looks))
     kept = [replace(f, is_of_instance=_is_of(f.status, thread)) for f in found if f is not None]
     return thread, sorted(kept, key=lambda f: (f.is_of_instance is not True, f.kind != "twin", f.instance))
 

@@ -22,13 +22,13 @@ STOPS_WITHIN_S = 10.0
 class ChildRun:
     """``await ChildRun.started(arguments, parse)``: the run ends by itself, after `LONGEST_S`, or with `stop`.
 
-    `parse` returns the result from the standard output. It raises a `msgspec.MsgspecError` or a `ValueError` if there is none;
-    the messages of the process are then the reason (`trouble`).
+    `parse` returns the result from the standard output, or raises `msgspec.MsgspecError` or `ValueError`; the messages of the
+    process are then the reason (`trouble`).
     """
 
     def __init__(self, process: asyncio.subprocess.Process, parse: Callable[[bytes], Any]) -> None:
         self.trouble = ""
-        """Why there is no result; empty while it runs."""
+        """The reason for a missing result; empty while the process runs."""
         self.result: Any = None
         self._process = process
         self._parse = parse

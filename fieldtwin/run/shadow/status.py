@@ -35,7 +35,7 @@ class LagStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a twin did with commands since it started."""
+    """Counts of a twin's commands since it started."""
 
     planned: int
     simulated: int

@@ -43,7 +43,7 @@ def compare(attachment: Attachment, status: TwinStatus) -> list[Compared]:
 
 
 class _Plant(NamedTuple):
-    """What the plant has for a variable."""
+    """The present value of a variable in the plant."""
 
     value: Any
     quality: str

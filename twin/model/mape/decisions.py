@@ -33,7 +33,7 @@ class Decision(msgspec.Struct, kw_only=True):
     observed: str
     """The finding as a sentence."""
     plan: str = ""
-    """The planned command; empty if there is none."""
+    """The planned command; empty without one."""
     outcome: str = OBSERVED
     reason: str = ""
     settled_ms: int | None = None

@@ -1,22 +1,18 @@
-"""A command of fieldtwin that runs as a child process and prints its result as JSON, such as a forecast."""
+"""A command of fieldtwin that runs as a child process and prints its result as JSON, such as a scenario or a forecast."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-import signal
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
 
-from fieldtwin.twin.plant.child import command
+from fieldtwin.studio import child_process
 
 MOST_OUTPUT_BYTES = 8 << 20
 MOST_MESSAGE_BYTES = 16_384
 LONGEST_S = 1800.0
-STOPS_WITHIN_S = 10.0
 
 
 class ChildRun:
@@ -39,14 +35,7 @@ class ChildRun:
     @classmethod
     async def started(cls, arguments: Sequence[str], parse: Callable[[bytes], Any]) -> ChildRun:
         """Start ``fieldtwin ARGUMENTS``."""
-        process = await asyncio.create_subprocess_exec(
-            *command("fieldtwin", *arguments),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,
-        )
-        return cls(process, parse)
+        return cls(await child_process.start(*arguments), parse)
 
     @property
     def is_running(self) -> bool:
@@ -68,17 +57,17 @@ class ChildRun:
         messages = asyncio.ensure_future(_tail(self._process.stderr))
         try:
             async with asyncio.timeout(LONGEST_S):
-                output = await _whole(self._process.stdout)
+                output = await child_process.read_whole(self._process.stdout, MOST_OUTPUT_BYTES)
                 await self._process.wait()
         except TimeoutError:
             self.trouble = self.trouble or f"stopped after {LONGEST_S:g} s"
-        except _TooLongError:
+        except child_process.OutputTooLong:
             self.trouble = f"stopped: the result is longer than {MOST_OUTPUT_BYTES} bytes"
         else:
             self._take(output, await messages)
         finally:
             self._took_s = asyncio.get_running_loop().time() - self._began_s
-            self._kill()
+            child_process.kill(self._process)
             await self._process.wait()
             messages.cancel()
 
@@ -93,29 +82,8 @@ class ChildRun:
         """Interrupt the run, and kill it with its processes if it does not end."""
         if self.is_running:
             self.trouble = "stopped"
-            with contextlib.suppress(ProcessLookupError):
-                self._process.send_signal(signal.SIGINT)
-            await asyncio.wait([self._following], timeout=STOPS_WITHIN_S)
-            self._kill()
+            await child_process.interrupt(self._process, self._following)
         await self.ended()
-
-    def _kill(self) -> None:
-        """Kill what is left of the process group; the processes of a finished run are gone already."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-
-
-class _TooLongError(Exception):
-    pass
-
-
-async def _whole(stream: asyncio.StreamReader) -> bytes:
-    output = bytearray()
-    while chunk := await stream.read(65_536):
-        output += chunk
-        if len(output) > MOST_OUTPUT_BYTES:
-            raise _TooLongError
-    return bytes(output)
 
 
 async def _tail(stream: asyncio.StreamReader) -> bytes:

@@ -14,14 +14,11 @@ import msgspec
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.scenarios.language.file_name import SUFFIX
-from fieldtwin.studio import child_process
+from fieldtwin.studio.child_run import ChildRun
 from fieldtwin.studio.scenarios.progress import RunProgress
 
 MOST_FILES = 200
 MOST_FILE_BYTES = 1 << 20
-MOST_OUTPUT_BYTES = 8 << 20
-MOST_MESSAGE_BYTES = 16_384
-LONGEST_S = 1800.0
 LOOK_EVERY_S = 0.1
 TARGETS = ("virtual", "local")
 
@@ -88,9 +85,10 @@ class ScenarioRunner:
             raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
         folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
         progress = folder / "progress.jsonl"
-        process = await child_process.start("test", path, "--target", target, "--json", "--progress", str(progress))
+        arguments = ["test", path, "--target", target, "--json", "--progress", str(progress)]
+        run = await ChildRun.started(arguments, _result)
         self._count += 1
-        self._run = _Run(self._count, path, target, process, progress)
+        self._run = _Run(self._count, path, target, run, progress)
 
     async def stop(self) -> None:
         """Stop the run, if one is running."""
@@ -99,17 +97,11 @@ class ScenarioRunner:
 
 
 class _Run:
-    def __init__(
-        self, number: int, path: str, target: str, process: asyncio.subprocess.Process, progress: Path
-    ) -> None:
+    def __init__(self, number: int, path: str, target: str, run: ChildRun, progress: Path) -> None:
         self.path = path
         self._number = number
         self._target = target
-        self._process = process
-        self._began_s = asyncio.get_running_loop().time()
-        self._took_s = 0.0
-        self._trouble = ""
-        self._result: dict[str, Any] | None = None
+        self._run = run
         self._progress_file = progress
         self._progress = RunProgress(progress)
         self._following = asyncio.ensure_future(self._follow())
@@ -124,59 +116,28 @@ class _Run:
             "path": self.path,
             "target": self._target,
             "running": self.is_running,
-            "elapsed_s": asyncio.get_running_loop().time() - self._began_s if self.is_running else self._took_s,
-            "trouble": self._trouble,
-            "result": self._result,
+            "elapsed_s": self._run.elapsed_s,
+            "trouble": self._run.trouble,
+            "result": self._run.result,
             "progress": self._progress.state(values_from),
         }
 
     async def _follow(self) -> None:
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        messages = asyncio.ensure_future(_tail(self._process.stderr))
-        looking = asyncio.ensure_future(self._look())
         try:
-            async with asyncio.timeout(LONGEST_S):
-                output = await child_process.read_whole(self._process.stdout, MOST_OUTPUT_BYTES)
-                await self._process.wait()
-        except TimeoutError:
-            self._trouble = self._trouble or f"stopped after {LONGEST_S:g} s"
-        except child_process.OutputTooLong:
-            self._trouble = f"stopped: the result is longer than {MOST_OUTPUT_BYTES} bytes"
-        else:
-            self._take(output, await messages)
-        finally:
-            self._took_s = asyncio.get_running_loop().time() - self._began_s
-            child_process.kill(self._process)
-            await self._process.wait()
-            messages.cancel()
-            looking.cancel()
+            while self._run.is_running:
+                self._progress.look()
+                await asyncio.sleep(LOOK_EVERY_S)
             while self._progress.look():
                 pass
+        finally:
             shutil.rmtree(self._progress_file.parent, ignore_errors=True)
-
-    async def _look(self) -> None:
-        while True:
-            self._progress.look()
-            await asyncio.sleep(LOOK_EVERY_S)
-
-    def _take(self, output: bytes, messages: bytes) -> None:
-        try:
-            [self._result] = msgspec.json.decode(output, type=list[dict[str, Any]])
-        except (msgspec.MsgspecError, ValueError):
-            said = messages.decode(errors="replace").strip()[-800:]
-            self._trouble = self._trouble or said or "the run ended without a result"
 
     async def stop(self) -> None:
         """Interrupt the run, and kill it with its processes if it does not end."""
-        if self.is_running:
-            self._trouble = "stopped"
-            await child_process.interrupt(self._process, self._following)
+        await self._run.stop()
         await asyncio.gather(self._following, return_exceptions=True)
 
 
-async def _tail(stream: asyncio.StreamReader) -> bytes:
-    tail = b""
-    while chunk := await stream.read(4096):
-        tail = (tail + chunk)[-MOST_MESSAGE_BYTES:]
-    return tail
+def _result(output: bytes) -> dict[str, Any]:
+    [result] = msgspec.json.decode(output, type=list[dict[str, Any]])
+    return result

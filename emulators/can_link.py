@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 MOST_WAITING = 10_000
-"""How many delayed frames may wait; further frames are lost and counted."""
+"""The number of delayed frames that may wait; further frames are lost and counted."""
 NMT, NO_NODE = 0x000, 0
 
 
@@ -68,7 +68,7 @@ class CanLink:
             while True:
                 frame = await source.recv()
                 if frame.error:
-                    continue  # it concerns one controller, not a bus
+                    continue  # an error frame concerns one controller, not the bus
                 for piece in self._become(frame, way):
                     if piece.delay_s <= 0:
                         await self._pass(piece.frame, way)
@@ -91,7 +91,7 @@ class CanLink:
             self.passed[way] += 1
 
     def _appear(self, active: Active) -> None:
-        """Schedule the frames that the fault itself sends, in the name of the node that is its target."""
+        """Schedule the frames that faults send by themselves, in the name of the node that is the target of the fault."""
         if not isinstance(active.fault, CanFault) or active.aim.unit is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)

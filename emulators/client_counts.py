@@ -11,7 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 MOST_CLIENTS = 1024
-"""Addresses that are kept in addition to those of open connections; the counts of older ones are kept as a sum."""
+"""The number of addresses that are kept in addition to those of open connections. The counts of older addresses are kept as a
+sum.
+"""
 OLDER = "older clients"
 
 

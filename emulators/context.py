@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand, Usag
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 MAX_ENTRIES = 500_000
-"""Recordings that a context keeps: about 100 MB at most."""
+"""The largest number of recordings that a context keeps: about 100 MB."""
 
 
 class EndOfRecording(Enum):
@@ -59,7 +59,8 @@ head of a list would take as many steps as there are recordings after it.
 
 
 class _Series:
-    """The recordings of one command, the number of those taken, and the last one taken. The list may be shared.
+    """The recordings of one command, the number of recordings that were taken, and the one that was taken last. The list may
+    be shared.
 
     `whole` says that the series was added as a whole, so nothing is added to it or dropped from it.
     """

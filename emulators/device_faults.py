@@ -29,7 +29,7 @@ class DeviceFaults:
         self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
     ) -> None:
         self.put_in: list[Active] = []
-        """The injected faults, once for each connection, with the number of times that each took effect."""
+        """The injected faults, once for each connection, with the number of times that each one took effect."""
         self._specs = [parse_fault(dict(one), number=number) for number, one in enumerate(said, 1)]
         self._profile = profile
         self._seed = seed
@@ -116,7 +116,7 @@ def _tag(aim: Aim, profile: DeviceProfile | None) -> Tag | None:
 
 
 def _place(aim: Aim, profile: DeviceProfile | None) -> tuple[range | None, frozenset[int]]:
-    """Return the addresses at which the fault aims (None for all), and the functions of their table."""
+    """Return the addresses that are the target of the fault (None for all), and the function codes of their table."""
     tag = _tag(aim, profile)
     if tag is not None:
         at = tag.registers

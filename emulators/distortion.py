@@ -20,12 +20,12 @@ class _Put:
 
 @dataclass
 class Distortions:
-    """The value faults of one device. `apply` is called for every number that the device is about to hold."""
+    """The value faults of one device. The device calls `apply` with every number before it holds the number."""
 
     _puts: dict[str, _Put] = field(default_factory=dict)
     counts_given: bool = False
-    """Whether a fault counts as having taken effect when `gave` reports the value. Otherwise it counts with each number that
-    `apply` changes, which suits a device that computes its values when they are read.
+    """Whether a fault takes effect when `gave` reports that its value was sent. Otherwise each number that `apply` changes
+    counts as an effect, which suits a device that computes its values when they are read.
     """
 
     def __bool__(self) -> bool:

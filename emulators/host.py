@@ -34,7 +34,7 @@ from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 
 MAX_CLIENTS = 32
-"""Most clients of one Modbus TCP endpoint at a time. A serial line over a socket has one."""
+"""The largest number of clients of one Modbus TCP endpoint at a time. A serial line over a socket has one client."""
 
 
 @dataclass(frozen=True, slots=True)

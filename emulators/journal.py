@@ -14,7 +14,7 @@ import msgspec
 
 CAPACITY = 200_000
 SHARED, LEAST = 1_000_000, 1_000
-"""Most entries of all devices in a process together, about 60 bytes each; and the minimum for one device."""
+"""The largest number of entries of all devices in a process together, about 60 bytes each, and the minimum for one device."""
 
 
 class DeviceValue(msgspec.Struct, frozen=True, gc=False):

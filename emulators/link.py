@@ -39,10 +39,10 @@ class LinkOptions:
     backoff_max_s: float = 5.0
     proven_after_s: float = 1.0
     half_close_s: float = 0.5
-    """How long a side that finished sending may still receive (socat -t)."""
+    """The time in seconds for which a side that finished sending may still receive (socat -t)."""
     stall_s: float = 2.0
-    """How long the link waits for a serial line that accepts no bytes, beyond its transmission time; then the bytes are
-    lost.
+    """The time in seconds, beyond the transmission time, that the link waits for a serial line that accepts no bytes. Then the
+    bytes are lost.
     """
 
 
@@ -76,10 +76,10 @@ class EmulatedConnection(TCPConnection):
 
 
 class _Plug(ABC):
-    """A side of the link: how it is prepared once and connected repeatedly."""
+    """A side of the link, which is prepared once and connected for each session."""
 
     stays: bool
-    """Whether it stays open between sessions: a serial port remains when the TCP connection (the carrier) is lost."""
+    """Whether this side stays open between sessions: a serial port remains when the TCP connection (the carrier) is lost."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -204,9 +204,9 @@ class EmulatedLink:
         serial = self._near.stays or self._far.stays
         self.connection = EmulatedConnection(PROTOCOL.RS232 if serial else PROTOCOL.TCP)
         self.sessions = 0
-        """How often the carrier was connected."""
+        """The number of times that the carrier was connected."""
         self.failed_attempts = 0
-        """How often connecting it failed."""
+        """The number of failed attempts to connect the carrier."""
         self.connected = False
         self._on_event = on_event
         self._last_event = ""
@@ -291,7 +291,7 @@ class EmulatedLink:
 
     async def _discard(self, plug: _Plug) -> None:
         while (connection := plug.open_now) is not None:
-            with contextlib.suppress(Unreachable):  # lost: the next connect detects it
+            with contextlib.suppress(Unreachable):  # the side is lost; the next connect detects it
                 self._dropped(plug is self._near, len(await connection.read()))
 
     async def _session(self, near: ByteConnection, far: ByteConnection) -> str:

@@ -20,7 +20,9 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.recording import RecordingReader, SignalRow
 
 MAX_NUMBERS = 16_000_000
-"""Most times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. A longer recording is refused."""
+"""The largest number of times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. A longer recording is
+refused.
+"""
 
 
 class SignalTrack:

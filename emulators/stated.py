@@ -20,11 +20,11 @@ from fieldtwin.emulators.modbus.unit import UnitParts
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Effect, Tag
 
 Peek = Callable[[Table, int], int]
-"""Returns the value of one cell without the effects of a read."""
+"""A function that returns the value of one cell without the effects of a read."""
 
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
-    """Return the contents of the cells that encode an engineering value; a value out of range becomes the limit.
+    """Return the contents of the cells that encode an engineering value. A value out of range becomes the limit.
 
     `exponent` is the value of the tag's scale-factor register. For a tag that is part of a register, the other bits of
     that register are 0.

@@ -17,7 +17,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 T = TypeVar("T")
 
 LEAD_NS, LEAD_SHARE = 60_000, 20
-"""How long before the end of a wait to be awake: at most this many nanoseconds, and at most one 20th of the wait."""
+"""The time before the end of a wait at which the process wakes up: at most this many nanoseconds, and at most one 20th of the
+wait.
+"""
 
 
 class WallClock:
@@ -58,8 +60,9 @@ if sys.platform.startswith("linux"):
     _TFD_FLAGS = os.O_NONBLOCK | os.O_CLOEXEC  # TFD_NONBLOCK and TFD_CLOEXEC have these values (sys/timerfd.h)
 
     class TimerSelector(selectors.EpollSelector):
-        """epoll, and a timerfd (one per loop) that ends its waits. Python 3.13 has os.timerfd_create; before, libc is
-        called."""
+        """A selector of epoll whose waits are ended by a timerfd (one per loop). Python 3.13 has os.timerfd_create; for
+        earlier versions libc is called.
+        """
 
         def __init__(self, descriptor: int, settime: Any) -> None:
             super().__init__()
@@ -68,7 +71,7 @@ if sys.platform.startswith("linux"):
             self._spec = (ctypes.c_long * 4)()  # struct itimerspec: interval, then value; seconds and nanoseconds each
             # Edge triggered: a timer that expired wakes one wait and is not read. It has no key, so it is not reported
             # to the loop.
-            epoll: select.epoll = self._selector  # type: ignore[attr-defined]  # typeshed leaves it out
+            epoll: select.epoll = self._selector  # type: ignore[attr-defined]  # typeshed does not declare it
             epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
 
         @classmethod

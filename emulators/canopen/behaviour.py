@@ -108,7 +108,9 @@ class DeviceModel(ABC):
 
 
 Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
-"""Called with all values that the device would hold and now_ns; returns the values that it holds instead. For faults."""
+"""A function for faults: it is called with all values that the device would hold, and now_ns, and returns the values that the
+device holds instead.
+"""
 
 
 class Behaviour(NodeService):
@@ -123,7 +125,7 @@ class Behaviour(NodeService):
         self._data = data
         self._objects = Objects(data)
         self.asks_at_ns = NEVER
-        """When the model must be called next."""
+        """The time of the next call of the model."""
         self._numeric = {key: data_type for key, data_type in data.types.items() if codec.is_number(data_type)}
         self._encoders: dict[Key, Callable[[Number], bytes] | None] = {}
         """Encoders by object, for objects that the model has mentioned; None for an object that the node does not have."""

@@ -25,7 +25,7 @@ class ClientView:
         self._refusals = dict(refusals or {})
 
     def add(self, service: NodeService) -> None:
-        """Add a service. It is for the SDO servers, which are created after this view because they use it."""
+        """Add the service of the SDO servers, which are created after this view because they use it."""
         self._services += (service,)
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:

@@ -48,7 +48,9 @@ class NodeData:
         self._live: dict[Key, bytes] = dict(self._factory)
         self._decoded: dict[Key, int | float] = {}
         self.version = 0
-        """Counts changes of communication objects, so that services can cache what they derive from them."""
+        """The number of changes of communication objects. It tells services when the results that they derived from these
+        objects are out of date.
+        """
 
     def rebase(self, node_id: int) -> None:
         """Set the factory values of a node with this node ID; live values stay until a reset."""
@@ -127,7 +129,7 @@ class NodeData:
             return
         value = codec.decode(entry.data_type, raw)
         high = 1 if entry.data_type == codec.BOOLEAN and entry.high is None else entry.high
-        # Written so that a NaN violates every limit.
+        # The comparison is written in this way so that a NaN violates every limit.
         if high is not None and not value <= high:
             raise abort(entry.index, entry.subindex, Abort.VALUE_HIGH)
         if entry.low is not None and not value >= entry.low:

@@ -17,12 +17,12 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import CanConnection
 
 Poke = Callable[[int], list[CanFrame]]
-"""An event inside the device: called with the time, it returns the frames that the node then sends."""
+"""An event inside the device: a function that is called with the time and returns the frames that the node then sends."""
 
 
 @runtime_checkable
 class TakesBack(Protocol):
-    """A connection that can withdraw frames that still wait for the bus. A kernel interface cannot."""
+    """A connection that can withdraw frames which still wait for the bus. A kernel interface cannot do this."""
 
     def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
         """Withdraw waiting frames and return them in order."""
@@ -31,7 +31,7 @@ class TakesBack(Protocol):
 
 @runtime_checkable
 class SendsAtOnce(Protocol):
-    """A connection of this process, whose queue usually has room. A socket's queue belongs to the kernel."""
+    """A connection within this process, whose queue can take a frame immediately. The queue of a socket belongs to the kernel."""
 
     def send_at_once(self, frame: CanFrame, /) -> bool:
         """Queue `frame` now.
@@ -60,7 +60,7 @@ async def serve_node(
 
 
 class _Shell:
-    """The serialisation of a node's events: the output of one event is sent before the next event is processed.
+    """Processes the events of a node one after the other: the output of one event is sent before the next event is processed.
 
     If the connection can send immediately and no other event is in progress, the event is processed in the callback
     itself, otherwise by a task that holds the lock.

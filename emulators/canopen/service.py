@@ -88,14 +88,16 @@ class ObjectChange:
 
 
 _VALUES = frozenset({"write", "rpdo", "set"})
-"""Changes whose data are an object's value."""
+"""Kinds of changes whose data are the value of an object."""
 
 Held = Callable[[Mapping[tuple[int, int], bytes], int], None]
-"""Called with (values by object, now_ns) when the node's objects change: the reference values of a prototype run."""
+"""A function that is called with (values by object, now_ns) when the node's objects change. These are the reference values of
+a prototype run.
+"""
 
 
 Given = Callable[[Iterable[tuple[int, int]], int], None]
-"""Called with the objects whose values the node has sent, in an SDO reply or a TPDO, and the time in ns."""
+"""A function that is called with the objects whose values the node has sent, in an SDO reply or a TPDO, and the time in ns."""
 
 
 class ObjectSource(Protocol):
@@ -130,7 +132,7 @@ class Core:
         self.journal: deque[SentPdo] = deque(maxlen=journal_size)
         self.changes: deque[ObjectChange] = deque(maxlen=journal_size)
         self.mutes: set[str] = set()
-        """Reasons why nothing can be sent now."""
+        """The reasons why the node can send nothing now."""
         self._source = source
         self._out: list[CanFrame] = []
         self.held: Held | None = None
@@ -185,11 +187,11 @@ class Core:
 
 
 NEVER = 1 << 63
-"""A time that is never reached."""
+"""The time of an event that will not happen."""
 
 
 class NodeService:
-    """The hooks of a service. Each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
+    """The hooks of a service. By default each of them does nothing. `check_*` raise `SdoAborted` to refuse an access."""
 
     @property
     def waits(self) -> bool:

@@ -12,7 +12,7 @@ from fieldtwin.emulators.canopen.service import Core, NodeService
 STORE, RESTORE = 0x1010, 0x1011
 _SIGNATURES = {STORE: b"save", RESTORE: b"load"}
 _ON_COMMAND = 1
-"""Read value: the device stores on command, not autonomously."""
+"""The value of a read: the device stores on command, not autonomously."""
 
 
 class Storage(NodeService):
@@ -32,7 +32,7 @@ class Storage(NodeService):
             raise abort(index, subindex, Abort.NOT_STORED)
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        self._announce()  # the signature itself cannot be read back
+        self._announce()  # a read returns the supported functions, not the signature
         if index == STORE:
             self._core.data.store(ParameterGroup(subindex))
         else:

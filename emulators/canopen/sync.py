@@ -149,7 +149,7 @@ class Sync(NodeService):
     def _produce(self, now_ns: int) -> None:
         due_ns, cycle_ns = self._send_at_ns, self._cycle_ns
         self._send_at_ns = max(due_ns + cycle_ns, now_ns + 1)
-        if due_ns + cycle_ns <= now_ns:  # late by more than a cycle: skip, never burst
+        if due_ns + cycle_ns <= now_ns:  # late by more than a cycle: skip SYNCs, and never send several at once
             self._send_at_ns = now_ns + cycle_ns
         overflow = self._core.data.number(OVERFLOW)
         counter = self._counter if overflow else None

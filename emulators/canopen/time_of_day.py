@@ -44,7 +44,7 @@ class TimeService(NodeService):
     """The node's time of day; None until it has been set or received."""
 
     due_ns: int = NEVER
-    """When to produce it next."""
+    """The time at which the node sends the next TIME."""
 
     def __init__(self, core: Core, period_ns: int) -> None:
         self._core = core
@@ -98,7 +98,8 @@ class TimeService(NodeService):
         if now_ns < self.due_ns:
             return
         due_ns = self.due_ns + self._period_ns
-        self.due_ns = due_ns if due_ns > now_ns else now_ns + self._period_ns  # never burst
+        # skip messages that are overdue, and never send several at once
+        self.due_ns = due_ns if due_ns > now_ns else now_ns + self._period_ns
         time = self.now(now_ns)
         if time is not None and self._core.communicating:
             self._core.send(self._core.data.number(COB_ID) & 0x7FF, time.to_bytes(), now_ns)

@@ -50,5 +50,5 @@ def aimed(active: Active, frame: CanFrame) -> bool:
 
 
 def seen(way: FrameDirection, node: int) -> FaultFrame:
-    """Return a node's frame in the form that an `Active` counts."""
+    """Return a frame of a node in the form in which `Active` compares it with the aim of a fault."""
     return FaultFrame(way, Framing.RAW, b"", node)

@@ -55,7 +55,7 @@ class BusFault(Fault):
     kind = InjectionPoint.CAN
     ways: ClassVar[frozenset[FrameDirection]] = frozenset((FrameDirection.REPLY,))
     attempts: ClassVar[int | None] = None
-    """Number of attempts that are destroyed; None: all that match while the fault lasts."""
+    """The number of attempts that are destroyed; None: all that match while the fault lasts."""
 
 
 def as_is(frame: CanFrame) -> tuple[CanPiece, ...]:

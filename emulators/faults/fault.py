@@ -45,7 +45,7 @@ class DelayedBytes:
     gather: bool = False
     back: bool = False
     gone: Callable[[], bool] | None = None
-    """Returns whether the piece has been forwarded already; called when its time has come."""
+    """A function that is called when the time of the piece has come, and returns whether the piece was forwarded already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Aim(BaseModel):
     address: str | int | None = None
     """A PDU address, or ``holding:0x10``."""
     registers: str | int | None = None
-    """How many registers or bits the request reads or writes: ``40``, ``65..125`` or ``65..``."""
+    """The number of registers or bits that the request reads or writes: ``40``, ``65..125`` or ``65..``."""
     register_: str = Field(default="", alias="register")
     """A tag of the device."""
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
@@ -89,7 +89,7 @@ class Aim(BaseModel):
     until: str | float | int | None = None
     probability: float = Field(default=1.0, ge=0.0, le=1.0)
     optional: bool = False
-    """A run passes even if the fault never struck."""
+    """True: a run passes even if the fault never took effect."""
 
 
 class Parameters(BaseModel):
@@ -99,7 +99,7 @@ class Parameters(BaseModel):
 
 
 HEX = r"^([0-9A-Fa-f]{2} ?)*$"
-"""Bytes that a parameter gives in hexadecimal."""
+"""A parameter that gives bytes in hexadecimal."""
 
 
 class Nothing(Parameters):
@@ -124,7 +124,7 @@ class Fault(ABC):
     ways: ClassVar[frozenset[FrameDirection]] = frozenset((FrameDirection.REPLY,))
     """The directions of the frames that the fault changes if its aim does not name a direction."""
     codes: ClassVar[Mapping[int, str]] = {}
-    """The meanings that the standard gives to its parameter `code`."""
+    """The meanings that the standard gives to values of the parameter `code`."""
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters: Any = parameters
@@ -188,7 +188,7 @@ class Active:
     matched: int = 0
     struck: int = 0
     units: Sequence[int] = field(default_factory=tuple)
-    """Unit IDs that `device` and `bus` resolve to; empty: all."""
+    """The unit IDs that `device` and `bus` stand for; empty: all."""
     addresses: range | None = None
     counts: range | None = None
     functions: frozenset[int] = frozenset()

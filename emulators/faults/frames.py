@@ -17,7 +17,7 @@ from fieldtwin.emulators.modbus.rtu.shapes import crc16
 from fieldtwin.gateway.core.endpoint import Endpoint
 
 FLUSH_S = 0.05
-"""How long bytes that form no frame wait for more, in seconds."""
+"""The time in seconds for which bytes that form no frame wait for more bytes."""
 LONGEST = 1024
 LONGEST_IN_STREAM = 256 * 1024
 _MBAP_HEADER = 7
@@ -109,7 +109,7 @@ class Assembler:
         self.way = way
         self.framing = framing
         self.pending = bytearray()
-        """Bytes that wait for more."""
+        """The received bytes that do not form a whole frame yet."""
 
     def feed(self, data: bytes) -> list[FaultFrame]:
         self.pending += data

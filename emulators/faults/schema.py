@@ -28,7 +28,7 @@ _NOT_OF = {
     InjectionPoint.CAN: frozenset({"function", "address", "registers"}),
     InjectionPoint.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until", "optional"},
 }
-"""The keys of an aim that have no meaning for a kind of fault."""
+"""By kind of fault: the keys of an aim that have no meaning for it."""
 
 
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
@@ -124,7 +124,7 @@ def parse_fault(
 
 
 Check = Callable[[FaultSpec], object]
-"""Raises `WrongAim` for a fault that cannot be injected at this target."""
+"""A function that raises `WrongAim` for a fault that cannot be injected at this target."""
 
 
 def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any], ...]:
@@ -186,7 +186,7 @@ FUNCTIONS_OF = {
     "input": frozenset({4}),
     "holding": frozenset({3, 6, 16, 22, 23, 24}),
 }
-"""Table -> the function codes that address it."""
+"""By table: the function codes that address it."""
 
 
 def addressed(address: str | int) -> tuple[range, frozenset[int]]:

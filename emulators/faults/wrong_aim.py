@@ -6,7 +6,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 class WrongAim(UsageError):
-    """An aim that cannot be used; `key` is the key of the fault that is wrong."""
+    """The aim of a fault cannot be used. `key` names the key of the fault that is wrong."""
 
     def __init__(self, key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> None:
         super().__init__(message, expected=expected, got=got, hint=hint)

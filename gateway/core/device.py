@@ -59,7 +59,7 @@ class Device(ABC):
 
     @abstractmethod
     def recognise(self, data: bytes) -> COMMAND:
-        """Return the command that a message is. Its name is empty if the device does not know the message."""
+        """Return the command that a message contains. Its name is empty if the device does not know the message."""
 
     @abstractmethod
     def _execute(self, command: COMMAND, now_ns: int) -> RESPONSE:

@@ -18,9 +18,9 @@ from typing import Any
 from fieldtwin.gateway.core.errors import UsageError
 
 LONGEST = 1000
-"""Most characters of an expression."""
+"""The largest number of characters of an expression."""
 DEEPEST = 50
-"""Most levels of an expression."""
+"""The largest number of nested levels of an expression."""
 
 _UNIT_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0}
 _TOKEN = re.compile(r"""('[^']*'|"[^"]*")|(?<![\w.])(\d+(?:\.\d+)?)\s*(ms|min|s|h)\b|(command pending)""")
@@ -68,7 +68,7 @@ OF_NUMBERS: dict[str, tuple[int, Callable[..., float]]] = {
     "sqrt": (1, math.sqrt),
     "tan": (1, math.tan),
 }
-"""Functions of numbers: number of arguments and function. Angles are in radians."""
+"""The functions of numbers, by name: the number of their arguments, and Python's function. Angles are in radians."""
 
 
 class NotUnderstood(UsageError):
@@ -85,7 +85,7 @@ class NotUnderstood(UsageError):
 
 
 class Parsed:
-    """The syntax tree of a text, of which each node is part of the language. `what` names it in errors: "formula".
+    """The syntax tree of a text, which contains only nodes of this language. `what` names the text in errors: "formula".
 
     `times_s` are the times that it contains, in seconds. Raises `UsageError` for an invalid text, with `hint` for one
     that Python's parser refuses.
@@ -164,7 +164,7 @@ class Parsed:
 
 
 def dotted(node: ast.expr) -> str:
-    """Return the name that a node of a `Parsed` tree is, such as ``ctd.pressure``; "" for any other node."""
+    """Return the name that a node of a `Parsed` tree represents, such as ``ctd.pressure``; "" for any other node."""
     if isinstance(node, ast.Attribute):
         return f"{dotted(node.value)}.{node.attr}"
     return node.id if isinstance(node, ast.Name) else ""

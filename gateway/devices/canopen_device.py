@@ -214,7 +214,9 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def to_configure(self) -> str:
-        """Return what `configure` may write, in words; empty if the system file configures nothing that has to be written."""
+        """Describe in words what `configure` may write. The text is empty if the system file configures nothing that has to be
+        written.
+        """
         canopen, parts = self.config.canopen, []
         if canopen.configuration is not None:
             parts.append(f"{canopen.dcf}(only if the node holds different values)")
@@ -270,7 +272,7 @@ class CanopenDriver(DeviceDriver):
         """Read over SDO the tags that the node's TPDOs should carry but do not. A tag that the node refuses gets no value."""
         for name in self.unmapped:
             if self.profile.tags[name].poll in self.config.poll:
-                continue  # its poll group reads it
+                continue  # the poll group of this tag reads it
             try:
                 await self._upload(self.profile.tags[name])
             except SdoAborted:

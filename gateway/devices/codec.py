@@ -73,7 +73,9 @@ def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue
 
 
 def _odd_number(tag: Tag, ordered: bytes) -> int | None:
-    """Return the number that big-endian bytes hold as BCD digits or in some of their bits; None for a BCD digit above 9."""
+    """Return the number that big-endian bytes hold as BCD digits or in some of their bits. Return None if a BCD digit is above
+    9.
+    """
     if tag.type.startswith("bcd"):
         digits = ordered.hex()
         return int(digits) if digits.isdigit() else None

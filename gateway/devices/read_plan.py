@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.modbus.requests.replies import BitsReply, Regis
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
-"""Exceptions (AP 7) which show that a read covered a gap, and that it was too long."""
+"""The exception codes (AP 7) which show that a read covered a gap, or that it was too long."""
 
 Member = tuple[RegisterRange, Tag | MessageBlock]
 
@@ -39,7 +39,7 @@ class Read:
 
     @cached_property
     def places(self) -> tuple[tuple[Tag, slice], ...]:
-        """Return each tag with the position of its bytes in the data of the read."""
+        """Return each tag, with the position of its bytes in the data that the device returns for this read."""
         return tuple((tag, place_of(tag.registers, self.range)) for tag in self.tags)
 
     @property
@@ -232,7 +232,8 @@ class GroupPlan:
             return
         whole.taken.add(read)
         first, second = whole.first, whole.second
-        if len(whole.taken) == 2:  # if a part was also refused, that alone explains the refusal of the whole
+        # if the device also refused a part, that alone explains why it refused the whole read
+        if len(whole.taken) == 2:
             gap = second.range.address - first.range.end if whole.code == ILLEGAL_ADDRESS else 0
             self.learnt.learn_gap(RegisterRange(first.range.table, first.range.end, gap))
             del self._splits[first], self._splits[second]

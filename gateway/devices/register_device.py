@@ -34,13 +34,13 @@ from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.unit_timing import UnitPace
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
-"""The most that one request may write (AP 6.11 and 6.12)."""
+"""The largest numbers of registers and coils that one request may write (AP 6.11 and 6.12)."""
 SAMPLED_STEPS = 0x80000000
 """A step of the sample counter that is larger than this is a step backwards: the device restarted."""
 
 
 NOTHING_READ = 1 << 16
-"""More registers or bits than a device can have."""
+"""The cost of a poll group without reads: more registers or bits than a device can have."""
 
 
 class GroupReading:
@@ -167,8 +167,8 @@ class RegisterDriver(DeviceDriver):
             )
 
     def cost(self, what: str) -> int:
-        """Return the number of registers or bits that the first transaction of the group `what` reads: the cost of a failed
-        attempt.
+        """Return the number of registers or bits that the first transaction of the group `what` reads. A failed attempt costs
+        that much.
 
         A group without any reads cannot show whether the device is present, so its cost is higher than that of any other group.
         """

@@ -131,7 +131,7 @@ class TransmitterDriver(RegisterDriver):
             self.to_acknowledge = 0
 
     async def check_outbox(self) -> bool:
-        """Read whether the transmitter took the last message. If the mailbox is still full, this counts as a wait."""
+        """Ask the device whether the transmitter took the last message. If the mailbox is still full, count one wait."""
         reply = await self.client.read_registers(self.config.address, "holding", self._outbox.ack.address, 1)
         free = reply.registers[0] == self._sent
         self.taken += free and not self.outbox_free

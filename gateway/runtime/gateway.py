@@ -34,7 +34,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
-"""How long after the gateway's start a PLC may take to appear before the outputs are made safe."""
+"""The time that a PLC may take to appear after the gateway's start. After it, the outputs are made safe."""
 _NUMBERS = (int, float)
 
 
@@ -106,7 +106,7 @@ class Gateway:
         self.drivers: dict[str, RegisterDriver | CanopenDriver] = {}
         self.buses: dict[str, Bus] = {}
         self._modbus: dict[str, ModbusBus] = {}
-        """Those of `buses` that can carry mailboxes and bridges."""
+        """The Modbus buses among `buses`, which can carry mailboxes and bridges."""
         for device in config.devices.values():
             driver = make_driver(device, config.buses[device.bus], self.tags, clock)
             self.let_trigger(driver)

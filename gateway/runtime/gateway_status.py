@@ -50,19 +50,19 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     address: int
     """Unit ID or node ID."""
     online: bool
-    """Whether it answers and is the expected device."""
+    """Whether the device answers and is the expected one."""
     error: str
     """Why the device is not online, or which problem it has; empty if it has none."""
     identity_error: str
     """How the device differs from the one in the system file; empty if it does not differ."""
     polls: int
     errors: int
-    """Polls that failed, and PDOs that were malformed."""
+    """The number of polls that failed, and of PDOs that were malformed."""
     samples_missed: int | UnsetType = UNSET
-    """Of a Modbus device that samples: samples between two polls that were never read."""
+    """For a Modbus device that samples: the number of samples between two polls that were never read."""
     mailbox: bool | UnsetType = UNSET
     conflicts: int | UnsetType = UNSET
-    """Of a CANopen node: replies from a second node with the same ID."""
+    """For a CANopen node: the number of replies from a second node with the same ID."""
     conflict: str | UnsetType = UNSET
     unstarted: str | UnsetType = UNSET
     """For a CANopen node that the gateway does not start: the tags that have no value until a different NMT master starts the
@@ -72,10 +72,10 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     bring_ups: int | UnsetType = UNSET
     emcys: int | UnsetType = UNSET
     emcy: list[str] | UnsetType = UNSET
-    """Error codes that the node has sent and not reset, such as ``8130h``."""
+    """For a CANopen node: error codes that the node has sent and not reset, such as ``8130h``."""
     emcy_log: list[EmcyStatus] | UnsetType = UNSET
     tpdos: dict[str, TpdoStatus] | UnsetType = UNSET
-    """By number of the PDO."""
+    """For a CANopen node: its TPDOs, by number."""
     rpdos: dict[str, list[str]] | UnsetType = UNSET
     rpdos_sent: int | UnsetType = UNSET
 
@@ -86,16 +86,16 @@ class BusStatus(msgspec.Struct, frozen=True, kw_only=True):
     endpoint: str
     connected: bool
     opens: int
-    """How many connections were opened so far."""
+    """The number of connections that were opened so far."""
     local: list[str]
-    """Local addresses of the connections so far."""
+    """The local addresses of the connections so far."""
     error: str
-    """Why the bus is not connected; empty while it is."""
+    """The reason why the bus is not connected; empty while it is connected."""
     counters: Counts
     latency: LatencyStatus
     """Response times: from request to reply (Modbus), and of whole SDO transfers (CANopen)."""
     not_produced: int | UnsetType = UNSET
-    """Of a CAN bus: SYNC, TIME and repeated RPDOs that could not be sent in their period."""
+    """For a CAN bus: the number of SYNC, TIME and repeated RPDO messages that could not be sent in their period."""
     sync_producers: str | UnsetType = UNSET
     """For a CAN bus: the problem with the producers of SYNC; empty if there is none."""
 
@@ -149,7 +149,7 @@ class RefusalStatus(msgspec.Struct, frozen=True, kw_only=True):
     program: str
     place: str
     fault: str
-    """What has to be corrected: "program", "device", or "" for nothing."""
+    """The part that has to be corrected: "program" or "device"; "" if neither has to be corrected."""
     standing: bool
 
 
@@ -160,7 +160,7 @@ class RefusalsStatus(msgspec.Struct, frozen=True, kw_only=True):
     entries_made: int
     unrecorded: int
     faults: Counts
-    """Refusals that are a fault of the program, and of the device."""
+    """The number of refusals that are a fault of the program ("program") or of the device ("device")."""
     counts: Counts
     entries: list[RefusalStatus]
     """The entries that are kept."""
@@ -179,12 +179,12 @@ class MailboxStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FrontStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the gateway answers clients: a TCP port or a serial line."""
+    """A TCP port or a serial line on which the gateway answers clients."""
 
     listening: str | None
     """The URL that is open; None while it is not."""
     error: str
-    """Why it is not open; empty while it is."""
+    """The reason why it is not open; empty while it is open."""
     counters: Counts
     clients: list[str] = []
     """The connected clients of a TCP port, as HOST:PORT."""
@@ -194,7 +194,7 @@ class ServerStatus(FrontStatus, frozen=True, kw_only=True):
     """A server of tags."""
 
     unit: int
-    """The unit ID that it answers."""
+    """The unit ID for which the server answers."""
 
 
 class BridgeStatus(FrontStatus, frozen=True, kw_only=True):
@@ -205,7 +205,7 @@ class BridgeStatus(FrontStatus, frozen=True, kw_only=True):
 
 
 class LearntStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """Addresses at which a device refuses reads, as the gateway found them out."""
+    """Addresses at which a device refuses reads, as the gateway has found."""
 
     profile: str
     gaps: list[str]
@@ -213,7 +213,7 @@ class LearntStatus(msgspec.Struct, frozen=True, kw_only=True):
     missing: list[str]
     """Tags that the device does not have."""
     line: str
-    """The line that replaces the `gaps` in the profile; "" if there is nothing to state."""
+    """The line that replaces the `gaps` in the profile; "" if the profile needs no change."""
 
 
 class PlcSeen(msgspec.Struct, frozen=True, kw_only=True):

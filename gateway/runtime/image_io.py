@@ -49,7 +49,7 @@ class ImageExchange:
         self.undelivered: dict[str, int] = {}
         """By output message tag: how many messages that were read have not been handled yet."""
         self.outputs: dict[str, TagValue] = {}
-        """Built anew when a value or quality changes; its times are those of that change."""
+        """A new dictionary is made when a value or quality changes; its times are those of that change."""
         self._seen: Snapshot | None = None
         self._taken = [
             (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)

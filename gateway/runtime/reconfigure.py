@@ -20,7 +20,7 @@ from fieldtwin.gateway.runtime.buses.pending_config import AnyDriver, PendingCon
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
 
 OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})
-"""Reasons that follow from the value itself."""
+"""Reasons for bad quality that result from decoding a value."""
 
 
 async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
@@ -38,7 +38,7 @@ async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
 
 
 class _Taking:
-    """The follow-up of a driver's new configuration in the gateway. All its consequences take effect in one step."""
+    """Applies a driver's new configuration to the gateway's tags, outputs and buses. All changes take effect in one step."""
 
     def __init__(self, gateway: Gateway, devices: Iterable[str]) -> None:
         drivers = [gateway.drivers[name] for name in devices]

@@ -114,7 +114,7 @@ class ServeCounters:
 
 @dataclass(frozen=True, slots=True)
 class _Cell:
-    """The content at an address: a tag's value, or its quality register."""
+    """The content at an address: a tag's value, or the quality register of a tag."""
 
     served: ServedTag
     is_quality: bool
@@ -193,7 +193,7 @@ class TagServer:
             return exception_pdu(e)
 
     def _note_refusal(self, caller: Caller, unit: int, pdu: bytes, code: int, why: str = "") -> None:
-        """Record a write that reaches no tag."""
+        """Record a refused write of registers that belong to no writable tag."""
         if self._record is not None and pdu[0] in WRITE_FUNCTIONS:
             self._record.refused(caller.on_record, self.config.name, unit, pdu, code, why)
 

@@ -19,7 +19,7 @@ FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000
 """The largest number of published values kept until the store fetches them. Older values are dropped and counted."""
 OnPut = Callable[[str, TagValue], None]
-"""Called with a tag's name and its new value. It must not raise."""
+"""A function that is called with a tag's name and its new value. It must not raise."""
 _GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an Enum's members is slow
 
 
@@ -43,7 +43,7 @@ class Held:
         self.value = NEVER
         self.refreshed_ns = 0
         self.limit_ns: int | None = None
-        """How long the value is good without being refreshed."""
+        """The time for which the value is good without being refreshed, in ns."""
 
     @property
     def fresh_until_ns(self) -> int:

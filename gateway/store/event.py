@@ -37,7 +37,7 @@ class Kind(IntEnum):
     PAYLOAD = 5
     """`value` is a RESPONSE as it was received (bytes); `name` is the program or device that sent it."""
     LOSS = 6
-    """`value` is how many events were never stored; `name` is the reason."""
+    """`value` is the number of events that were never stored; `name` is the reason."""
 
 
 Value = None | int | float | str | bytes
@@ -67,7 +67,9 @@ def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
 
 
 def stored(event: Event, value: Scalar | None) -> Event:
-    """Return `event` with `value` in the form of `plain`; it is uncertain at best if that form differs from `value`."""
+    """Return `event` with `value` in the form of `plain`. If that form differs from `value`, the quality becomes uncertain
+    unless it is bad.
+    """
     kept = plain(value)
     if value is not None and kept is not None and kept != value and event.quality < Quality.UNCERTAIN:
         event = event._replace(quality=int(Quality.UNCERTAIN), reason=int(Reason.NOT_EXACT))

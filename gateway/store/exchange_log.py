@@ -16,7 +16,9 @@ from fieldtwin.gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
 KNOWN = 1_000
-"""How many rows at the end of the store are not stored again: more than a PLC can have under way."""
+"""The number of rows at the end of the store that are compared with new rows, so that no row is stored twice. A PLC cannot
+have as many rows under way.
+"""
 
 
 class ExchangeLog:

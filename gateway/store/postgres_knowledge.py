@@ -169,7 +169,7 @@ class PostgresKnowledge:
         try:
             return await self._do(work)
         except FieldtwinError:
-            self._origins.pop(origin, None)  # it may not have been stored either
+            self._origins.pop(origin, None)  # perhaps this row was not stored either
             raise
 
     # -- reading ----------------------------------------------------------------------------------------------------------

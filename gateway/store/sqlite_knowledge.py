@@ -22,7 +22,7 @@ T = TypeVar("T")
 Work = Callable[[], Any]
 Offload = Callable[[Work], Awaitable[Any]]
 BLOCK = 20_000
-"""How many events a replay reads in one block: enough that the switch to the thread does not matter."""
+"""The number of events that a replay reads in one block: so many that the switch to the thread costs little."""
 NAMES_MAX = 100_000
 PAGE = 4096
 BUSY_S = 5.0

@@ -24,9 +24,9 @@ _REAL = {REAL32: struct.Struct("<f"), REAL64: struct.Struct("<d")}
 _LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
 """The `struct` letter of signed integers by size in bytes; the capital letter is the unsigned one."""
 _TIME_BYTES = {0x0C: 6, 0x0D: 6}
-"""TIME_OF_DAY and TIME_DIFFERENCE: 48 bits as sent; this module does not interpret them."""
+"""The size in bytes of TIME_OF_DAY and TIME_DIFFERENCE, which this module does not interpret."""
 
-# By data type, because they are needed for every value.
+# By data type, made once, because every value needs one.
 _INTEGER_BYTES = {BOOLEAN: 1} | {data_type: bits // 8 for data_type, bits in (_SIGNED | _UNSIGNED).items()}
 _BYTES = _INTEGER_BYTES | _TIME_BYTES | {data_type: real.size for data_type, real in _REAL.items()}
 _RANGES = (

@@ -17,7 +17,7 @@ _PARAMETERS = {1: ("COB-ID", _U32), 2: ("Transmission type", _U8), 3: ("Inhibit 
     6: ("SYNC start value", _U8),
 }
 _ROOM = 8
-"""Highest number of mapped objects: a PDO's 64 bits hold no more whole bytes."""
+"""The largest number of mapped objects: the 64 bits of a PDO hold 8 objects of one byte."""
 _INVALID = 1 << 31
 _PREDEFINED = 4
 _MAX_PDOS = 512

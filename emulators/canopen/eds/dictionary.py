@@ -34,12 +34,12 @@ _OBJECT = re.compile(r"[0-9a-f]{1,4}")
 _VALUES = re.compile(r"[0-9a-f]{4}value")
 _SUBOBJECT = re.compile(r"([0-9a-f]{1,4})sub([0-9a-f]{1,2})")
 _HOLDS_NO_VALUE = (0x05, 0x06)
-"""DEFTYPE and DEFSTRUCT: the definition of a data type."""
+"""Object types that define a data type and hold no value: DEFTYPE and DEFSTRUCT."""
 _RESERVED_TYPES = (0x00, 0x0E, 0x17)
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NAMED = 4
-"""Most objects of one kind that a note names."""
+"""The largest number of objects of one kind that a note names."""
 _NODE_ID = re.compile(r"\$nodeid", re.IGNORECASE)
 _RELATIVE = re.compile(r"\$nodeid(?:\+([0-9a-fx]+))?|([0-9a-fx]+)\+\$nodeid", re.IGNORECASE)
 """``$NODEID``, ``$NODEID+0x180`` and ``0x180+$NODEID`` (CiA 306-1, 4.6.3.2), without spaces."""

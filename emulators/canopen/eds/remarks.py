@@ -18,7 +18,7 @@ _SHORTEST_CYCLE_US = 50
 """A SYNC without data takes 47 bits: 47 us at 1 Mbit/s, the highest bit rate (CiA 301, 5.3)."""
 _INVALID = 1 << 31
 _NAMED = 6
-"""Most objects that one remark names."""
+"""The largest number of objects that one remark names."""
 
 
 @dataclass(frozen=True, slots=True)

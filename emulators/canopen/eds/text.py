@@ -18,7 +18,9 @@ _OBJECT = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2}|name|value)?", re.IGNORECASE
 """Names of the sections that describe objects."""
 
 MAX_LINES = 500_000
-"""More than any device needs (65,536 objects); it limits the cost of a wrong file."""
+"""The largest number of lines, which is more than any device needs (65,536 objects). It limits the time to read a file that is
+not a data sheet.
+"""
 
 
 @dataclass(frozen=True, slots=True)

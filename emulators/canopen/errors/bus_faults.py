@@ -29,7 +29,9 @@ class BusFaults(NodeService):
         self._react = react
         self.state = CanErrorState.ACTIVE
         self.tell: Callable[[int], None] | None = None
-        """Called with the identifier when a second node sends on an identifier of this node; called once until the next reset."""
+        """A function that is called with the identifier when a second node sends on an identifier of this node, once until the
+        next reset.
+        """
         self._told = False
 
     def reset(self, now_ns: int) -> None:

@@ -21,7 +21,7 @@ COMMUNICATION = 0x10
 """Bits of the error register (CiA 301, table 51)."""
 
 MAX_WAITING = 32
-"""Messages that wait for the inhibit time; a burst beyond that is dropped and counted."""
+"""The number of messages that may wait for the end of the inhibit time. Further messages are dropped and counted."""
 
 _INVALID = 1 << 31
 _UNIT_NS = 100_000
@@ -36,7 +36,7 @@ class Emergency(NodeService):
         self._active: dict[tuple[int, str], int] = {}
         self._waiting: deque[bytes] = deque()
         self._free_at_ns = 0
-        """End of the inhibit time."""
+        """The end of the inhibit time (ns)."""
         self.active: tuple[int, ...] = ()
         """Codes of the errors that are present, oldest first."""
 

@@ -18,14 +18,14 @@ ERROR_CONTROL = 0x700
 
 
 class ErrorReaction:
-    """The reaction to a communication error that 1029h:01 selects; called with the time."""
+    """Carries out the reaction to a communication error that 1029h:01 selects."""
 
     def __init__(self, core: Core, change_state: Callable[[NmtState, int], None]) -> None:
         self._core = core
         self._change_state = change_state
 
     def __call__(self, now_ns: int) -> None:
-        """React by the value of 1029h:01 (CiA 301, 7.5.2.32).
+        """React to a communication error as the value of 1029h:01 demands (CiA 301, 7.5.2.32).
 
         0: go from OPERATIONAL to PRE-OPERATIONAL. 1: no change. 2: go to STOPPED."""
         reaction = self._core.data.number(0x1029, 1)
@@ -39,7 +39,7 @@ class HeartbeatProducer(NodeService):
     """The producer that sends the state every 1017h milliseconds. A newly written period begins immediately, with a heartbeat."""
 
     due_ns: int = NEVER
-    """When the next heartbeat must be sent."""
+    """The time at which the next heartbeat must be sent."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
@@ -66,7 +66,7 @@ class HeartbeatProducer(NodeService):
         self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._core.state]), now_ns)
         period_ns = self._period_ns()
         self.due_ns += period_ns
-        if self.due_ns <= now_ns:  # late by more than a period: skip, never burst
+        if self.due_ns <= now_ns:  # late by more than a period: skip heartbeats, and never send several at once
             self.due_ns = now_ns + period_ns
 
     def _period_ns(self) -> int:
@@ -84,7 +84,7 @@ class HeartbeatConsumer(NodeService):
     """The monitor of the nodes of 1016h, each from its first heartbeat on. A loss causes EMCY 8130h and the reaction of 1029h."""
 
     due_ns: int = NEVER
-    """When the first missing heartbeat is detected."""
+    """The time at which the first missing heartbeat is detected."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
@@ -112,7 +112,7 @@ class HeartbeatConsumer(NodeService):
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
         self._configure()
-        self._clear_if_all_heard(now_ns)  # the missing node may not be monitored any more
+        self._clear_if_all_heard(now_ns)  # 1016h may have changed, so that the missing node is not monitored now
 
     def reset(self, now_ns: int) -> None:
         self._watched.clear()

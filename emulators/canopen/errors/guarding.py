@@ -18,7 +18,7 @@ class NodeGuarding(NodeService):
     """The guarded side: it answers guarding requests and monitors that they arrive."""
 
     due_ns: int = NEVER
-    """When the life time ends."""
+    """The end of the life time."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core

@@ -1,4 +1,5 @@
-"""LSS inside a node: the states in which it answers, and the effect of a new node ID or bit rate (CiA 305 v3.0, 4.3 and 6.3).
+"""The LSS service of a node: the states in which it answers, and the effect of a new node ID or bit rate (CiA 305 v3.0, 4.3
+and 6.3).
 
 A configured node takes a new node ID at the next reset; an unconfigured node boots with it as soon as LSS leaves
 configuration. The bit rate changes after the switch delay; the node is silent for one delay before and one after.
@@ -19,7 +20,7 @@ class LssService(NodeService):
     """The LSS slave of one node. It calls `boot` with the time when an unconfigured node has got a pending node ID."""
 
     due_ns: int = NEVER
-    """When the node may send again, at the new bit rate."""
+    """The time at which the node may send again, with the new bit rate."""
 
     def __init__(self, core: Core, store: LssStore, boot: Callable[[int], None]) -> None:
         self._core = core

@@ -29,7 +29,7 @@ Identity = tuple[int, int, int, int]
 
 
 class LssStore(Enum):
-    """The result of the store command; the values are its error codes."""
+    """The results of the store command. The values are the error codes of its reply."""
 
     WORKS = 0
     UNSUPPORTED = 1
@@ -50,7 +50,7 @@ class LssSlave:
     pending_rate: int | None = None
     stored_rate: int | None = None
     activate_ms: int | None = None
-    """Switch delay of an activated bit timing, for the node to read and clear."""
+    """The switch delay in ms of an activated bit timing. The node reads and clears it."""
     _selected: int = 0
     _identified: int = 0
     _scanned: int = 0
@@ -103,7 +103,9 @@ class LssSlave:
         return _reply(command, self.node_id) if command == _INQUIRE_NODE_ID else None
 
     def _select(self, part: int, number: int) -> bytes | None:
-        """Process four frames in order; if all match, the fourth one switches to configuration."""
+        """Process one of the four frames that select a slave. If all match in order, the fourth one switches to the
+        configuration state.
+        """
         if self.configuring:
             return None
         in_turn = part in (0, self._selected) and self.identity()[part] == number
@@ -114,7 +116,9 @@ class LssSlave:
         return _reply(_SELECTED)
 
     def _identify(self, part: int, number: int) -> bytes | None:
-        """Process vendor, product, lowest and highest revision, lowest and highest serial number."""
+        """Process one of the six frames that ask for slaves by identity: vendor, product, lowest and highest revision, lowest
+        and highest serial number.
+        """
         vendor, product, revision, serial = self.identity()
         matches = (
             number == vendor,

@@ -83,7 +83,7 @@ class PdoParameters:
         self.transmit = index >= 0x1800
         self._settings: PdoSettings | None = None
         self._settings_of = -1
-        """The version of the values that `_settings` were read from."""
+        """The version of the values from which `_settings` were read."""
 
     @property
     def settings(self) -> PdoSettings:

@@ -23,9 +23,9 @@ _FIRST = 0x1400
 class _Rpdo:
     parameters: PdoParameters
     waiting: bytes | None = None
-    """Received data, to be applied at the next SYNC; a newer PDO replaces it."""
+    """The received data that is applied at the next SYNC. A newer PDO replaces it."""
     deadline_ns: int = NEVER
-    """When the next one must have arrived; `NEVER` before the first one."""
+    """The time by which the next PDO must arrive; `NEVER` before the first one."""
 
     @property
     def source(self) -> str:
@@ -40,7 +40,7 @@ class Rpdos(NodeService):
     """
 
     due_ns: int = NEVER
-    """When the first timeout is due."""
+    """The time of the first timeout."""
 
     def __init__(
         self,

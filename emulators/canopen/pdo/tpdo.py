@@ -29,10 +29,10 @@ class _Tpdo:
     pending: bool = False
     event_at_ns: int | None = None
     free_at_ns: int = 0
-    """End of the inhibit time."""
+    """The end of the inhibit time (ns)."""
     syncs: int = 0
     started: bool = False
-    """The SYNC whose counter equals the start value has occurred."""
+    """Whether the SYNC whose counter equals the start value has occurred."""
     sample: bytes | None = None
 
     def due_ns(self) -> int:
@@ -55,7 +55,7 @@ class Tpdos(NodeService):
         self._overdue: frozenset[int] = frozenset()
         self._event_ns = NEVER
         self._event_of = -1
-        """The version of the values that `_event_ns` follows from; -1 after a change in this object."""
+        """The version of the values from which `_event_ns` was computed; -1 after a change in this object."""
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     @property

@@ -31,12 +31,12 @@ class BlockDownload:
     overflow: Abort = Abort.TOO_LONG
     """The abort code for more than `limit` bytes."""
     block: int = MAX_BLOCK
-    """Segments of a sub-block."""
+    """The number of segments of a sub-block."""
     receiving: bool = True
     """False after the last segment, while only the end request is missing."""
     data: bytearray = field(default_factory=bytearray)
     good: int = 0
-    """Number of the last segment of this sub-block that arrived in sequence."""
+    """The number of the last segment of this sub-block that arrived in sequence."""
 
     def segment(self, data: bytes) -> bytes | None:
         """Process one segment; return the acknowledgement if it ends a sub-block. Raises `SdoAborted`."""
@@ -48,7 +48,7 @@ class BlockDownload:
             self.good = number
             self.data += data[1:8]
             self.receiving = not last
-            room = max(-(-self.limit // SEGMENT_BYTES), 1) * SEGMENT_BYTES  # an empty value takes one segment too
+            room = max(-(-self.limit // SEGMENT_BYTES), 1) * SEGMENT_BYTES  # an empty value also takes one segment
             if len(self.data) > room:
                 raise abort(self.index, self.subindex, self.overflow)
         return self.acknowledge() if last or number == self.block else None
@@ -82,9 +82,9 @@ class BlockUpload:
     block: int
     crc: bool
     offset: int = 0
-    """Where the present sub-block begins."""
+    """The position in bytes at which the present sub-block begins."""
     sent: int = 0
-    """Segments of the present sub-block; 0 before the client's start."""
+    """The number of segments of the present sub-block; 0 before the client's start."""
     ending: bool = False
 
     def segments(self) -> list[bytes]:

@@ -15,14 +15,14 @@ _ADDITIONAL = range(0x1201, 0x1280)
 _TO_SERVER, _TO_CLIENT = 1, 2
 _INVALID = 1 << 31
 _RESERVED = 0x3FFFF800
-"""Includes the frame bit: 29-bit identifiers are not supported."""
+"""The bits of an identifier entry that must be 0. They include the frame bit, because 29-bit identifiers are not supported."""
 
 
 class SdoChannels(NodeService):
     """All SDO servers of a node, each with its own transfer. `tolerate_short` accepts requests of fewer than 8 bytes."""
 
     due_ns: int = NEVER
-    """When the first transfer needs a call."""
+    """The time at which the first of the transfers needs a call."""
 
     def __init__(self, core: Core, access: ObjectAccess, timeout_ns: int, block: int, *, tolerate_short: bool) -> None:
         self._core = core

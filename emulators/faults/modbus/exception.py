@@ -22,7 +22,7 @@ CODES = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-"""APP V1.1b3, 7. All other codes are vendor-specific."""
+"""The exception codes of the standard (APP V1.1b3, 7). All other codes are vendor-specific."""
 
 
 class Form(Parameters):

@@ -14,11 +14,11 @@ from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES, Tag
 
 PLAUSIBLE = 1.0e9
-"""A float is out of range with this value, unless its declared range includes it."""
+"""The value with which a fault puts a float out of range, unless the declared range includes it."""
 FLOAT_LIMITS = {"float32": 3.4028234663852886e38, "float64": 1.7976931348623157e308}
 """The largest finite numbers (IEEE 754)."""
 _MOST_SENTINELS = 64
-"""Number of neighbours of a limit that may be sentinels, which mean "no value" and not a value out of range."""
+"""The number of neighbours of a limit that may be sentinels, which mean "no value" and not a value out of range."""
 
 
 def numbers(tags: Iterable[Tag]) -> list[Tag]:

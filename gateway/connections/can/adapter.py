@@ -30,10 +30,10 @@ POLL_S = 0.05
 SEND_TIMEOUT_S = 2.0
 
 _OWN = frozenset({"bitrate", "listen"})
-"""Parameters of the endpoint that are read here; others are passed to the driver (``?app_name=CANalyzer``)."""
+"""Parameters of the endpoint that this module reads; all others are passed to the driver (``?app_name=CANalyzer``)."""
 
 RATELESS = frozenset({"virtual", "udp_multicast"})
-"""Interfaces without a bit rate."""
+"""Interfaces of python-can that have no bit rate."""
 
 
 class AdapterConnection(CanConnection):

@@ -39,7 +39,7 @@ class CanInterface:
     kind: str
     bitrate: int
     listen_only: bool = False
-    """The controller does not even acknowledge."""
+    """The controller listens only: it does not even acknowledge frames."""
     state: str = ""
     """The controller's state: ``error-active``, ``error-passive``, ``bus-off``...; empty if it has none."""
     tx_errors: int = 0

@@ -29,7 +29,9 @@ RECEIVE_BUFFER_BYTES = 4 << 20
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.001, 0.05
 SEND_TIMEOUT_S = 2.0
-"""How long a full transmit queue is waited for. If it stays full, no node acknowledges, or the controller is bus-off."""
+"""The time for which `send` waits while the transmit queue is full. If it stays full, no node acknowledges, or the controller
+is bus-off.
+"""
 
 
 class SocketCanConnection(CanConnection):

@@ -158,7 +158,7 @@ class SerialConnection(ByteConnection):
                     return
                 await asyncio.sleep(0.005)
         except (OSError, termios.error):
-            return  # lost while closing: nothing is left to wait for
+            return  # the port was lost while it was closed: there are no bytes left to wait for
 
 
 def _ignored_settings(fd: int, endpoint: Endpoint) -> tuple[str, ...]:

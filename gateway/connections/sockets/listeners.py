@@ -58,7 +58,7 @@ class ClientConnection(TcpConnection, Client):
             shaken = self._wire.transport.get_extra_info("ssl_object")
             assert isinstance(shaken, ssl.SSLObject)
             self.role = role_in(shaken.getpeercert(binary_form=True) or b"")
-        if self._lost is not None:  # evicted meanwhile
+        if self._lost is not None:  # the listener evicted this client during the handshake
             self._wire.transport.abort()
 
     def on_end_of_stream(self, error: ConnectionLost) -> bool:
@@ -240,7 +240,7 @@ class TcpListener:
         except BaseException as e:
             sock.close()
             self._forget(client)
-            if isinstance(e, OSError):  # it left while being accepted, or its TLS handshake failed
+            if isinstance(e, OSError):  # the client left while it was accepted, or its TLS handshake failed
                 self.unshaken += self._tls is not None
                 return
             raise

@@ -203,5 +203,5 @@ def _tune(sock: socket.socket) -> None:
         ("TCP_KEEPCNT", KEEPALIVE_PROBES),
         ("TCP_USER_TIMEOUT", UNACKNOWLEDGED_MS),
     ):
-        if hasattr(socket, name):  # some systems do not have all of them
+        if hasattr(socket, name):  # some systems do not have all of these options
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -40,7 +40,7 @@ class TlsConnection(TcpConnection):
         """
         connection = cls(endpoint, max_pending)
         make_context = partial(_context, endpoint)
-        # In a thread: reading the system's authorities alone means a few hundred files or one large one.
+        # In a thread, because the system's authorities are a few hundred files or one large file.
         context, connection.role = await asyncio.get_running_loop().run_in_executor(None, make_context)
         await connection._connect(timeout_s, context, endpoint.param("name") or endpoint.host)
         return connection

@@ -23,7 +23,7 @@ _LINE = re.compile(
 _FD = re.compile(rb"\(\d{1,12}\.\d{1,9}\)\s+\S{1,64}\s+[0-9A-Fa-f]{3,8}##[0-9A-Fa-f]{1,129}(?:\s+[RT])?")
 _ERROR_FLAG = 0x20000000
 MAX_LINE = 1024
-"""Most bytes of a line, its newline included."""
+"""The largest number of bytes of a line, its newline included."""
 
 SUFFIX = ".log"
 """File name suffix by which a log of candump is recognised among recordings."""
@@ -31,7 +31,7 @@ SUFFIX = ".log"
 
 @dataclass(slots=True)
 class LeftOut:
-    """The content of a log apart from classic data and remote frames."""
+    """Counts of the frames that `read_lines` omits: CAN FD frames and error frames."""
 
     fd: int = 0
     errors: int = 0

@@ -24,7 +24,8 @@ _KINDS = {
 
 def open_input(path: Path) -> io.BufferedReader:
     """Open `path` for reading bytes. Raises `FileInvalid` if it is not a regular file, `OSError` if it cannot be opened."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # else a pipe is waited for
+    # otherwise opening a pipe would wait for a writer
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
         if kind == stat.S_IFDIR:

@@ -137,7 +137,7 @@ class MessageBlock:
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """The tag that counts samples and the tag that holds their period in seconds."""
+    """The tags that describe samples: one counts them, and one holds their period in seconds."""
 
     count: str
     period: str

@@ -203,7 +203,7 @@ class ProfileForm(Strict):
     gaps: list[str] = Field(default=[], description='registers that a read must not include, such as "holding:10..19"')
     undeclared: Literal["exception", "zero", "hold"] = Field(
         default="exception",
-        description="what registers are that no tag names, in the tables that have tags: refused (02), 0, or 0 until written",
+        description="the answer for registers that no tag names, in tables that have tags: exception 02, 0, or 0 until written",
     )
     defaults: Defaults = Defaults()
     eds: str | None = None

@@ -75,7 +75,7 @@ class TagSpec:
                     got=f"{self.max_bytes} bytes, depth {self.depth}",
                 )
         elif self.max_bytes or self.depth:
-            raise FileInvalid(f"tag {self.name} is no message and has no bytes or depth", got=self.kind.value)
+            raise FileInvalid(f"tag {self.name} is not a message and has no bytes or depth", got=self.kind.value)
 
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able description; the inverse of `from_description`."""

@@ -28,7 +28,7 @@ RPDO_MAPPING = 0x1600
 PDO_INVALID = 1 << 31
 """Bit 31 of a PDO's COB-ID: the PDO does not exist (7.5.2.37)."""
 NO_RTR = 1 << 30
-"""Bit 30 of a TPDO's COB-ID: no remote frames for it."""
+"""Bit 30 of a TPDO's COB-ID: the TPDO may not be requested by remote frames."""
 SYNCHRONOUS_MAX = 240
 """The highest transmission type of a synchronous PDO (7.5.2.35, 7.5.2.37)."""
 

@@ -75,12 +75,12 @@ class CanopenMaster:
         on_event: EventCallback | None = None,
     ) -> None:
         self.counters = SdoCounters()
-        self.latency = response_times()  # of completed SDO transfers
+        self.latency = response_times()  # durations of completed SDO transfers
         self.on_event: EventCallback = on_event or _nobody
         self.on_sync: PdoCallback = _no_one
-        """Called with each SYNC that this master did not send. Like `on_event`, it may be set at any time."""
+        """A function that is called with each SYNC that this master did not send. Like `on_event`, it may be set at any time."""
         self.conflicts: dict[int, str] = {}
-        """Detected node ID conflicts by node ID, as text: the last two replies to one request."""
+        """Detected conflicts by node ID, as text that contains the last two replies to one request."""
         self._connection = connection
         self._clock = clock
         self._sdo_timeout_s = sdo_timeout_s

@@ -97,7 +97,7 @@ class ModbusClient:
         self.counters = ClientCounters()
         self.latency = (
             response_times()
-        )  # of replies and exceptions; a caller that keeps it across connections sets its own
+        )  # response times of replies and exceptions; a caller that counts across connections sets its own histogram
 
     @classmethod
     def at(
@@ -330,7 +330,7 @@ class ModbusClient:
             data = await (self._read_pending() if arrived else self._read_until(transaction.wake_ns))
             now_ns = clock.monotonic_ns()
             reply = transaction.feed(data, now_ns) if data else None
-            if reply is None and (not data or now_ns >= transaction.deadline_ns):  # noise does not prolong it
+            if reply is None and (not data or now_ns >= transaction.deadline_ns):  # noise does not prolong the wait
                 reply = transaction.poll(now_ns)
             if reply is not None:
                 return reply
@@ -367,7 +367,7 @@ class ModbusClient:
             self._drain(data, self._clock.monotonic_ns(), live=True)
 
     async def _await_silence(self) -> None:
-        """Return when a request may be sent. Bytes that arrive before that belong to no request and are drained.
+        """Wait until a request may be sent, and return the time. Bytes that arrive before belong to no request and are drained.
 
         Raises `Desync` if the line does not become silent, `ConnectionLost` if it is gone.
         """

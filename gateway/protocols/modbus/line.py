@@ -13,7 +13,7 @@ TURNAROUND_S = 0.1
 """The time that units get to execute a broadcast (SL 2.4.1: 100 to 200 ms)."""
 
 _LONGEST_LATENCY_NS = 60 * NS_PER_S
-"""The longest quarantine, however late a reply once came."""
+"""The longest quarantine, in ns, even if a reply once took longer."""
 
 _BABBLE_FACTOR = 3
 _BABBLE_GRACE_NS = 500 * NS_PER_MS

@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.modbus.server.forward import ForwardedReply
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 
 MOST_CLIENTS = 256
-"""For how many clients the last refusal is remembered."""
+"""The number of clients for which the last refusal is remembered."""
 
 
 class WriteRecord:

@@ -122,7 +122,7 @@ class BridgeCounters:
 
 @dataclass
 class _Away:
-    """A unit that did not answer, and its back-off time."""
+    """The state of a unit that did not answer: its back-off, and the end of the present pause."""
 
     backoff: Backoff = field(default_factory=lambda: Backoff(0.5, 10.0))
     until_ns: int = 0
@@ -217,8 +217,9 @@ class Bridge:
             self._record.refused(caller.on_record, self._place(unit, self._route(unit)), unit, pdu, code, why)
 
     def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[ServerRequest, Route | None]:
-        """Return the parsed request and its route; a route of None is a broadcast. Raises the exception to answer
-        with."""
+        """Check a client's request, and return it parsed, with its route. A route of None means a broadcast. Raises the
+        exception with which the bridge answers a request that it does not forward.
+        """
         function = pdu[0] if pdu else 0
         route = self._route(unit)
         broadcast = route is None and unit == 0 and self.config.broadcast

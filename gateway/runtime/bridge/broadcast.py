@@ -13,7 +13,7 @@ from fieldtwin.gateway.protocols.modbus.requests.refusals import refusal
 from fieldtwin.gateway.protocols.modbus.server.analysis import NO_PATH, exception_pdu
 
 _REPEATED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
-"""How many bytes of the request the normal reply repeats (AP 6); for 15h all of it."""
+"""By function code: the number of bytes of the request that the normal reply repeats (AP 6); for 15h all of them."""
 
 
 def when_all_are_out(pdu: bytes, lines: Iterable[asyncio.Future[bytes | None]]) -> asyncio.Future[bytes | None]:

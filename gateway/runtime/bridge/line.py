@@ -64,7 +64,7 @@ class LineFront:
         return FrontStatus(listening=listening, error=self.error, counters=asdict(self.counters))
 
     async def run(self) -> None:
-        """Open, listen, and open again, until cancelled."""
+        """Open the line and answer its client until cancelled. A lost line is opened again."""
         backoff = Backoff(0.25, 5.0)
         while True:
             try:

@@ -31,7 +31,7 @@ REQUEST_WITHIN_S = 10.0
 client that sends one byte at a time would keep its place without end."""
 
 MOST_UNSENT = 64
-"""How many answers may wait for a client to read them; while more wait, no more of its requests are accepted."""
+"""The number of answers that may wait for a client to read them. While more wait, no more of its requests are accepted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Caller:
 
 
 Answer = bytes | None | asyncio.Future[bytes | None]
-"""A response PDU, None for no answer, or a promise of either."""
+"""A response PDU, None for no answer, or a future of either."""
 
 Ask = Callable[[Caller, int, bytes], Answer]
 """``(caller, unit, request PDU)``. Never waits, and never raises an error because of what a client sends."""

@@ -60,7 +60,7 @@ class BridgeQueue:
     counters: BridgeQueueCounters = field(default_factory=BridgeQueueCounters)
     _waiting: dict[str, deque[BridgeRequest]] = field(default_factory=dict)
     size: int = 0
-    """How many requests wait."""
+    """The number of requests that wait."""
 
     def put(self, guest: BridgeRequest) -> None:
         """Queue a request. If the queue is full, the request fails at once with `EndpointBusy`."""

@@ -19,11 +19,13 @@ from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, LatencyStatus
 
 Ended = Callable[[str, FieldtwinError | None], None]
-"""Called once for each tag with the result of its write: None, or the error; `HeldBack` for a tag that was not sent."""
+"""A function that is called once for each tag with the result of its write: None, or the error. The error of a tag that was
+not sent is `HeldBack`.
+"""
 
 
 class HeldBack(NotAllowed):
-    """A member of a group was not written, because another member of the group could not be written."""
+    """A member of a group was not written, because a different member of the group could not be written."""
 
 
 def not_sent(where: str) -> HeldBack:
@@ -37,11 +39,11 @@ class Bus(Protocol):
     config: BusConfig
     connected: bool
     opens: int
-    """How many connections were opened so far."""
+    """The number of connections that were opened so far."""
     locals: deque[str]
-    """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
+    """The local addresses of the connections so far, the latest one last; an empty text for a medium without addresses."""
     error: str
-    """Why the bus is not connected; empty while it is."""
+    """The reason why the bus is not connected; empty while it is connected."""
     latency: Histogram
 
     def takes(self, device: str, tag: str) -> bool:
@@ -98,7 +100,7 @@ class Bus(Protocol):
 
 
 def status_of(bus: Bus) -> BusStatus:
-    """Return what all kinds of buses report."""
+    """Return the part of a bus's status that is the same for all kinds of buses."""
     return BusStatus(
         endpoint=str(bus.config.endpoint),
         connected=bus.connected,

@@ -16,7 +16,7 @@ from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot
 from fieldtwin.gateway.runtime.buses.probing import MARGIN_NS, Probing
 
 FOREVER_NS = 2**62
-"""The end of a free time that no poll limits."""
+"""The end of the free time of a bus on which no poll is planned."""
 
 
 @dataclass
@@ -43,21 +43,21 @@ class DeviceState:
     reading_due_ns: int = 0
     triggered: set[str] = field(default_factory=set)
     alone: bool = False
-    """Whether it is the only device of its bus."""
+    """Whether this is the only device of its bus."""
     asked_ns: int = 0
-    """When it was last tried while it was away."""
+    """The time of the last request to the device while it was away."""
     late_ns: int = 0
-    """How long its reply took that arrived after a shortened timeout; 0 if there was no such reply."""
+    """The duration of a reply that arrived after a shortened timeout; 0 if no reply was late."""
     last_cost_ns: int = 0
-    """How long its last poll used the bus without success, although the device answered at first."""
+    """The time for which the device's last poll used the bus without success, although the device answered at first."""
     timeout_ns: int = 0
-    """The timeout of its next try; 0: its own."""
+    """The timeout of the next request to the device; 0: the device's configured timeout."""
     answered_ns: int = 0
-    """When it last answered a poll."""
+    """The time at which the device last answered a poll."""
     silences: int = 0
-    """How many of its polls in a row had no reply while it counts as online."""
+    """The number of consecutive polls without a reply, while the device counts as online."""
     fits: bool = True
-    """Whether its next attempt can end before another device misses a poll."""
+    """Whether the next attempt can end before a different device misses a poll."""
 
     @property
     def retries_left(self) -> bool:

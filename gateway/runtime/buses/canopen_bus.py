@@ -79,8 +79,7 @@ class NodeStatus:
     boots: int = 0
     conflicts: int = 0
     conflict: str = ""
-    """The last sign of a second node with this node ID. It stays, because nothing proves that the second node has
-    gone."""
+    """The last sign of a second node with this node ID. It is kept, because nothing proves that the second node was removed."""
     emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
     polls: int = 0
@@ -398,7 +397,7 @@ class CanopenBus:
     def _online(self, status: NodeStatus) -> None:
         driver = status.driver
         for tag in driver.profile.tags.values():
-            if tag.readable:  # only now the gateway knows which tags a TPDO carries, and when it is sent
+            if tag.readable:  # only now the gateway knows which tags a TPDO carries, and when the node sends it
                 self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
         self._tags.put_bad([f"{driver.config.name}.{tag}" for tag in driver.unbrought], Reason.NOT_OPERATIONAL)
         status.online, status.error = True, ""
@@ -424,7 +423,7 @@ class CanopenBus:
                 self._failed(status, e)
                 await self._rest(status)
             else:
-                if not status.wanted.is_set():  # otherwise it restarted meanwhile
+                if not status.wanted.is_set():  # otherwise the node restarted meanwhile
                     self._online(status)
 
     async def _rest(self, status: NodeStatus) -> None:
@@ -500,7 +499,7 @@ class CanopenBus:
             self._note_lss(driver, address)
             had = await self._lss.assign(address, driver.node)
             if had not in (UNCONFIGURED, driver.node):
-                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # it takes the new ID when it boots
+                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # the node takes its new ID when it boots
         except ReplyTimeout:
             return error  # no node with this LSS address is on the bus
         except ConnectionLost:
@@ -581,7 +580,7 @@ class CanopenBus:
 
         if self._allow_writes and not self._stopping:
             if status.start_again is not None:
-                status.start_again.cancel()  # it was started meanwhile, and left OPERATIONAL again
+                status.start_again.cancel()  # the node was started meanwhile, and left OPERATIONAL again
             status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
     async def halt(self, timeout_s: float) -> None:

@@ -22,7 +22,7 @@ from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.gateway_status import LearntStatus
 
 MOST_BYTES = 4_000_000
-"""Our files are never larger; a larger file is not read."""
+"""The gateway never writes a larger file, and does not read one."""
 
 
 class LearntGapsEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,7 +115,7 @@ def _learnt(driver: RegisterDriver, entry: LearntGapsEntry) -> Learnt | None:
 
 
 def learnt_statuses(drivers: Iterable[object]) -> dict[str, LearntStatus]:
-    """Return what the gateway has learnt about each device, by name; devices without an entry are left out."""
+    """Return the gaps that the gateway has learnt, by device name. Devices without an entry are left out."""
     found: dict[str, LearntStatus] = {}
     for driver in drivers:
         if isinstance(driver, RegisterDriver) and (driver.learnt.gaps or driver.learnt.missing):

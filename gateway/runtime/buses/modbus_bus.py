@@ -68,7 +68,7 @@ def reason_of(error: FieldtwinError) -> Reason:
 
 
 ALARM_NS = 10 * NS_PER_S
-"""How long the devices of a bus are polled with shortened timeouts after one of them stopped answering."""
+"""The time for which the devices of a bus are polled with shortened timeouts after one of them stopped answering."""
 STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
 
 
@@ -82,7 +82,7 @@ class BusJob:
 
 
 MOST_LOCALS = 64
-"""How many local addresses are remembered; each time the bus is opened adds one."""
+"""The number of local addresses that are remembered. Each opening of the bus adds one."""
 
 
 class ModbusBus:
@@ -111,7 +111,9 @@ class ModbusBus:
         """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
         self.error = ""
         self.down: FieldtwinError | None = None
-        """Why the last attempt to open the bus failed; None while the bus is open, or was open until just now."""
+        """The error of the last attempt to open the bus. None while the bus is open, and after a loss until the next attempt
+        has failed.
+        """
         self.guests = BridgeQueue()
         self.guests.on_put = self._wake
         self._guest_was_last = False
@@ -126,7 +128,7 @@ class ModbusBus:
         self._coming: PendingConfig | None = None
         self._jobs: deque[BusJob] = deque()
         self._awake = False
-        """Set when the bus has new work to look at, whether `_serve` sleeps or not."""
+        """Set when new work has arrived for the bus, whether `_serve` sleeps or not."""
         self._sleeper: asyncio.Future[None] | None = None
         self._idle = asyncio.Event()
         self._halted = False
@@ -397,7 +399,7 @@ class ModbusBus:
                 end()
 
     async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
-        """Give a device one turn: one transaction of a group, or first contact."""
+        """Use the bus once for a device: for one transaction of a group, or for the first contact."""
         begun_ns = self._clock.monotonic_ns()
         device.polls += not device.online or device.reading is None
         unit, probed = device.driver.config.address, not device.online
@@ -451,8 +453,8 @@ class ModbusBus:
             if begun_ns >= self._alarm_until_ns:
                 self._turns.doubt_ns = begun_ns
             self._alarm_until_ns = self._clock.monotonic_ns() + ALARM_NS
-            # A shortened timeout proves nothing: a slow device gets another try, with more time once its late reply was
-            # received.
+            # A missing reply after a shortened timeout proves nothing. A slow device is tried again, with more time once its
+            # late reply was received.
             tries = max(self._retries_of(device), 1 if shortened else 0)
             if device.reading is not None and device.silences < tries:
                 device.silences += 1
@@ -476,7 +478,7 @@ class ModbusBus:
     def _heard_late(self, client: ModbusClient) -> None:
         """Handle devices that answered after their shortened timeout but within their own.
 
-        They are present, so they are asked again at once, with more time."""
+        These devices are present, so they are asked again at once, with more time."""
         for device in self.devices:
             late_ns = client.units.late_ns.get(device.driver.config.address)
             if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
@@ -549,7 +551,7 @@ class ModbusBus:
         """
         device.poll_errors += 1
         device.reading = None
-        if not group:  # it refused the request for its identity
+        if not group:  # the device refused the request for its identity
             self._offline(device, error)
             return
         device.online, device.error = True, str(error)

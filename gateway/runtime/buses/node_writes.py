@@ -21,9 +21,9 @@ from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
 from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent
 
 Done = Callable[[FieldtwinError | None], None]
-"""Called once with the result of a write."""
+"""A function that is called once with the result of a write: None, or the error."""
 Write = Callable[[CanopenDriver, str, COMMAND, Done], None]
-"""Starts the write of one tag."""
+"""A function that starts the write of one tag."""
 
 
 @dataclass
@@ -43,7 +43,7 @@ class NodeWrites:
 
     def __init__(self, driver: CanopenDriver, clock: Clock, timeout_s: float) -> None:
         self.frames = self.not_sent = 0
-        """RPDOs that were sent, and repetitions that the bus did not accept."""
+        """Counters of the RPDOs that were sent, and of the repetitions that the bus did not accept."""
         self._driver = driver
         self._clock = clock
         self._timeout_s = timeout_s

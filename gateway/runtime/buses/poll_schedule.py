@@ -130,7 +130,7 @@ class PollSchedule:
             self._go_sooner(group, rate, now_ns)
 
     def _go_sooner(self, group: str, rate: PollSlot, now_ns: int) -> None:
-        """Move a group that is read now one step towards its target phase."""
+        """Move a group that is being read now by one step towards its target phase."""
         step_ns, most_ns = (rate.phase_ns - self._goal_ns[group]) % rate.period_ns, rate.period_ns // SOONER
         if self.due_ns[group] - now_ns < rate.period_ns - most_ns:
             return  # this read is late, and the next one would follow too soon

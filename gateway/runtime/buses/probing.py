@@ -26,13 +26,13 @@ PATIENCE = 4
 LATE_PATIENCE = 2
 """A device that answered too late gets this multiple of the time that its reply took."""
 MARGIN_NS = 20 * NS_PER_MS
-"""What a probe takes in addition to its timeout: request, silences, and delays of the host."""
+"""The duration of a probe in addition to its timeout: request, silences, and delays of the host."""
 BURST_NS = 3 * NS_PER_S
 """Probing time that may be spent in one burst, for instance on the first contact with all devices: 5 % of a minute."""
 LONG_PART = 8
 """Probes that make other devices miss polls get the share divided by this."""
 SHORT_TRIES = 3
-"""How many times a device is asked with a shortened timeout before it gets its own."""
+"""The number of probes with a shortened timeout before a device is probed with its own timeout."""
 
 
 class Probing:
@@ -42,7 +42,7 @@ class Probing:
         self._share = share
         self._least_ns = max(LEAST_NS, 2 * t35_ns)
         self._spent_until_ns = 0
-        """When the share will have paid for all probes so far."""
+        """The time until which the probes so far have used up the share of the bus."""
         self._long_ns = 0
         """The earliest time of the next probe that makes other devices miss polls."""
 

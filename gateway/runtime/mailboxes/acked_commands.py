@@ -16,7 +16,7 @@ import msgspec
 from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_BYTES = 1_000_000
-"""Our files are never larger; a larger file is not read."""
+"""The gateway never writes a larger file, and does not read one."""
 
 
 class AckedCommandStore:

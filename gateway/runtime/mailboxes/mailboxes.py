@@ -18,7 +18,7 @@ from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
 
 ASK_EVERY_NS = 50 * NS_PER_MS
-"""How often a full outbox is checked."""
+"""The time between two checks of a full outbox."""
 MOST_PATIENCE_NS = 2000 * NS_PER_MS
 """The longest time for which a full outbox is not checked because the previous message took that long to leave it."""
 INBOX_KEPT = 256

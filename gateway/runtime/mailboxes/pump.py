@@ -101,7 +101,8 @@ class MailboxPump:
         if not self.remote:
             for item in self.inbox.drain():
                 self.commands_refused += 1
-                with suppress(Unreachable):  # refused with or without a record, and counted
+                # the command is refused even if it cannot be recorded; the missing record is counted
+                with suppress(Unreachable):
                     self._audit.note(
                         "refuse",
                         self.driver.config.name,

@@ -12,7 +12,7 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.runtime.outputs.output import SAFE, Output
 
 READ_BACK_NS = 2 * NS_PER_S
-"""How long the first write of an output waits, once its device is online, for the first reading of what it holds."""
+"""The time for which the first write of an output waits for the first reading of its value, once its device is online."""
 
 
 def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:

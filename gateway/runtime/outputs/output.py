@@ -31,18 +31,24 @@ class Output:
     pending: bool = False
     refused: tuple[float, str] | None = None
     not_a_number: bool = False
-    """The program's newest value is not a number, so `wanted` is an older value."""
+    """True if the program's newest value is not a number, so that `wanted` is an older value."""
     waits_since_ns: int | None = None
-    """Since when the output waits for a device that does not answer; `AWAY_REPORTED` once the journal has it."""
+    """The time since which the output waits for a device that does not answer; `AWAY_REPORTED` once the journal has an entry
+    about it.
+    """
     next_try_ns: int = 0
     commanded: bool = False
-    """Whether a program writes it. If not, the gateway writes only its safe value and what a client requests."""
+    """Whether a program writes this output. If not, the gateway writes only its safe value and the values that clients
+    request.
+    """
     untouched: bool = True
-    """No value was written to it yet, and its device was not lost: the device may already hold the wanted value."""
+    """True until the first write of this output or the loss of its device. Until then the device may already hold the wanted
+    value.
+    """
     due_since_ns: int | None = None
-    """Since when (monotonic) the first write has been due while the device was online."""
+    """The monotonic time since which the first write has been due while the device was online."""
     asked: Callable[[FieldtwinError | None], None] | None = None
-    """The callback of the client that requested one write; None for what the PLC or the safe state commands."""
+    """The callback of the client that requested one write; None for a value that the PLC or the safe state commands."""
 
     @property
     def ready(self) -> bool:

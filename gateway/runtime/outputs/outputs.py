@@ -42,7 +42,7 @@ class OutputWriter:
         self.journal = Refusals(audit)
         """The journal of every write that did not reach its device, with its cause."""
         self.writes = self.refusals = self.failures = self.rewrites = self.superseded = 0
-        """`superseded`: values of programs that a newer value replaced before they were written."""
+        """Counters of writes. `superseded` counts values of programs that a newer value replaced before they were written."""
         self.safe_active = False
         self._tags = tags
         self._audit = audit
@@ -433,5 +433,5 @@ class OutputWriter:
                 "write", output.driver.config.name, by=by, result=result, tag=output.tag, new=output.shown(value)
             )
         except Unreachable:
-            self.failures += 1  # counted; the next write does not start without a record
+            self.failures += 1  # the missing record is counted, and the next write does not start without a record
         output.answer(error)

@@ -27,7 +27,7 @@ from fieldtwin.gateway.runtime.buses.bus import HeldBack
 from fieldtwin.gateway.runtime.gateway_status import RefusalsStatus, RefusalStatus
 
 KEPT = 256
-"""How many entries are kept."""
+"""The number of entries that are kept."""
 MERGE_NS = NS_PER_S
 """A refusal of the same tag for the same cause within this time repeats the previous entry, whatever its value."""
 MERGE_AT_MOST_NS = 10 * NS_PER_S
@@ -36,13 +36,13 @@ continue."""
 AUDIT_EVERY_NS = NS_PER_S
 """The shortest time between two audit-log lines about the same tag, cause and client."""
 MOST_AUDITED = 1024
-"""For how many combinations of tag, cause and client the last audit-log line is remembered."""
+"""The number of combinations of tag, cause and client for which the last audit-log line is remembered."""
 LATER = frozenset({5, 6, 10, 11})
 """Modbus exception codes that mean "not now" or come from a gateway on the path: the same write may succeed later."""
 
 
 class RefusalCause(Enum):
-    """Why a write did not reach its device."""
+    """The cause for which a write did not reach its device."""
 
     LIMIT = "limit"
     """The value is outside the limits of the tag, or its type cannot hold it, or it is not a number."""
@@ -55,7 +55,7 @@ class RefusalCause(Enum):
     DEVICE = "device"
     """The device answered and refused the value, or acknowledged it and holds a different one."""
     GROUP = "group"
-    """Another member of the tag's group was refused, so the whole group is held back."""
+    """A different member of the tag's group was refused, so the whole group is held back."""
     AWAY = "away"
     """The device does not answer. The value is written when it is back."""
     FAILED = "failed"
@@ -67,7 +67,7 @@ class RefusalCause(Enum):
 
 
 OF_PROGRAM = frozenset({RefusalCause.LIMIT, RefusalCause.NOT_WRITABLE})
-"""Causes that require a change to the program or the configuration, whatever happens in the plant."""
+"""Causes that a change to the program or the configuration has to remove, whatever happens in the plant."""
 OF_DEVICE = frozenset({RefusalCause.WRONG_DEVICE, RefusalCause.DEVICE})
 """Causes that a disturbed device may also produce."""
 
@@ -125,7 +125,7 @@ class RefusedOutput:
         return "program" if self.cause in OF_PROGRAM else "device" if self.cause in OF_DEVICE else ""
 
     def status(self) -> RefusalStatus:
-        """Return the entry as it is reported."""
+        """Return the entry for the status of the gateway."""
         return RefusalStatus(
             number=self.number,
             tag=self.tag,
@@ -150,18 +150,18 @@ class Refusals:
     def __init__(self, audit: AuditLog) -> None:
         self.counts: Counter[RefusalCause] = Counter()
         self.faults: Counter[str] = Counter()
-        """How many entries of programs there were by `RefusedOutput.fault`, including those that are no longer kept."""
+        """The number of entries of programs by `RefusedOutput.fault`, including those that are no longer kept."""
         self.on_new: Callable[[RefusedOutput], None] | None = None
         self.looks_up = False
         """Whether the place of each entry of a program is being looked up and reported with `placed`."""
         self.unrecorded = 0
-        """How many refusals could not be written into the audit log."""
+        """The number of refusals that could not be written into the audit log."""
         self._audit = audit
         self._entries: deque[RefusedOutput] = deque(maxlen=KEPT)
         self._newest: dict[str, RefusedOutput] = {}
         self._number = 0
         self._audited: dict[tuple[str, str, RefusalCause], tuple[int, int]] = {}
-        """By tag, client and cause: when the last line was written, and how many refusals came since."""
+        """By tag, client and cause: the time of the last audit-log line, and the number of refusals since then."""
 
     @property
     def total(self) -> int:
@@ -237,7 +237,7 @@ class Refusals:
         try:
             self._audit.note("refuse", device, by=by, result=reason, **details)
         except Unreachable:
-            self.unrecorded += 1  # counted; the write is refused with or without a record
+            self.unrecorded += 1  # the missing record is counted; the write is refused with or without a record
 
     def flush(self) -> None:
         """Write into the audit log the number of refusals since the last line about their tag. Called when the gateway stops."""

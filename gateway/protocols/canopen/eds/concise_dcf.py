@@ -121,7 +121,7 @@ def _pdo(index: int, wanted: dict[tuple[int, int], Setting], dictionary: ObjectD
     mapping = index + _TO_MAPPING
     cob_id = wanted.get((index, 1))
     held = dictionary.get(index, 1)
-    if cob_id is None and held is not None and isinstance(held.default, int):  # needed to switch it off and on
+    if cob_id is None and held is not None and isinstance(held.default, int):  # needed to switch the PDO off and on
         cob_id = Setting(index, 1, held.default.to_bytes(4, "little"))
     mapped = [s for (i, sub), s in wanted.items() if i == mapping and sub]
     number = wanted.get((mapping, 0))

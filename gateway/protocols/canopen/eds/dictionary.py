@@ -29,7 +29,7 @@ from fieldtwin.gateway.protocols.canopen.eds.values import read_limit, read_valu
 MAX_EDS_BYTES = 8 * 1024 * 1024
 """A larger EDS or DCF file is treated as a mistake; the largest known one has 2 MB."""
 MAX_DOMAIN_BYTES = 16 * 1024 * 1024
-"""The largest file that a DOMAIN object may name as its content."""
+"""The largest size in bytes of a file that a DOMAIN object names as its content."""
 _TYPE_AREA = range(0x1000)
 """Indices that define data types (7.4.1) and are not objects of the device."""
 
@@ -208,7 +208,7 @@ def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[
 
 
 class _Values:
-    """The values in the sections of the file. `mended` lists the values that could not be read."""
+    """Reads the values in the sections of the file. `mended` lists the values that could not be read."""
 
     def __init__(self, eds: EdsText, node_id: int | None) -> None:
         self._sections = eds.sections

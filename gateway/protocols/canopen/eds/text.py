@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 
 MAX_BYTES = 16 * 1024 * 1024
-"""No EDS is nearly this large; a larger file is not an EDS."""
+"""The largest accepted file. Every EDS is much smaller, so a larger file is not an EDS."""
 
 _OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME|VALUE|DENOTATION))?$", re.IGNORECASE)
 _DOMAIN = "0xF"
@@ -224,7 +224,7 @@ def _mend_information(
 
 
 def _mend_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
-    """Copy a number that describes the whole device. An impossible number is left out, since no object depends on it."""
+    """Copy a number that describes the whole device. An impossible number is left out, because no object depends on it."""
     try:
         number = int(_number(section, key, "0", path, mended), 0)
     except FileInvalid:

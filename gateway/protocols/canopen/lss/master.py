@@ -136,8 +136,8 @@ class LssMaster:
 
         If there are several, it finds the slave with the smallest numbers, and the next scan finds the next slave. While a slave
         that was found before is still in the configuration state, scan without `verify`, because that slave would answer the
-        inquiry too. A scan takes 133 requests, each as long as a reply may take. Raises `Desync` if the answers contradict each
-        other, or if the slave that was found reports a different identity.
+        inquiry too. A scan takes 133 requests, each of which lasts for the reply time. Raises `Desync` if the answers
+        contradict each other, or if the slave that was found reports a different identity.
         """
         async with self._turn:
             if not await self._anybody(lss.fastscan(0, lss.ANYBODY, 0, 0), lss.SLAVE_FOUND):

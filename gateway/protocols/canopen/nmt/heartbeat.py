@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.canopen import cob_id
 from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState, NodeEvent, NodeEventKind, heartbeat_state
 
 TWIN_BOOT_NS = 100 * NS_PER_MS
-"""One node does not boot twice within this time; two nodes with the same ID do (CO-042)."""
+"""Two boot-ups within this time come from two nodes with the same ID, because one node does not boot so fast (CO-042)."""
 
 
 @dataclass(slots=True)

@@ -96,7 +96,7 @@ class TimeProducer(_Periodic):
             return None
         try:
             return CanFrame(self._can_id, time_of_day(utc_ns))
-        except UsageError:  # the host's clock starts in 1970: that must not stop the bus
+        except UsageError:  # the host's clock may start in 1970, which must not stop the bus
             self.sent, self.missed = self.sent - 1, self.missed + 1
             return None
 
@@ -106,5 +106,5 @@ def time_of_day(utc_ns: int) -> bytes:
     days, rest_ns = divmod(utc_ns, _DAY_NS)
     since = days - _DAYS_TO_1984
     if not 0 <= since <= 0xFFFF:
-        raise UsageError("a time that TIME_OF_DAY can tell", expected="1984 to 2163", got=f"{since} days since 1984")
+        raise UsageError("a time that TIME_OF_DAY can hold", expected="1984 to 2163", got=f"{since} days since 1984")
     return (rest_ns // NS_PER_MS).to_bytes(4, "little") + since.to_bytes(2, "little")

@@ -14,7 +14,7 @@ from collections import deque
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _INTERVALS = 16
-"""The number of intervals that are compared: enough that a few late frames do not matter."""
+"""The number of intervals that are compared, so large that a few late frames do not change the result."""
 _APART = 2.0
 """With two producers, the ratio of the long to the short quarter of the intervals."""
 _TOO_OFTEN = 1.5
@@ -39,7 +39,7 @@ class SyncWatch:
         self._intervals: deque[int] = deque(maxlen=_INTERVALS)
         self.seen = 0
         self.verdict = ""
-        """Why there seems to be a second producer, as text; empty while there is no sign of one. Once set, it stays."""
+        """A text with the evidence for a second producer; empty while there is none. Once set, it does not change."""
 
     def feed(self, data: bytes, t_ns: int) -> None:
         """Note a SYNC that arrived at `t_ns`; `data` is empty, or its counter."""

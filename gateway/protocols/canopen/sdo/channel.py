@@ -149,7 +149,9 @@ class SdoChannel:
             self._foreign[multiplexor_of(frame.data)] = None
 
     def lose(self, error: ConnectionLost | None) -> None:
-        """Note that the bus is no longer read (None: that it is read again). Waiting and later transfers fail immediately."""
+        """Note that the master no longer reads the bus (None: that it reads the bus again). Waiting and later transfers fail
+        immediately.
+        """
         self._lost = error
         self._arrived.set()
 
@@ -173,7 +175,7 @@ class SdoChannel:
         """Wait for the transfers that were asked for before this call. A transfer that is asked for later waits until it is
         cancelled.
         """
-        await self._turn.acquire()  # never released
+        await self._turn.acquire()  # the lock is never released, so that no later transfer begins
 
     async def _settle(self, transfer: SdoTransfer) -> None:
         """Make sure that no late reply can be taken for the reply to `transfer` (see `late_replies`)."""
@@ -187,7 +189,7 @@ class SdoChannel:
         try:
             await self._run(probe)
         except (SdoAborted, NodeRestarted):
-            pass  # an answer, which is all that is needed, or no reply can arrive any more
+            pass  # the node answered, which settles earlier requests; or no reply can arrive any more
         except ReplyTimeout as e:
             hint = (
                 f"an earlier request for {transfer.name} is unanswered, so {index:04X}h:{subindex:02X} was asked first"
@@ -238,7 +240,9 @@ class SdoChannel:
             self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
 
     async def _tell_owed(self, transfer: SdoTransfer) -> None:
-        """Send the abort of an earlier abandoned transfer; else the node might take our request for one of its segments."""
+        """Send the abort of a transfer that was abandoned earlier. Otherwise the node might take our request for one of its
+        segments.
+        """
         if self._owed is not None:
             try:
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
@@ -267,7 +271,7 @@ class SdoChannel:
 
     async def _after_send(self, transfer: SdoTransfer) -> Step | None:
         """Return the next frame of a sequence, unless a frame from the node waits to be handled (CO-018)."""
-        await asyncio.sleep(0)  # else a bus that accepts frames immediately would never let the reader run
+        await asyncio.sleep(0)  # otherwise a bus that accepts frames immediately would never let the reader run
         return None if self._inbox else transfer.more(self._clock.monotonic_ns())
 
     async def _next_step(self, transfer: SdoTransfer) -> Step | None:
@@ -367,7 +371,7 @@ class SdoChannel:
     def _settle_earlier(self, request: Multiplexor) -> None:
         """Settle the requests before the one that a reply for the present `request` answers, when the reply arrives.
 
-        When the transfer's task runs, it would be too late: replies that arrived after this one have settled this one too.
+        This cannot wait until the transfer's task runs, because replies that arrive after this one would settle this one too.
         """
         if self._late.answered(request) and not self._final_seen:
             self._late.unanswered(request)  # this may be the reply to an earlier request, so one more is expected

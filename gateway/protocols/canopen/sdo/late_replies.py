@@ -23,10 +23,10 @@ Multiplexor = tuple[int, int]
 """Index and subindex."""
 
 MAX_OUTSTANDING = 64
-"""The largest number of unanswered requests that are tracked; a later reply than that is considered impossible."""
+"""The largest number of unanswered requests that are tracked. A reply to an older request is considered impossible."""
 
 PROBES: tuple[Multiplexor, ...] = ((0x1000, 0), (0x1001, 0), (0x1018, 0), (0x1018, 1))
-"""Objects that every node must have (7.5.2.1, 7.5.2.2, 7.5.2.19), read without effect."""
+"""Objects that every node must have (7.5.2.1, 7.5.2.2, 7.5.2.19), and that can be read without an effect."""
 
 
 class LateReplies:

@@ -23,7 +23,9 @@ from fieldtwin.gateway.protocols.canopen import cob_id
 from fieldtwin.gateway.protocols.canopen.sdo import abort_codes
 
 MAX_BYTES = 1 << 20
-"""The largest object that a gateway reads; a node that never stops sending segments is stopped here."""
+"""The largest object, in bytes, that the gateway reads. This limit also ends the transfer of a node that never stops sending
+segments.
+"""
 
 WHOLE_TIMEOUTS = 10
 WHOLE_NS_PER_BYTE = 50_000_000
@@ -38,7 +40,9 @@ WHOLE_S = 600.0
 """
 
 KNOWN_MAX_BYTES = 64
-"""If the caller knows the object's size, a reply of up to this size is read, so that the error can report its length."""
+"""The limit in bytes if the caller knows the object's size: a longer reply is read up to this limit, so that the error can
+report its length.
+"""
 
 MAX_STRAYS = 64
 """The number of stray frames on the SDO channel after which a transfer is given up (CO-025)."""
@@ -63,7 +67,7 @@ class SendFrame:
 
 @dataclass(frozen=True, slots=True)
 class WaitForFrame:
-    """The frame advanced the transfer, and there is nothing to send yet."""
+    """The step "wait": the frame advanced the transfer, and there is nothing to send yet."""
 
 
 @dataclass(frozen=True, slots=True)

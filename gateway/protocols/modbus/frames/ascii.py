@@ -18,7 +18,7 @@ CHARACTER_GAP_NS = NS_PER_S
 """The longest permitted pause between two characters of a frame (SL 2.5.2.1)."""
 
 MAX_FRAME = 1 + 2 * (1 + MAX_PDU + 1) + 2
-"""Characters of the longest frame: 513 (SL 2.5.2.1)."""
+"""The number of characters of the longest frame (SL 2.5.2.1)."""
 
 MOST_DAMAGED = 256
 """The number of damaged frames after which an exchange stops looking for its reply: the line carries continuous noise."""
@@ -33,7 +33,7 @@ def lrc(data: bytes | bytearray) -> int:
 
 
 class AsciiFramer(Framer):
-    """ASCII framing of one serial line. `echo` has the meaning it has in `RtuFramer`."""
+    """ASCII framing of one serial line. `echo` says, as for `RtuFramer`, that the adapter returns the sent bytes first."""
 
     has_broadcast = True
     gap_ns = CHARACTER_GAP_NS

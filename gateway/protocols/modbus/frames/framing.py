@@ -32,25 +32,25 @@ class Framer(ABC):
     """Whether the link preserves message boundaries: then each `feed` gets exactly one datagram."""
 
     gap_ns: int = 0
-    """How long the link must be silent before `settle` is called; 0 means never."""
+    """The silence of the link in ns after which the caller calls `settle`; 0: it never calls `settle`."""
 
     t35_ns: int = 0
-    """The silence that must precede a frame; 0 means none."""
+    """The silence in ns that must precede a frame; 0: none."""
 
     rest_ns: int = 0
-    """The longest delay with which the rest of a damaged frame may arrive."""
+    """The longest delay with which the rest of a damaged frame may arrive, in ns."""
 
     def __init__(self) -> None:
         self.late_bytes = 0
         self.noise_bytes = 0
         self.foreign_frames = 0
         self.strays: dict[int, int] = {}
-        """Unit IDs whose reply came while no reply, or that of another unit, was awaited, and its time in ns; 0 means
-        just now.
+        """By unit ID: the time in ns of a reply that arrived while the client awaited no reply, or the reply of a different
+        unit. 0 means just now.
         """
 
     def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
-        """Note a frame of `unit` that no request awaited.
+        """Note a frame of `unit` that is not the reply to a present request.
 
         Exception 0A or 0B comes from a gateway and does not show that the unit is alive.
         """

@@ -26,7 +26,7 @@ _IDLE_NOISE = (0x00, 0xFF)
 """Bytes that are received from a line that is being switched on, idle or not biased (case MB-008)."""
 
 MOST_HUNTED = 8192
-"""Bytes of noise after which an exchange stops looking for its reply: the line carries continuous noise."""
+"""The number of bytes of noise after which an exchange stops looking for its reply, because the line carries continuous noise."""
 
 _EXCEPTION_FRAME = 5
 _LAST_UNIT = 247

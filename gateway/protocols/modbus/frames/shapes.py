@@ -7,10 +7,10 @@ determine where a frame ends (AP 6). This module uses the first bytes of a frame
 from __future__ import annotations
 
 MAX_FRAME = 256
-"""Bytes of the longest RTU frame (SL 2.5.1)."""
+"""The number of bytes of the longest RTU frame (SL 2.5.1)."""
 
 MIN_FRAME = 4
-"""Bytes of the shortest frame: unit ID, function and check sum."""
+"""The number of bytes of the shortest frame: unit ID, function and check sum."""
 
 _FIXED: dict[int, tuple[int, ...]] = {
     0x01: (8,),
@@ -30,7 +30,7 @@ _FIXED: dict[int, tuple[int, ...]] = {
     0x18: (6,),
     0x2B: (7,),
 }
-"""Requests and replies whose length follows from the function alone."""
+"""By function code: the lengths of requests and replies that only the function code determines."""
 
 _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
     0x01: ((2, 5),),
@@ -45,7 +45,7 @@ _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
     0x15: ((2, 5),),
     0x17: ((2, 5), (10, 13)),
 }
-"""Position of a byte count, and the frame's length without the bytes counted."""
+"""By function code: the position of the byte count, and the length of the frame without the bytes that are counted."""
 
 KNOWN_FUNCTIONS = frozenset(_FIXED.keys() | _COUNTED.keys())
 """Functions whose frames have a known length."""

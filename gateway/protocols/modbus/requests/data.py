@@ -53,12 +53,13 @@ def _counted(head: bytes, byte_count: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ReadRegisters(Request[RegistersReply]):
-    """Functions 03h and 04h: 1 to 125 registers."""
+    """Functions 03h and 04h: read 1 to 125 holding or input registers."""
 
     table: RegisterTable
     address: int
     count: int
-    function: int = field(init=False, repr=False, compare=False)  # used with every reply
+    # computed once, because every reply is compared with it
+    function: int = field(init=False, repr=False, compare=False)
     _reply_bytes: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -84,7 +85,7 @@ class ReadRegisters(Request[RegistersReply]):
 
 @dataclass(frozen=True, slots=True)
 class ReadBits(Request[BitsReply]):
-    """Functions 01h and 02h: 1 to 2000 bits."""
+    """Functions 01h and 02h: read 1 to 2000 coils or discrete inputs."""
 
     table: BitTable
     address: int
@@ -140,7 +141,7 @@ class _Write(Request[WriteReply]):
 
 @dataclass(frozen=True, slots=True)
 class WriteCoil(_Write):
-    """Function 05h."""
+    """Function 05h: write one coil."""
 
     address: int
     value: bool
@@ -158,7 +159,7 @@ class WriteCoil(_Write):
 
 @dataclass(frozen=True, slots=True)
 class WriteRegister(_Write):
-    """Function 06h."""
+    """Function 06h: write one holding register."""
 
     address: int
     value: int
@@ -177,7 +178,7 @@ class WriteRegister(_Write):
 
 @dataclass(frozen=True, slots=True)
 class WriteCoils(_Write):
-    """Function 0Fh: 1 to 1968 coils."""
+    """Function 0Fh: write 1 to 1968 coils."""
 
     address: int
     values: tuple[bool, ...]
@@ -195,7 +196,7 @@ class WriteCoils(_Write):
 
 @dataclass(frozen=True, slots=True)
 class WriteRegisters(_Write):
-    """Function 10h: 1 to 123 registers, written together or not at all."""
+    """Function 10h: write 1 to 123 holding registers together or not at all."""
 
     address: int
     values: tuple[int, ...]
@@ -215,7 +216,9 @@ class WriteRegisters(_Write):
 
 @dataclass(frozen=True, slots=True)
 class MaskWriteRegister(_Write):
-    """Function 16h: register becomes (register AND `and_mask`) OR (`or_mask` AND NOT `and_mask`)."""
+    """Function 16h: change single bits of a holding register. It becomes (register AND `and_mask`) OR (`or_mask` AND NOT
+    `and_mask`).
+    """
 
     address: int
     and_mask: int

@@ -24,7 +24,9 @@ _LOOPBACK = 0x00
 _FORCE_LISTEN_ONLY = 0x04
 
 _ECHOED = frozenset({_LOOPBACK, 0x01, 0x03, 0x0A, 0x14})
-"""Loopback, restart, change delimiter, clear counters, clear overrun: the reply repeats the request (AP 6.8.1)."""
+"""Sub-functions whose reply repeats the request (AP 6.8.1): loopback, restart, change delimiter, clear counters, clear
+overrun.
+"""
 
 _LOG_HEAD = 6  # status, event count and message count precede the events of a log
 _MOST_EVENTS = 64

@@ -20,7 +20,7 @@ _IDENTIFICATION_HEAD = 7  # function, MEI type, read code, conformity, more foll
 
 @dataclass(frozen=True, slots=True)
 class ReadExceptionStatus(Request[ExceptionStatusReply]):
-    """Function 07h, serial line only."""
+    """Function 07h: read the eight exception status outputs. For serial lines only."""
 
     @property
     def function(self) -> int:
@@ -41,7 +41,7 @@ class ReadExceptionStatus(Request[ExceptionStatusReply]):
 
 @dataclass(frozen=True, slots=True)
 class ReportServerId(Request[ServerIdReply]):
-    """Function 11h, serial line only."""
+    """Function 11h: read the server ID. For serial lines only."""
 
     @property
     def function(self) -> int:

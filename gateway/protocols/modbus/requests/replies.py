@@ -48,7 +48,9 @@ class RegistersReply(Reply, msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class BitsReply(Reply):
-    """Exactly as many bits as requested, in the order of their addresses; `raw` with its padding bits (AP 6.1)."""
+    """The bits that a server returned: exactly as many as requested, in the order of their addresses. `raw` includes the
+    padding bits (AP 6.1).
+    """
 
     bits: tuple[bool, ...]
     raw: bytes
@@ -98,7 +100,9 @@ class DeviceIdentificationReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class CommEventCounterReply(Reply):
-    """Function 0Bh (AP 6.9): whether a program command is being executed, and the requests completed so far."""
+    """The reply to function 0Bh (AP 6.9): whether a program command is being executed, and the number of requests completed so
+    far.
+    """
 
     busy: bool
     event_count: int
@@ -108,7 +112,7 @@ class CommEventCounterReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class CommEventLogReply(Reply):
-    """Function 0Ch (AP 6.10): the fields of 0Bh, the number of messages on the line, and the events as bytes, the
+    """The reply to function 0Ch (AP 6.10): the fields of 0Bh, the number of messages on the line, and the events as bytes, the
     latest first.
     """
 
@@ -122,7 +126,7 @@ class CommEventLogReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class FileRecordsReply(Reply):
-    """Function 14h (AP 6.14): the words of each span, in the order of the requested spans."""
+    """The reply to function 14h (AP 6.14): the words of each span, in the order of the requested spans."""
 
     records: tuple[tuple[int, ...], ...]
     raw: bytes
@@ -131,7 +135,7 @@ class FileRecordsReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class UserReply(Reply):
-    """The reply to a user-defined function: `raw` is its data. Unacknowledged and empty after a broadcast."""
+    """The reply to a user-defined function: `raw` is its data. After a broadcast it is empty, and `acknowledged` is False."""
 
     raw: bytes
     t_ns: int

@@ -19,7 +19,7 @@ R = TypeVar("R", bound=Reply)
 R_co = TypeVar("R_co", bound=Reply, covariant=True)
 
 MAX_PDU = 253
-"""Bytes of the longest protocol data unit, function code included (AP 4.1)."""
+"""The number of bytes of the longest protocol data unit, function code included (AP 4.1)."""
 
 NEED_MORE = 0
 """Result of `Request.reply_length`: the head is too short to decide."""
@@ -69,7 +69,8 @@ class Request(ABC, Generic[R_co]):
     def unanswered(self, t_ns: int) -> R_co:
         """Return the result of a broadcast of this request. Raises `UsageError` if the request reads data (SL 2.1)."""
         raise UsageError(
-            f"function {self.function:02X}h cannot be broadcast: nobody answers", expected="a write, or a unit from 1"
+            f"function {self.function:02X}h cannot be broadcast: no unit answers a broadcast",
+            expected="a write, or a unit from 1",
         )
 
 

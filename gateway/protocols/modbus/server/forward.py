@@ -18,7 +18,7 @@ _COUNTED = frozenset({0x0C, 0x11, 0x14})
 """Functions whose reply has its length in the second byte."""
 
 _ECHOED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
-"""Writes: the number of bytes of the request that their reply repeats. 15h repeats all of it."""
+"""By function code of a write: the number of bytes of the request that the reply repeats. 15h repeats all of them."""
 
 _FIXED_BYTE_COUNT = frozenset({0x01, 0x02, 0x03, 0x04, 0x17})
 

@@ -39,7 +39,7 @@ class MbapRequests:
         self.foreign = 0
         """ADUs dropped because their protocol id is not Modbus's (case MB-054)."""
         self.desync = ""
-        """Why the stream can no longer be read; empty while it is valid."""
+        """The reason why the stream can no longer be read; empty while it is valid."""
 
     @property
     def unfinished(self) -> bool:

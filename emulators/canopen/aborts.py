@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import SdoAborted
 
 
 class Abort(IntEnum):
-    """All abort codes of the standard.
+    """The abort codes of the standard.
 
     Some have a cause only in a real device; a user can set them with `NodeContext.refusals`.
     """

@@ -18,13 +18,15 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import Desync, EndpointBusy, FieldtwinError, Unreachable
 
 ROOM = 2
-"""Packets that a modem hands over before the first is accepted."""
+"""The number of packets that a modem may send to the server before the server accepts the first of them."""
 HEARD = 64
 _LONGEST = 1024
 
 
 async def _read(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
-    """Return a frame's kind and content. Raises `asyncio.IncompleteReadError` at the end, `Desync` for an invalid frame."""
+    """Read one frame, and return its kind and content. Raises `asyncio.IncompleteReadError` at the end, `Desync` for an
+    invalid frame.
+    """
     head = await reader.readexactly(3)
     length = int.from_bytes(head[1:])
     if length > _LONGEST:

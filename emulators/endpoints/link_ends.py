@@ -35,7 +35,7 @@ else:
 
 CHUNK = 4096
 MAX_PENDING = 64
-"""Chunks that wait in an end: with `CHUNK` the limit for bytes in flight in each direction (256 KiB)."""
+"""The number of chunks that may wait in an end. With `CHUNK` it limits the bytes in flight in each direction (256 KiB)."""
 PTY_MAJORS = range(136, 144)
 """Device numbers of the slave side of Linux pseudo-terminals (Linux, Documentation/admin-guide/devices.txt)."""
 
@@ -206,12 +206,12 @@ class TcpDoor:
         return TcpEnd(self.bound, self).wire
 
     def knocked(self, end: TcpEnd) -> None:
-        """Handle an accepted connection (called by its protocol)."""
+        """Handle a new connection. Its asyncio protocol calls this method."""
         if any(other is not None and other.wire.open and not other.wire.eof for other in (self._inside, self._next)):
             self.refused += 1
             end.wire.transport.abort()
             return
-        if self._next is not None:  # it finished sending before it was served
+        if self._next is not None:  # the peer finished sending before its connection was served
             self.refused += 1
             self._next.wire.transport.abort()
         self._next = end

@@ -24,7 +24,9 @@ FIRST_PORT = 50_000
 
 
 class MemoryNet:
-    """`fieldtwin.emulators.endpoints.ports.Ports` for the simulated field devices and `Connector` for the gateway."""
+    """A network in memory: `fieldtwin.emulators.endpoints.ports.Ports` for the simulated field devices, and a `Connector` for
+    the gateway.
+    """
 
     def __init__(self, loop: VirtualLoop) -> None:
         self.loop = loop
@@ -77,7 +79,7 @@ class MemoryNet:
     # -- gateway ------------------------------------------------------------------------------------------------------
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Do the same as `OsConnector`; an endpoint that does not exist or refuses raises `Unreachable`."""
+        """Connect to a port as `OsConnector` does. Raises `Unreachable` if the endpoint does not exist or refuses connections."""
         key = _key(endpoint)
         if endpoint.is_serial:
             port = self._serial.get(endpoint.path)
@@ -156,7 +158,9 @@ class _SerialPort:
         self.field: MemoryEnd = self._wire.far
 
     def plug_in(self) -> MemoryEnd:
-        """Open the gateway's end again. Only one program can hold a port."""
+        """Return a new gateway's end. Raises an error while the previous one is open, because only one program can hold a
+        port.
+        """
         if self._wire.near.lost is None:
             raise EndpointBusy("another program holds the port", where=str(self._plant))
         self._wire.near = MemoryEnd.again(self._wire.near)
@@ -208,7 +212,7 @@ class _Listener:
 
 
 class MemoryDatagrams:
-    """`fieldtwin.emulators.endpoints.ports.Datagrams` in memory: each write of a client is one datagram."""
+    """A UDP socket in memory (`fieldtwin.emulators.endpoints.ports.Datagrams`): each write of a client is one datagram."""
 
     def __init__(self, net: MemoryNet, bound: Endpoint) -> None:
         self.bound = bound
@@ -257,7 +261,7 @@ class MemoryDatagrams:
 
 
 class MemoryBus:
-    """`fieldtwin.emulators.endpoints.ports.CanPort`: the bus model itself, joined without a socket."""
+    """A CAN bus in memory (`fieldtwin.emulators.endpoints.ports.CanPort`): nodes join the bus model itself, without a socket."""
 
     def __init__(self, net: MemoryNet, bound: Endpoint, runner: BusRunner) -> None:
         self.bound = bound

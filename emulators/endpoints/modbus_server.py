@@ -30,7 +30,7 @@ Latency = Callable[[ServedFrame], float]
 
 
 def as_recorded(line: SerialSettings | None = None) -> Latency:
-    """Return the latency that each unit states itself, for example a unit that replays a recording.
+    """Return a latency function that takes the latency from the unit, for example from a unit that replays a recording.
 
     A recorded latency ends with the last byte of the reply. If replies are paced on a `line`, the time that the reply
     takes there is therefore subtracted.
@@ -96,7 +96,7 @@ async def serve_mbap(
 
 
 def _at_once(server: MbapServer, data: bytes, clock: Clock) -> tuple[bytes, bool]:
-    """Return the replies to a chunk, and whether the rest of the stream cannot be parsed."""
+    """Answer a chunk without waiting. Return the replies, and whether the rest of the stream cannot be parsed."""
     return server.answer(data, clock.monotonic_ns()), server.desync is not None
 
 
@@ -170,7 +170,9 @@ async def _reply_on_line(
     latency_s: float | Latency,
     on_frame: OnFrame | None,
 ) -> None:
-    """Do the same as `_reply` on a line that keeps the time itself: processing starts at the request's last character."""
+    """Send the replies on a line that paces its bytes itself. The processing time of the device starts at the request's last
+    character.
+    """
     if on_frame is not None:
         _tell_heard(exchanges, now_ns, on_frame)
     after_s = 0.0
@@ -183,5 +185,5 @@ async def _reply_on_line(
 
 
 def _tell_heard(exchanges: list[ServedFrame], now_ns: int, on_frame: OnFrame) -> None:
-    for exchange in exchanges:  # all of them arrived before any was answered
+    for exchange in exchanges:  # all of these frames arrived before the first of them was answered
         on_frame(Direction.SENT, now_ns, exchange.heard)

@@ -45,12 +45,12 @@ class CanPort(Listening, Protocol):
     async def join(self, name: str) -> CanConnection: ...
 
     def stats(self) -> dict[str, Any]:
-        """Return the counters of the bus; empty if it is not served by this process."""
+        """Return the counters of the bus; empty if a different process serves it."""
         ...
 
     @property
     def runner(self) -> BusRunner | None:
-        """Return the model of the bus; None if it is not served by this process."""
+        """Return the model of the bus; None if a different process serves it."""
         ...
 
 

@@ -172,7 +172,7 @@ class PtyEnd(ByteConnection):
             return
         _raise_idle_flags(self._spare)
         if self._inward is not None:
-            self._stop_reading()  # later bytes follow it, and wait in the pty
+            self._stop_reading()  # later bytes follow this chunk, and wait in the pty
             end_ns = self._inward.send(now_ns, len(data))
             self._on_its_way = self._loop.call_at(end_ns / NS_PER_S, self._arrived, data)
         elif not self.feed(data):

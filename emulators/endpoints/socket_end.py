@@ -20,12 +20,12 @@ from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreacha
 MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16
 READ_BYTES = 8192
-"""Maximum size of a chunk: enough for any pipelining, and a limit for a flood. asyncio itself allocates 256 KiB for
-each read, which takes longer than all other parts of an answer.
+"""The largest chunk in bytes. It is enough for any pipelining, and limits the effect of a flood. asyncio itself allocates 256
+KiB for each read, which takes longer than all other parts of an answer.
 """
 CLOSE_WITHIN_S = 1.0
 HANDSHAKE_WITHIN_S = 10.0
-"""A peer that has not finished the TLS handshake by then is disconnected and never counts as a client."""
+"""The time limit of a TLS handshake in seconds. A peer that needs longer is disconnected and never counts as a client."""
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 3
 
 OnClient = Callable[["SocketEnd"], Awaitable[None]]
@@ -284,7 +284,9 @@ class SocketListener:
 
 
 def _keep_alive(sock: socket.socket) -> None:
-    """Detect within 25 s, and not after two hours, that a client vanished without closing (row MB-064)."""
+    """Make the system detect within 25 s, instead of two hours, that a client vanished without closing its connection (row
+    MB-064).
+    """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if hasattr(socket, "TCP_KEEPIDLE"):

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, os_reason
 
 MAX_PENDING = 256
-"""Datagrams that wait to be read."""
+"""The number of datagrams that may wait for their reader."""
 
 Peer = tuple[str, int]
 

@@ -17,7 +17,7 @@ CHARACTER_GAP_NS = NS_PER_S
 MAX_CHARACTERS = 513
 """Longest frame in characters: colon, 2 for each byte of unit ID, 253 bytes of PDU and LRC, CR and LF (SL 2.5.2.1)."""
 MIN_BYTES = 3
-"""Unit ID, function code and LRC."""
+"""The number of bytes of the shortest frame: unit ID, function code and LRC."""
 _COLON, _RETURN = b":", b"\r"
 
 

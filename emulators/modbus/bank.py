@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import DeviceRefused, UsageError
 Table = Literal["coil", "discrete", "input", "holding"]
 Access = Literal["ro", "rw", "wo"]
 Undeclared = Literal["exception", "zero", "hold"]
-"""How cells that no span declares behave, in tables that have spans: refused, always 0, or 0 until they are written."""
+"""The behaviour of cells that no span declares, in tables that have spans: refused, always 0, or 0 until they are written."""
 
 BIT_TABLES: frozenset[str] = frozenset({"coil", "discrete"})
 WRITABLE_TABLES: frozenset[str] = frozenset({"coil", "holding"})
@@ -84,7 +84,7 @@ class RegisterBank(ABC):
         """Set the cells from `address` on. Either all of them change, or none changes and a `Refusal` is raised."""
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
-        """Raise what `read` would raise. A bank whose reads have side effects must override this method."""
+        """Raise the error that `read` would raise. A bank whose reads have side effects must override this method."""
         self.read(table, address, count, now_ns)
 
 
@@ -127,11 +127,11 @@ class CellHooks:
 _NO_HOOKS = CellHooks()
 
 MAX_PLANS = 1024
-"""Number of different reads for which a bank keeps a plan."""
+"""The number of different reads for which a bank keeps a plan."""
 
 
 class _Plan(NamedTuple):
-    """How to read adjacent cells: a function that reads all of them, and the cells that have a `reading` hook."""
+    """The plan for a read of adjacent cells: a function that reads all of them, and the cells that have a `reading` hook."""
 
     cells: Callable[[dict[int, int]], Sequence[int]]
     hooked: tuple[tuple[int, Callable[[int, int], int]], ...]
@@ -234,7 +234,8 @@ class MapBank(RegisterBank):
         Raises `NoSuchAddress` if it does not exist.
         """
         try:
-            return self._cells[table][address]  # undeclared cells that `undeclared` fills read as 0
+            # cells that no span declares, and that `undeclared` makes readable, are 0
+            return self._cells[table][address]
         except KeyError:
             raise NoSuchAddress("not a readable cell", where=f"{table}:{address}") from None
 

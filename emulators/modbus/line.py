@@ -109,7 +109,7 @@ class LineServer(ABC):
         """Return `frame` (unit ID and PDU) as it is sent on the line."""
 
     def as_heard(self, frame: bytes) -> bytes:
-        """Return a received frame in its form on the line."""
+        """Return a received frame with its delimiters, as it was sent on the line."""
         return frame
 
     def _exchange(self, frame: bytes, now_ns: int) -> ServedFrame:

@@ -14,11 +14,11 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import Desync, UsageError
 
 HEADER = 6
-"""Bytes of transaction ID, protocol ID and length: those that precede the bytes counted by the length field (TG 3.1.3)."""
+"""The number of bytes of transaction ID, protocol ID and length. The length field counts the bytes after them (TG 3.1.3)."""
 MIN_LENGTH, MAX_LENGTH = 2, 254
-"""Unit ID and function code; unit ID and the largest PDU of 253 bytes."""
+"""The limits of the length field: unit ID and function code; unit ID and the largest PDU of 253 bytes."""
 MAX_IN_FLIGHT = 16
-"""TG 4.4.2.2 gives 1 to 16 as usual for a server."""
+"""The number of requests of one client that are executed together; TG 4.4.2.2 gives 1 to 16 as usual for a server."""
 ANY_UNIT = (0, 255)
 """Unit IDs that mean the device itself, if there is only one device at the address (TG 4.4.1.2)."""
 NO_PATH = 0x0A
@@ -59,7 +59,7 @@ class MbapServer:
         self.max_in_flight = max_in_flight
         self.desync: Desync | None = None
         self.counts = counts or ClientTraffic()
-        """Requests that reached a unit, and the replies to them."""
+        """The numbers of requests that reached a unit, and of the replies to them."""
         self.requests = 0
         self.discarded = 0
         """Number of ADUs that were dropped: not Modbus, or too short for a function code."""
@@ -128,7 +128,7 @@ class MbapServer:
                 adu = bytes(buffer[begin:at])
                 break
             self.discarded += 1
-        del buffer[:at]  # only once, so that a flood of invalid ADUs costs one deletion
+        del buffer[:at]  # all dropped ADUs are deleted together, so that a flood of invalid ADUs costs one deletion
         return adu
 
     def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> ServedFrame:

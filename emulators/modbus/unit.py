@@ -33,7 +33,7 @@ WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
 """Functions that a busy unit still answers, so that a client can find out that it is busy (AP 6.9)."""
 
 MAX_SERVER_DATA = 249
-"""Bytes of the server ID and the data after the run indicator that fit a reply to 11h."""
+"""The number of bytes of the server ID, and of the data after the run indicator, that fit a reply to 11h together."""
 
 Handler = Callable[[bytes, int], bytes | None]
 """``(pdu, now_ns)`` -> the response PDU, or None for silence. It may raise a `Refusal` if it has changed nothing."""
@@ -192,7 +192,7 @@ class ModbusUnit:
             self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, damaged=True)
 
     def _counted(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:
-        self.counters.requests += 1  # counted first: a request for the counters or the log includes itself
+        self.counters.requests += 1  # counted first, because a request for the counters or the log includes itself
         self.diagnostics.log.note_received(listening=self.diagnostics.listen_only)
         response = self._answer(pdu, now_ns, busy)
         if response is None:
@@ -226,7 +226,7 @@ class ModbusUnit:
         return response
 
     def _tire(self, now_ns: int) -> None:
-        """Count one more request, and become busy after it if `be_busy_behind` says so."""
+        """Count one more request, and make the unit busy after it if `be_busy_behind` requires this."""
         self._answered += 1
         if self._busy_every and self._answered % self._busy_every == 0:
             self._busy_until_ns = max(self._busy_until_ns, now_ns + self._busy_for_ns)

@@ -168,7 +168,7 @@ class SdoServer:
         return [b"\x60" + data[1:4] + bytes(4)]
 
     def _room(self, index: int, subindex: int, size: bytes) -> tuple[int | None, int, Abort]:
-        """Return the announced size, the limit, and the abort code if the limit is exceeded.
+        """Return the announced size, the size limit, and the abort code for data beyond the limit.
 
         Raises `SdoAborted` if the announced size already exceeds the limit."""
         announced = int.from_bytes(size, "little") if size else None

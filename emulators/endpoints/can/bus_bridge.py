@@ -18,7 +18,7 @@ class CanBridge:
 
     def __init__(self, one: CanConnection, other: CanConnection) -> None:
         self.forwarded = {str(one.endpoint): 0, str(other.endpoint): 0}
-        """Number of frames by the endpoint that they came from."""
+        """The number of forwarded frames, by the endpoint from which they came."""
         self._ends = (one, other)
         self._refused = 0
         self._tasks: list[asyncio.Task[None]] = []
@@ -33,7 +33,7 @@ class CanBridge:
 
     @property
     def lost(self) -> int:
-        """Return the number of frames that came faster than the other bus accepted them."""
+        """Return the number of frames that were lost because they came faster than the target bus accepted them."""
         return self._refused + sum(end.overruns for end in self._ends)
 
     async def aclose(self) -> None:

@@ -54,7 +54,7 @@ class BusPort(Protocol):
 
 
 class _Told(NamedTuple):
-    """An error frame that a controller passes to its node."""
+    """An error frame that a controller passes to its node, with the number of the node."""
 
     t_ns: int
     order: int
@@ -121,7 +121,7 @@ class BusRunner:
             raise self._closed
         node = self._bus.join(self.now_ns(), name, listen_only=listen_only)
         self._ports[node] = port
-        self._schedule()  # it acknowledges from now on
+        self._schedule()  # the node acknowledges frames from now on
         return node
 
     def leave(self, node: int) -> None:

@@ -66,10 +66,10 @@ class SoftBusServer:
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
         self.sdo_clients = ClientCounts()
-        """SDO requests by the client that sent them, and the replies, assigned to the client that sent the last request."""
+        """By client: its SDO requests, and the replies. A reply counts for the client that sent the last request."""
         self._asked_by: dict[int, _Client] = {}
         self.turned_away = 0
-        """Clients that were refused or violated the protocol."""
+        """The number of clients that were refused or violated the protocol."""
 
     @classmethod
     async def open(
@@ -307,7 +307,8 @@ class _Client(asyncio.Protocol):
                 self._counts.requests += 1
                 self._bus._asked_by[frame.can_id & 0x7F] = self
             return taken
-        except (Desync, UsageError):  # not this protocol, or an error frame: the rest cannot be trusted
+        # the record is invalid or an error frame, so the rest of the stream cannot be trusted
+        except (Desync, UsageError):
             self._turn_away()
             return True
 
@@ -329,7 +330,7 @@ class _Client(asyncio.Protocol):
                 self._counts.open = True
             except EndpointBusy:
                 status = Status.FULL
-            except ConnectionLost:  # the bus is closing, and so is this client
+            except ConnectionLost:  # the bus is closing, and closes this client too
                 self._turn_away()
                 return
         self._deadline.cancel()

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable, os_reason
 
 MAX_OUTBOUND_BYTES = 64 * 1024
-"""Bytes that wait for a slow client; beyond that it loses frames, which are counted."""
+"""The number of bytes that may wait for a slow client. Further frames are lost and counted."""
 MAX_CLIENTS = 64
 SOCKET_BUFFER_BYTES = 16 * 1024
 

@@ -19,7 +19,9 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 OK, REFUSED = b"\r", b"\a"
 VERSION, SERIAL_NUMBER = b"V1013\r", b"NFT01\r"
 MAX_LINE = 32
-"""The longest command is a frame: T, 8 digits, length, 16 digits, and a time stamp that some programs append."""
+"""The number of characters of the longest command, a frame: T, 8 digits, length, 16 digits, and a time stamp that some
+programs append.
+"""
 
 _BIT_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 _ALL = {"M": ("00000000",), "m": ("FFFFFFFF",)}
@@ -39,11 +41,11 @@ class SlcanSession:
         self.listen_only = False
         self.refused = 0
         self.waiting = False
-        """The next command is a frame for which there was no room: call `step` again later."""
+        """True if there was no room for the frame of the next command. The caller calls `step` again later."""
         self._bitrate = bitrate
         self._stamps = False
         self._buffer = bytearray()
-        self._skipping = False  # within a line that is longer than any command
+        self._skipping = False  # True while a line is received that is longer than any command
         self._flags = 0
         self._state = 0
 
@@ -105,7 +107,7 @@ class SlcanSession:
         letter, rest = line[:1], line[1:]
         match letter:
             case "":
-                return OK  # clients send some to clear earlier input
+                return OK  # an empty line: clients send it to clear earlier input
             case "t" | "T" | "r" | "R":
                 return self._transmit(letter, rest, send)
             case "O" | "L" if not rest and not self.is_open:

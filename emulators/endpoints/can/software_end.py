@@ -90,7 +90,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
 
 
 def _judge(answer: BusHello, bitrate: int, endpoint: Endpoint) -> None:
-    """Raise the error for an answer of the bus that is not a welcome."""
+    """Raise the error for an answer by which the bus refuses the node."""
     if answer.status == Status.WRONG_BITRATE:
         raise UsageError(
             "the software CAN bus runs at a different bit rate",
@@ -182,7 +182,7 @@ async def _hang_up(writer: asyncio.StreamWriter) -> None:
     writer.close()
     try:
         await asyncio.wait_for(writer.wait_closed(), CLOSE_TIMEOUT_S)
-    except OSError:  # reset, or a peer that does not read any more
+    except OSError:  # the connection was reset, or the peer has stopped reading
         writer.transport.abort()
 
 

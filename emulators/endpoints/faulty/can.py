@@ -124,7 +124,7 @@ class FaultyCan(CanConnection):
         try:
             await self.inner.send(frame)
         except ConnectionLost:
-            pass  # it was too late
+            pass  # the connection was lost before the frame was sent
 
 
 def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[int]) -> Any:

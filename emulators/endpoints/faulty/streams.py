@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 MOST_WAITING = 10_000
-"""Pieces that wait for their time; further ones are lost and counted."""
+"""The number of pieces that may wait for the end of their delay. Further pieces are lost and counted."""
 
 
 class FaultyEnd(ByteConnection):
@@ -35,7 +35,7 @@ class FaultyEnd(ByteConnection):
         self.host = getattr(inner, "host", "")
         self.role = getattr(inner, "role", "")
         self.lost_pieces = 0
-        """Pieces that were lost because too many waited."""
+        """The number of pieces that were lost because too many pieces waited."""
         self._faults = faults
         self._loop = asyncio.get_running_loop()
         self._requests = Assembler(FrameDirection.REQUEST, faults.framing)
@@ -119,7 +119,7 @@ class FaultyEnd(ByteConnection):
         return not (self._faults.active or assembler.pending or (self._free_ns and assembler.way in self._free_ns))
 
     def _heard(self, data: bytes) -> bool:
-        """Process a chunk from the peer; return True if a fault has handled it."""
+        """Handle a chunk from the peer. Return True if a fault was applied to it, so that it must not be passed on unchanged."""
         if self._faults.watch is not None:
             self._show(FrameDirection.REQUEST, data)
         if self._dead:
@@ -152,7 +152,7 @@ class FaultyEnd(ByteConnection):
             self._on_request(frame)
 
     def _said(self, data: bytes, after_s: float = 0.0) -> list[bytes]:
-        """Return the parts of an emulator's reply that are sent immediately; the rest is scheduled."""
+        """Apply the faults to a reply of the emulator. Return the parts to send immediately; the other parts are scheduled."""
         if self._dead:
             return []
         assembler = self._replies
@@ -172,7 +172,9 @@ class FaultyEnd(ByteConnection):
     # -- carrying out ---------------------------------------------------------------------------------------------------
 
     def _carry_out(self, way: FrameDirection, outcome: FaultEffect, after_s: float = 0.0) -> list[bytes]:
-        """Return the pieces to send immediately; schedule those with a delay or the opposite direction."""
+        """Carry out the effect of a fault. Return the pieces to send immediately, and schedule those with a delay or in the
+        opposite direction.
+        """
         now_ns = self._now_ns()
         at_once: list[bytes] = []
         for piece in outcome.pieces:
@@ -234,7 +236,7 @@ class FaultyEnd(ByteConnection):
             await self.inner.write(data)
             self._show(FrameDirection.REPLY, data)
         except ConnectionLost:
-            pass  # it was too late
+            pass  # the connection was lost before the delayed bytes were sent
 
     def _pass_in(self, data: bytes) -> None:
         if data:

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
 
 MOST_WAITING = 1_000
-"""Datagrams received and not yet taken; further ones are lost, as with a socket."""
+"""The number of received datagrams that may wait for their reader. Further datagrams are lost, as with a socket."""
 
 Heard = tuple[bytes, tuple[str, int]]
 
@@ -76,7 +76,7 @@ class FaultyDatagrams(Datagrams):
             task.add_done_callback(self._tasks.discard)
 
     async def _send_quietly(self, data: bytes, peer: tuple[str, int]) -> None:
-        with contextlib.suppress(ConnectionLost):  # it was too late
+        with contextlib.suppress(ConnectionLost):  # the connection was lost before the delayed bytes were sent
             await self._inner.send(data, peer)
             self._show(FrameDirection.REPLY, data, peer)
 

@@ -52,7 +52,7 @@ class UnitCounters:
 
     @property
     def messages(self) -> int:
-        """Messages addressed to this unit (CPT4)."""
+        """Return the number of messages addressed to this unit (CPT4)."""
         return self.requests + self.broadcasts
 
 
@@ -95,9 +95,9 @@ class UnitDiagnostics:
         self._cleared = replace(self.counters)
 
     def wakes(self, pdu: bytes) -> bool:
-        """Return whether `pdu` is 08/01, the only request that ends listen-only mode; if so, end it.
+        """End listen-only mode if `pdu` is 08/01, the only request that does this. Return whether it is.
 
-        The unit does not answer it.
+        The unit does not answer this request.
         """
         if pdu not in _RESTARTS:
             return False
@@ -132,17 +132,17 @@ class UnitDiagnostics:
         return self._execute(sub, pdu)
 
     def exception_status(self, pdu: bytes) -> bytes:
-        """Answer function 07."""
+        """Return the answer to function 07."""
         _require_bare(pdu)
         return bytes((pdu[0], self.status & 0xFF))
 
     def event_counter(self, pdu: bytes, processing: bool) -> bytes:
-        """Answer function 0B. `processing`: an earlier program command is still being executed."""
+        """Return the answer to function 0B. `processing` says that an earlier program command is still being executed."""
         _require_bare(pdu)
         return pdu[:1] + self._status_and_count(processing)
 
     def event_log(self, pdu: bytes, processing: bool) -> bytes:
-        """Answer function 0C."""
+        """Return the answer to function 0C."""
         _require_bare(pdu)
         data = self._status_and_count(processing) + _word(self._since_clear("bus_messages")) + self.log.content
         return bytes((pdu[0], len(data))) + data

@@ -12,7 +12,7 @@ from fieldtwin.emulators.modbus.bank import IllegalValue, NoSuchAddress
 from fieldtwin.gateway.core.errors import UsageError
 
 MOST_READ = 31
-"""Registers that fit one answer; a longer queue is refused with 03 until the device takes some out."""
+"""The number of registers that fit one answer. A longer queue is refused with 03 until the device takes registers out."""
 
 
 class FifoQueues:

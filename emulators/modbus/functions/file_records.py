@@ -13,9 +13,9 @@ from fieldtwin.gateway.core.errors import UsageError
 
 REFERENCE_TYPE = 6
 MAX_RECORDS = 10_000
-"""Most records in a file: 0000h to 270Fh."""
+"""The largest number of records in a file, which have the numbers 0000h to 270Fh."""
 _GROUP = 7
-"""Bytes of a sub-request: reference type, file, record, count."""
+"""The layout of a sub-request: reference type, file, record, count."""
 _MOST_READ, _MOST_ASKED, _MOST_WRITTEN = 0xF5, 0xF5, 0xFB
 
 

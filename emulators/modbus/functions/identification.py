@@ -17,7 +17,7 @@ _LAST_OF = {BASIC: 0x02, REGULAR: 0x7F, EXTENDED: 0xFF}
 _INDIVIDUAL_ACCESS = 0x80
 _HEAD = 7
 MAX_OBJECT = 253 - _HEAD - 2
-"""Bytes of the longest object that fits into one PDU: 244."""
+"""The number of bytes of the longest object that fits into one PDU."""
 
 
 class Identification:

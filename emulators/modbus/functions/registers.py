@@ -1,4 +1,4 @@
-"""Functions that access cells: 01 to 06, 0F, 10, 16 and 17h on a bank (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
+"""The functions that access cells: 01 to 06, 0F, 10, 16 and 17h on a bank (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
 
 Pure: a function takes a request PDU and returns a response PDU, or raises a `Refusal`. The checks follow the flow
 charts of AP 6: quantities and lengths (03), addresses (02), then execution. A refused request changes nothing.
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import UsageError
 STANDARD_FUNCTIONS = frozenset({*range(0x01, 0x09), 0x0B, 0x0C, 0x0F, 0x10, 0x11, 0x14, 0x15, 0x16, 0x17, 0x18, 0x2B})
 
 TABLES: dict[int, Table] = {0x01: "coil", 0x02: "discrete", 0x03: "holding", 0x04: "input"}
-"""Function code of a read -> the table that it reads."""
+"""By function code of a read: the table that it reads."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,13 +22,13 @@ from fieldtwin.emulators.modbus.rtu.shapes import (
 )
 
 LOST_AFTER = 4 * MAX_FRAME
-"""Bytes without a frame after which the search only considers frames to the units served here, with functions whose
-length is known. In so much garbage the frames of other units no longer help to resynchronise, and trying every byte
-costs too much.
+"""The number of bytes without a frame after which the search only considers frames to the units served here, with functions
+whose length is known. In so much garbage, frames of other units do not help to resynchronise, and a check of every byte costs
+too much.
 """
 
 IDLE_NOISE = 4
-"""Bytes of noise that a line may produce while it changes direction (row MB-008)."""
+"""The largest number of noise bytes that a line may produce while it changes direction (row MB-008)."""
 
 _REQUEST, _RESPONSE = 0, 1
 

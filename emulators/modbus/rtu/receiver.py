@@ -30,8 +30,8 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 __all__ = ["FRAME_GAP_NS", "MAX_FRAME", "MIN_FRAME", "RtuReceiver", "crc16", "with_crc"]
 
 FRAME_GAP_NS = 50 * NS_PER_MS
-"""A pause after which no sender continues a frame: well over t3.5 and over the 16 ms of a USB adapter's timer, well
-under the response timeout of any client.
+"""A pause after which no sender continues a frame. It is much longer than t3.5 and than the 16 ms of a USB adapter's timer,
+and much shorter than the response timeout of any client.
 """
 
 _NOISE, _WAIT = 0, -1

@@ -8,7 +8,9 @@ from functools import lru_cache
 
 MIN_FRAME = 4
 MAX_FRAME = 256
-"""Bytes of a frame with unit ID and checksum: a function code alone, and the limit of SL 2.5.1."""
+"""The smallest and the largest number of bytes of a frame, with unit ID and checksum: a function code alone, and the limit of
+SL 2.5.1.
+"""
 LAST_UNIT = 247
 """Higher IDs are reserved (SL 2.2)."""
 
@@ -24,7 +26,7 @@ def _crc_table() -> tuple[int, ...]:
 
 CRC_TABLE = _crc_table()
 KEPT = 256
-"""Number of frames whose checksums are cached."""
+"""The number of frames whose checksums are cached."""
 
 
 def crc16(data: bytes | bytearray | memoryview, crc: int = 0xFFFF) -> int:
@@ -69,7 +71,7 @@ FIXED_REQUESTS = {
     0x16: 10,
     0x18: 6,
 }
-"""Function code -> length of the request frame, for functions with only one."""
+"""By function code: the length of the request frame, for functions whose requests all have one length."""
 KNOWN_REQUESTS = frozenset({*FIXED_REQUESTS, 0x0F, 0x10, 0x14, 0x15, 0x17, 0x2B})
 """Functions whose request length follows from the first bytes."""
 _COUNTED_RESPONSES = frozenset({0x01, 0x02, 0x03, 0x04, 0x0C, 0x11, 0x14, 0x15, 0x17})

@@ -19,9 +19,10 @@ from fieldtwin.gateway.core.files.profile import Tag
 
 
 class DistortedObjects:
-    """A node's value source that distorts the values of `source`. `data` is set once the node exists.
+    """A source of a node's object values, for nodes with value faults: it takes the values from `source` and distorts them.
 
-    With a model, calling it changes nothing: the node calls `over` after the model instead (`NodeContext.distort`).
+    `data` holds the live values of the node, and is set when the node exists. If the node has a model, a call of this object
+    returns the values unchanged, because the node calls `over` after the model (`NodeContext.distort`).
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class DistortedObjects:
         self._own: dict[Key, bytes] = {}
         """The undistorted values of objects that no source provides."""
         self._given: dict[Key, bytes] = {}
-        """The last distorted value of each of them."""
+        """The last distorted value of each object in `_own`."""
 
     def share(self, distortions: Distortions, names: Mapping[Key, str]) -> None:
         """Use the `distortions` of the recorded source, which distorts the objects in `names` (key: tag name) itself."""
@@ -78,7 +79,9 @@ class DistortedObjects:
         return self._distorted(*known, raw, now_ns)
 
     def over(self, values: Mapping[Key, bytes], now_ns: int) -> dict[Key, bytes]:
-        """Return `values` with distorted objects replaced; distorted objects that no source provides are added."""
+        """Return `values` with the distorted values in place of the undistorted ones, and with distorted objects that no
+        source provides.
+        """
         out = dict(values)
         if not self.distortions and not self._own:
             return out

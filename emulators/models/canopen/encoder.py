@@ -18,7 +18,7 @@ SPEED, CYCLIC_TIMER, OPERATING_STATUS = 0x6030, 0x6200, 0x6500
 STEPS_PER_TURN, TURNS, OFFSET = 0x6501, 0x6502, 0x6509
 
 COUNTER_CLOCKWISE, SCALING = 1 << 0, 1 << 2
-"""Bits of 6000h; 6500h shows the same two."""
+"""Bits of 6000h; 6500h shows the same two bits."""
 
 SPEED_OVER_NS = 20 * NS_PER_MS
 """The shortest time over which the speed is measured."""
@@ -68,7 +68,7 @@ class Encoder(DeviceModel):
         then_ns, then = self._last
         if now_ns - then_ns < SPEED_OVER_NS:
             return
-        way = (raw - then + whole // 2) % whole - whole // 2  # the shorter way round
+        way = (raw - then + whole // 2) % whole - whole // 2  # the shaft took the shorter of the two ways
         self._speed = way / _units_per_turn(situation.objects) * 60 * NS_PER_S / (now_ns - then_ns)
         self._last = now_ns, raw
 

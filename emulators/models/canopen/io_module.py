@@ -24,7 +24,7 @@ AT_UPPER, BELOW_LOWER, MOVED, MOVED_DOWN, MOVED_UP = 1, 2, 4, 8, 16
 
 HEARTBEAT_LOST = 0x8130
 SCAN_NS = 10 * NS_PER_MS
-"""Interval at which the module scans its inputs while it is OPERATIONAL."""
+"""The interval at which the module scans its inputs while it is OPERATIONAL."""
 
 
 class IoModule(DeviceModel):

@@ -22,7 +22,7 @@ SPAN_START, SPAN_END, STATUS = 0x6148, 0x6149, 0x6150
 PROCESS_INTEGER_16, PROCESS_INTEGER_32 = 0x7130, 0x9130
 
 ZERO = int.from_bytes(b"zero", "little")
-"""The value that must be written to 6125h: the four letters, so that a scale is not tared by accident."""
+"""The value that must be written to 6125h to tare the device: four letters, so that a scale is not tared by accident."""
 
 OFF, NORMAL = 0, 1
 NOT_VALID, ABOVE_SPAN, BELOW_SPAN = 1, 2, 4

@@ -29,8 +29,8 @@ class PlayedObjects:
         self.distortions = Distortions()
         self._player = player
         self._objects: list[tuple[str, Key, float, float, bool, Callable[[int | float], bytes]]] = []
-        """Tag name, object, scale and offset, whether the type can express "no value", and the encoder of the object's
-        bytes.
+        """For each object: the tag name, the object, scale and offset, whether the type can express "no value", and the
+        encoder of the object's bytes.
         """
         for tag in tags:
             if tag.object is None or tag.name not in player.names:

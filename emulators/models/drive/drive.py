@@ -32,11 +32,13 @@ position).
 HEARTBEAT_LOST, BUS_OFF = 0x8130, 0x8140
 _COMMUNICATION = frozenset({HEARTBEAT_LOST, BUS_OFF})
 _REACTIONS = {1: TransitionCause.ERROR, 2: TransitionCause.DISABLE_VOLTAGE, 3: TransitionCause.QUICK_STOP}
-"""Abort connection option code 6007h: the effect of a lost connection."""
+"""The effect of a lost connection, by the abort connection option code 6007h."""
 
 _SPAN = 1 << 32
 _USUAL, _UNLIMITED = 10_000.0, 10_000_000.0
-"""Accelerations if the node has no object for them: of a profile, and of a motor without limits."""
+"""Accelerations for a node without the object that states them: the usual one of a profile, and that of a motor without
+limits.
+"""
 _FASTEST = 10_000_000.0
 """The final speed of a motor that a torque accelerates without limit."""
 
@@ -68,7 +70,7 @@ class Drive(DeviceModel):
         self._rated, self._axis = rated, axis or DriveAxis()
         self._zero = 0.0  # the place where 6064h is 0
         self._exists: dict[Key, Number] = {}
-        """6502h and 60E3h: the modes and homing methods of the data sheet that the model supports."""
+        """The values of 6502h and 60E3h: the modes and homing methods of the data sheet that the model supports."""
         self._self_test_ns = round(self_test_s * NS_PER_S)
         self._coasting = coasting
         self._motion = Motion()
@@ -163,7 +165,7 @@ class Drive(DeviceModel):
                 self._go(cause, situation.now_ns, situation.objects)
 
     def _obey(self, now_ns: int, objects: Objects) -> None:
-        """Process a new controlword. It can trigger two transitions at once: switch on and enable operation."""
+        """Carry out a new controlword. It can trigger two transitions together: switch on and enable operation."""
         before, self._controlword = self._controlword, objects.whole(od.CONTROLWORD)
         command = command_of(self._controlword, before)
         if command is TransitionCause.FAULT_RESET and self._disconnected(objects):

@@ -23,7 +23,7 @@ _POSITIVE_HOME = {3: _LEFT, 4: _RIGHT}
 """Methods that use the lower edge of the home switch, as if it were active from there on; by the side of the index pulse.
 """
 _NEGATIVE_HOME = {5: _RIGHT, 6: _LEFT}
-"""The same for the upper edge."""
+"""Methods that use the upper edge of the home switch, as if it were active up to there; by the side of the index pulse."""
 _BETWEEN = {
     7: (_RIGHT, "lower", _LEFT), 8: (_RIGHT, "lower", _RIGHT), 9: (_RIGHT, "upper", _LEFT), 10: (_RIGHT, "upper", _RIGHT),
     11: (_LEFT, "upper", _RIGHT), 12: (_LEFT, "upper", _LEFT), 13: (_LEFT, "lower", _RIGHT), 14: (_LEFT, "lower", _LEFT),
@@ -47,7 +47,9 @@ class DriveAxis:
     turn: float = 10_000.0
 
     def inputs(self, x: float) -> int:
-        """Return 60FDh, digital inputs: bit 0 negative limit switch, bit 1 positive limit switch, bit 2 home switch."""
+        """Return the value of 60FDh, the digital inputs: bit 0 negative limit switch, bit 1 positive limit switch, bit 2 home
+        switch.
+        """
         x = round(x)  # a path ends at an edge only up to rounding errors
         return (x <= self.negative) | (x >= self.positive) << 1 | (self.home_from <= x <= self.home_to) << 2
 

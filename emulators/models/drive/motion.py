@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 Ramp = tuple[float, float]
-"""(duration in s, acceleration)."""
+"""A ramp: its duration in seconds, and its acceleration."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,7 +60,9 @@ OPTIONS = {
     FAULT_OPTION: range(5),
     HOMING_METHOD: (0, *METHODS),
 }
-"""Codes that the model supports; a client that writes a different one gets an abort. 0 means no homing method."""
+"""By object: the option codes that the model supports. A client that writes a different code gets an abort. For the homing
+method, 0 means none.
+"""
 
 
 def mode_bits(objects: Objects) -> int:

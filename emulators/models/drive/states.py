@@ -86,7 +86,8 @@ TRANSITIONS = (
     DriveTransition(1, _S.NOT_READY, _C.INITIALISED, _S.SWITCH_ON_DISABLED),
     DriveTransition(2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY),
     DriveTransition(3, _S.READY, _C.SWITCH_ON, _S.SWITCHED_ON),
-    DriveTransition(3, _S.READY, _C.ENABLE_OPERATION, _S.SWITCHED_ON),  # and on to 4 with the same controlword
+    # the same controlword then also causes transition 4
+    DriveTransition(3, _S.READY, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
     DriveTransition(4, _S.SWITCHED_ON, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
     DriveTransition(5, _S.OPERATION_ENABLED, _C.SWITCH_ON, _S.SWITCHED_ON),
     DriveTransition(6, _S.SWITCHED_ON, _C.SHUTDOWN, _S.READY),
@@ -108,7 +109,7 @@ TRANSITIONS = (
     DriveTransition(15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
     DriveTransition(
         16, _S.QUICK_STOP, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED
-    ),  # if the option code permits the drive to stay there
+    ),  # only if the option code permits the drive to stay in QUICK STOP ACTIVE
 )
 
 _BY_CAUSE = {(t.source, t.cause): t for t in TRANSITIONS}
@@ -130,7 +131,7 @@ def transition(state: DriveState, cause: TransitionCause, *, stays_stopped: bool
 def command_of(controlword: int, before: int) -> TransitionCause | None:
     """Return the command in a controlword; `before` is the previous controlword (fault reset is an edge of bit 7).
 
-    While bit 7 is set, the word is no other command (CiA 402-2, table "Command coding").
+    While bit 7 is set, the word contains no other command (CiA 402-2, table "Command coding").
     """
     if controlword & ControlBit.FAULT_RESET:
         return None if before & ControlBit.FAULT_RESET else TransitionCause.FAULT_RESET

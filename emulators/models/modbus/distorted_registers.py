@@ -17,9 +17,10 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 
 class DistortedRegisters(RegisterBank):
-    """`bank` of a device that `profile` describes; `peek` returns a cell without the effects of a read.
+    """The registers of a device with value faults. `bank` holds the undistorted values of the device that `profile` describes,
+    and `peek` returns one of its cells without the effects of a read.
 
-    The distorted values that are read are noted in `journal` as held.
+    A distorted value that a client reads is recorded in `journal` as a value that the device held.
     """
 
     def __init__(

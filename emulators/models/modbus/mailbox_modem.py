@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.files.profile import Box, DeviceProfile, RegisterRan
 
 LAST_SEQUENCE = 0xFFFF
 RECEIVED = 64
-"""Messages that wait for a free inbox; beyond that number the link waits."""
+"""The number of messages that may wait for a free inbox. Further messages wait in the link."""
 
 
 _LINK = "link_state", "link_sent", "link_received", "link_resent"
@@ -64,7 +64,7 @@ class MailboxModem(RegisterBank):
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
     def _state(self, name: str, text: str) -> None:
-        """Set a tag that never changes."""
+        """Write the value of a tag that never changes into its registers."""
         tag = self._tags[name]
         try:
             words = encode(text if tag.is_text else float(text), tag.type, tag.order, registers=tag.registers.count)

@@ -16,7 +16,7 @@ from typing import Protocol
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 OVERHEAD_BYTES = 8
-"""Preamble, address and checksum of a packet."""
+"""The number of bytes of a packet besides its payload: preamble, address and checksum."""
 MAX_RESENDS = 50
 
 
@@ -27,7 +27,7 @@ class PacketSource(Protocol):
     resent: int
 
     def submit(self, payload: bytes, now_ns: int) -> bool:
-        """Send `payload`; return False if there is no room."""
+        """Send `payload`; return False if the link has no room."""
         ...
 
 

@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.recording import RecordingReader
 
 MOST_COUNTED = 4
-"""Most registers that a counter may have."""
+"""The largest number of registers of a counter."""
 
 
 def load_replay(
@@ -72,7 +72,7 @@ class RecordedDevice(ProfiledReplay):
         self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
         self.journal = DeviceValueLog()
         self.distortions = Distortions()
-        """Value faults of its answers to reads."""
+        """The value faults that change the device's answers to reads."""
         self.unlisted = 0
         self._readable = [t for t in profile.tags.values() if t.readable and t.at is not None]
         for tag, text in ((profile.tags[n], text) for n, text in identity.items()):

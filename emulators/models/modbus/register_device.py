@@ -47,7 +47,7 @@ class ProfileRegisters(RegisterBank):
             self._note(tag, now_ns)
 
     def _start_in_range(self, profile: DeviceProfile, given: Collection[str]) -> None:
-        """Give each tag whose range excludes an empty register a value in that range: no device has the unit ID 0."""
+        """Give each tag whose range excludes 0 a value in that range. For example, no device has the unit ID 0."""
         for tag in profile.tags.values():
             if tag.range is not None and tag.name not in given and not tag.is_text:
                 low, high = tag.range

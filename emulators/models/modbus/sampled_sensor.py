@@ -24,7 +24,9 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 STANDBY, SAMPLING, OFF = 0, 1, 2
 MAX_CATCH_UP = 3600
-"""Most samples taken at one access after a long time without one; older samples are skipped, but counted."""
+"""The largest number of samples that one access takes after a long time without an access. Older samples are skipped, but
+counted.
+"""
 
 OWN = ("status", "instrument_time")
 """Tags whose values the model provides itself, in addition to the sample counter and the period."""
@@ -48,7 +50,7 @@ class SampledSensor(RegisterBank):
             raise FileInvalid("the profile has no `sampled`", path=profile.path, expected="`sampled:`")
         self.journal = DeviceValueLog()
         self.distortions = Distortions()
-        """Value faults of its signals, which apply to the next samples."""
+        """The value faults of the sensor's signals, which apply to the next samples."""
         self.samples = 0
         self._player = player
         self._tags = profile.tags

@@ -1,4 +1,5 @@
-"""Conductivity of seawater from salinity, temperature and pressure: the practical salinity scale of 1978, both ways.
+"""Conversion between the conductivity and the salinity of seawater, by temperature and pressure: the practical salinity scale
+of 1978.
 
 Source: Fofonoff and Millard, "Algorithms for computation of fundamental properties of seawater", UNESCO technical papers in
 marine science 44 (1983), section 1; the tests contain its check values. Valid for salinities of 2 to 42. Temperatures are in
@@ -48,7 +49,7 @@ def conductivity(salinity_psu: float, temperature: float, pressure: float) -> fl
 
 
 def _pressure_terms(t68: float, pressure: float) -> tuple[float, float, float]:
-    """Return the terms of the pressure correction: the numerator, and of the denominator the constant and the slope."""
+    """Return the terms of the pressure correction: the numerator, and the constant and the slope of the denominator."""
     d1, d2, d3, d4 = _D
     numerator = pressure * _polynomial(_E, pressure)
     return numerator, 1.0 + d1 * t68 + d2 * t68 * t68, d3 + d4 * t68

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 SIGNALS = {"slope_long": "deg", "slope_lateral": "deg"}
 
 Wave = tuple[int, float, float]
-"""Number of periods in the recording, amplitude in degrees, phase in radians."""
+"""A wave: number of periods in the recording, amplitude in degrees, phase in radians."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tilt:
-    """The buoy. Slopes in degrees; the waves are a slow swing on the mooring and swell of 7.5 to 12 s."""
+    """The motion of the buoy. Slopes are in degrees. The waves are a slow swing on the mooring, and swell of 7.5 to 12 s."""
 
     duration_s: float = 60.0
     rate_hz: float = 10.0

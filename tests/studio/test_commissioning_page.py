@@ -101,6 +101,8 @@ def test_the_first_hour_with_an_unknown_device(tmp_path: Path) -> None:
         play(page, "Identify", "findings")
         page.sees(".outcome", "FM-300")
         page.sees(".outcome", "no known profile fits")
+        page.type("[name=address]", "3")  # the result is drawn again: this once stopped all drawing of the page
+        page.sees(".outcome dl", "SunSpec\nno header")
 
         play(page, "Dump", "done", ranges="input:0..15 holding:0..15", passes="8", every_s="0.5")
         page.sees(".outcome", "10 values in 8 passes")

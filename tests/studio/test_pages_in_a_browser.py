@@ -92,6 +92,48 @@ def test_a_value_is_set_in_the_simulated_device_and_released(page: Window) -> No
     until(lambda: "\n7\n" not in f"\n{page.text(f'{row} td.number')}\n", "the device has its own value again")
 
 
+def test_a_view_that_throws_shows_the_error_and_the_page_goes_on(page: Window) -> None:
+    breaks = """const includes = String.prototype.includes;
+        String.prototype.includes = function (text, ...more) {
+          if (text === "break it") throw new Error("broken on purpose");
+          return includes.call(this, text, ...more);
+        };"""
+    page.script(breaks)
+    page.click(".nav a", "Devices")
+    ways = (lambda: page.click("button", "Try again"), lambda: page.click(".nav a", "Devices"))
+    for go_on in ways:
+        page.type("[type=search]", "break it")
+        page.sees("main [role=alert]", "broken on purpose")
+        page.sees(".top", "live")
+        go_on()
+        page.sees("main", "ctd.status")
+        assert any("broken on purpose" in line for line in page.complaints())
+        assert not page.elements("main [role=alert]")
+    page.type("[type=search]", "break it")
+    page.click(".nav a", "Overview")
+    page.sees(".plan", "ctd")
+    page.complaints()
+
+
+def test_a_page_whose_frame_throws_offers_to_load_it_again(page: Window) -> None:
+    page.click(".nav a", "Devices")
+    page.sees("main", "ctd.status")
+    page.script("Object.entries = () => { throw new Error('broken on purpose'); };")  # the next update draws the frame
+    page.sees("[role=alert]", "Studio's page cannot be shown")
+    page.click("button", "Load the page again")
+    page.sees(".top", "live")
+    page.sees("main", "ctd.status")
+    page.complaints()
+
+
+def test_an_address_that_is_cut_off_names_what_is_missing(page: Window, observatory: Studio) -> None:
+    page.go(f"{observatory.url}#/%E0%A4%A")
+    page.sees("main .error", "%E0%A4%A")
+    page.click("a", "All instances")
+    page.sees("h2", "Running")
+    page.complaints()
+
+
 def test_a_force_is_visible_on_every_view_until_it_is_removed(page: Window) -> None:
     row = ROW.format("ctd.sample_count")
     page.click(".nav a", "PLC")

@@ -3,6 +3,7 @@
 import { html, render, useEffect, useRef, useState } from "./vendor/preact.js";
 import { address } from "./lib/address.js";
 import { remove } from "./lib/api.js";
+import { Guard } from "./lib/guard.js";
 import { Failure, useAction } from "./lib/parts.js";
 import { Store, useStore } from "./lib/store.js";
 import { PREFIX, TraceStore } from "./lib/trace_store.js";
@@ -33,22 +34,36 @@ const GUIDE = "commissioning"; // an instance of this name is opened at commissi
 
 function readAddress() {
   const [path, query] = location.hash.replace(/^#\/?/, "").split("?");
-  const [instance = "", view = "overview"] = path.split("/").map(decodeURIComponent);
+  const [instance = "", view = "overview"] = path.split("/").map(decoded);
   if (path === GUIDE) return { guide: new URLSearchParams(query ?? "").get("step") ?? "" };
   return { instance, view: view in VIEWS ? view : "overview", query: new URLSearchParams(query ?? "") };
+}
+
+function decoded(text) {
+  try {
+    return decodeURIComponent(text);
+  } catch {
+    return text; // a cut-off address: no instance has this name, and the page says so
+  }
 }
 
 function App() {
   const [place, setPlace] = useState(readAddress());
   useEffect(() => {
     const changed = () => setPlace(readAddress());
+    // A click on the link of the shown view changes no address, so the browser reports nothing; it draws the view again.
+    const clicked = (e) => e.target.closest?.("a[href]")?.href === location.href && changed();
     addEventListener("hashchange", changed);
-    return () => removeEventListener("hashchange", changed);
+    addEventListener("click", clicked);
+    return () => {
+      removeEventListener("hashchange", changed);
+      removeEventListener("click", clicked);
+    };
   }, []);
   useEffect(() => {
     document.title = place.guide !== undefined ? "Commissioning · Studio" : place.instance ? `${place.instance}: ${VIEWS[place.view].title} · Studio` : "fieldtwin Studio";
   }, [place]);
-  if (place.guide !== undefined) return html`<${Guide} step=${place.guide}><${Theme} /><//>`;
+  if (place.guide !== undefined) return html`<${Guide} step=${place.guide} place=${place}><${Theme} /><//>`;
   if (!place.instance) return html`<${Home} />`;
   return html`<${Instance} key=${place.instance} place=${place} />`;
 }
@@ -82,7 +97,10 @@ function Instance({ place }) {
     </nav>
     <main class=${fill ? "fill" : ""} id="view" ref=${main} tabindex="-1">
       ${store.error && html`<${Failure} text=${store.error} /><p><a href="#/">All instances</a></p>`}
-      ${store.about && html`<${View} store=${store} query=${place.query} key=${`${place.view} ${store.about.started_ns}`} />`}
+      ${store.about &&
+      html`<${Guard} title="This view cannot be shown" place=${place}>
+        <${View} store=${store} query=${place.query} key=${`${place.view} ${store.about.started_ns}`} />
+      <//>`}
       ${!store.about && !store.error && html`<p class="empty">Reading the instance …</p>`}
     </main>
   </div>`;
@@ -157,4 +175,4 @@ function Banners({ store }) {
   </div>`;
 }
 
-render(html`<${App} />`, document.getElementById("app"));
+render(html`<${Guard} title="Studio's page cannot be shown"><${App} /><//>`, document.getElementById("app"));

@@ -2,6 +2,7 @@
 
 import { html, useEffect, useMemo, useRef, useState } from "../vendor/preact.js";
 import { followPath, get, post, remove } from "../lib/api.js";
+import { Guard } from "../lib/guard.js";
 import { Dialog, Failure, useAction } from "../lib/parts.js";
 import { Editor, emptyDraft } from "./editor.js";
 import { CommandLine, Fields, useCommand, valuesOf } from "./fields.js";
@@ -43,13 +44,27 @@ function useGuide() {
   const [guide, setGuide] = useState(null);
   const [error, setError] = useState("");
   const [connected, setConnected] = useState(true);
-  const read = () => get("/commissioning").then((got) => setGuide(got), (e) => setError(e.message));
+  const seen = useRef({ asked: 0, shown: 0, streamed: 0 });
+  const read = () => {
+    const number = (seen.current.asked += 1);
+    const { streamed } = seen.current;
+    return get("/commissioning").then(
+      (got) => {
+        if (number < seen.current.shown) return; // a later answer has arrived first
+        seen.current.shown = number;
+        setGuide((old) => (old && streamed !== seen.current.streamed ? { ...got, jobs: old.jobs } : got)); // the stream's jobs are newer
+        setError("");
+      },
+      (e) => setError(e.message),
+    );
+  };
   const ended = useRef("");
   useEffect(() => {
     read();
     return followPath(
       "/commissioning/stream",
       ({ jobs }) => {
+        seen.current.streamed += 1;
         setGuide((old) => old && { ...old, jobs });
         const now = jobs.map((j) => `${j.number}${j.state === "running" ? "" : "e"}`).join();
         if (now !== ended.current) read();
@@ -61,7 +76,7 @@ function useGuide() {
   return [guide, error, connected, read];
 }
 
-export function Guide({ step: wanted, children }) {
+export function Guide({ step: wanted, place, children }) {
   const [guide, error, connected, again] = useGuide();
   const [choices, change] = useChoices(guide?.folder);
   const [draft, setDraft] = useState(emptyDraft);
@@ -139,11 +154,13 @@ export function Guide({ step: wanted, children }) {
         <section class="card" key=${at.id}>
           <header><h1>${at.title}</h1></header>
           <p class="explanation">${at.text}</p>
-          ${at.id === "port" && html`<${PortStep} ctx=${ctx} guide=${guide} change=${change} mayOperate=${mayOperate} again=${again} />`}
-          ${at.id === "edit" &&
-          html`<${Editor} ctx=${ctx} draft=${draft} setDraft=${setDraft} mayOperate=${mayOperate}
-            onSaved=${(name, valid) => (change({ draft: name, draftValid: valid }), again())} />`}
-          ${at.fields && html`<${CommandStep} step=${at} ctx=${ctx} choices=${choices} change=${change} mayOperate=${mayOperate} again=${again} />`}
+          <${Guard} title="This step cannot be shown" place=${place}>
+            ${at.id === "port" && html`<${PortStep} ctx=${ctx} guide=${guide} change=${change} mayOperate=${mayOperate} again=${again} />`}
+            ${at.id === "edit" &&
+            html`<${Editor} ctx=${ctx} draft=${draft} setDraft=${setDraft} mayOperate=${mayOperate}
+              onSaved=${(name, valid) => (change({ draft: name, draftValid: valid }), again())} />`}
+            ${at.fields && html`<${CommandStep} step=${at} ctx=${ctx} choices=${choices} change=${change} mayOperate=${mayOperate} again=${again} />`}
+          <//>
         </section>
         <${Files} guide=${guide} />
         <${Next} at=${at} />

@@ -57,7 +57,10 @@ const Identify = ({ r }) => {
     </details>`}`;
 };
 
-/** What the device says about itself. */
+/** What a device may not have answered, by the names in `silence`. */
+const SILENT = { "2B": "identification", 11: "server id", sunspec: "SunSpec" };
+
+/** What the device says about itself, and why it does not. */
 function stated(r) {
   const id = r.identification ?? {};
   const { vendor, product, revision, serial } = r.identity ?? {};
@@ -69,7 +72,7 @@ function stated(r) {
     serial,
     "server id": r.server_id && html`<span class="mono">${hex(r.server_id)}</span>`,
     conflict: r.conflict,
-    remark: r.silence,
+    ...Object.fromEntries(Object.entries(r.silence ?? {}).map(([request, why]) => [SILENT[request] ?? request, why])),
   };
 }
 

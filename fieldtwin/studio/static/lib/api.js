@@ -13,8 +13,9 @@ export async function call(method, path, body) {
   } catch {
     throw new Error("Studio's server does not answer. Is `fieldtwin studio` still running?");
   }
-  const content = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(content.error?.message ?? `the server answered ${response.status}`);
+  const content = await response.json().catch(() => null);
+  if (!response.ok) throw new Error(content?.error?.message ?? `the server answered ${response.status}`);
+  if (content === null) throw new Error("The answer of Studio's server is cut off. Try again.");
   return content;
 }
 

@@ -22,8 +22,8 @@ from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
 from fieldtwin.gateway.runtime.buses.bus import Bus
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.image_io import ImageExchange
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump

@@ -26,8 +26,9 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog

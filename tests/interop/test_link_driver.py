@@ -26,7 +26,8 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import SensorDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.site.system import load_system

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 LINE = Endpoint.parse("rtu:/dev/ttyVIRT?baudrate=19200&frame=8E1")

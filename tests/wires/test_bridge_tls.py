@@ -34,7 +34,7 @@ from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS, W
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

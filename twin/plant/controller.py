@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, learnt_statuses
+from fieldtwin.gateway.runtime.buses.modbus.learnt_gaps import LearntFile, learnt_statuses
 from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus, StoppedGateway
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.reconfigure import reconfigure

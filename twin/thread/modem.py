@@ -16,8 +16,8 @@ from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.bus_turns import DeviceState
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Inbox, Mailboxes
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.twin.thread.frames import Schema

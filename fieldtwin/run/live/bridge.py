@@ -26,7 +26,7 @@ from fieldtwin.gateway.protocols.modbus.server.analysis import READ_FUNCTIONS
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import LOOPBACK, AllowRule, Network, Policy
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.plant.instance import Instance

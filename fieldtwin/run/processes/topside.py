@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import RESPONSE
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Inbox, Mailboxes
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.twin.site.system import System

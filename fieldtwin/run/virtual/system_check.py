@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, TagValue
-from fieldtwin.gateway.runtime.buses.learnt_gaps import learnt_statuses
+from fieldtwin.gateway.runtime.buses.modbus.learnt_gaps import learnt_statuses
 from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, OutputStatus
 from fieldtwin.gateway.runtime.status import describe

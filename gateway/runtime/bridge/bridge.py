@@ -51,8 +51,8 @@ from fieldtwin.gateway.runtime.bridge.line import LineFront
 from fieldtwin.gateway.runtime.bridge.policy import Policy
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeRequest
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.bridge_queue import BridgeRequest
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.gateway_status import BridgeStatus
 
 _FULL = "too many requests wait for the bus"

@@ -23,6 +23,9 @@ Ended = Callable[[str, FieldtwinError | None], None]
 not sent is `HeldBack`.
 """
 
+MOST_LOCALS = 64
+"""The number of local addresses that are remembered. Each opening of the bus adds one."""
+
 
 class HeldBack(NotAllowed):
     """A member of a group was not written, because a different member of the group could not be written."""

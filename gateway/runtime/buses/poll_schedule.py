@@ -11,6 +11,7 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.devices.config import DeviceConfig
 
 K = TypeVar("K", bound=Hashable)
 SOONER = 8
@@ -45,6 +46,17 @@ def spread(
         for k, key in enumerate(keys):
             rates[key] = PollSlot(period_ns, min(int(period_ns * (k + offset) / len(keys)), period_ns - 1))
     return rates
+
+
+def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, PollSlot]]:
+    """Return the rates of the groups of one bus's devices, by device name."""
+    groups: list[tuple[tuple[str, str], int]] = []
+    stated: dict[tuple[str, str], int] = {}
+    for config in configs:
+        groups += [((config.name, group), every_ms) for group, every_ms in config.poll.items()]
+        stated |= {(config.name, group): phase_ms for group, phase_ms in config.phase.items()}
+    rates = spread(groups, stated, offset)
+    return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
 
 
 class PollSchedule:

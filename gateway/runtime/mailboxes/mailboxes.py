@@ -15,7 +15,8 @@ from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 
 ASK_EVERY_NS = 50 * NS_PER_MS
 """The time between two checks of a full outbox."""

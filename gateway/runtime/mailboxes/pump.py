@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
 from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Mailboxes
 from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause, Refusals, cause_of

@@ -17,7 +17,7 @@ from typing import Any
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.image.image import TagKind
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local, var_output
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.run.benches.virtual_bench import VirtualBench

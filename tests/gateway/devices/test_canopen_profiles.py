@@ -33,7 +33,7 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.prototype.file import load_prototype

@@ -27,7 +27,8 @@ from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver, next_sequence
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

@@ -32,7 +32,7 @@ from fieldtwin.gateway.protocols.canopen.eds.concise_dcf import Setting
 from fieldtwin.gateway.protocols.canopen.lss.frames import LssAddress
 from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 PROFILE = load_profile(Path(__file__).parents[4] / "profiles" / "devices" / "inclinometer-cia410.yaml")

@@ -22,7 +22,7 @@ from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 

@@ -16,8 +16,9 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.server.analysis import examine
 from fieldtwin.gateway.protocols.modbus.server.forward import ForwardedReply
-from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, BridgeQueue, BridgeRequest
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.bridge_queue import MAX_WAIT_NS, BridgeQueue, BridgeRequest
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 READ = bytes.fromhex("03 0064 0001")

@@ -26,7 +26,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy
 from fieldtwin.gateway.runtime.bridge.tcp import TcpFront
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 ROWS = tomllib.loads((Path(__file__).parents[3] / "vectors" / "modbus_gateway.toml").read_text())["row"]

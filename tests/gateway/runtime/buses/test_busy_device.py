@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import SensorDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 GROUPS = ("a", "b", "c", "d")

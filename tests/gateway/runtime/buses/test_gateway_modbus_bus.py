@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Fieldtwi
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.modbus_bus import MAX_JOBS, BusJob
+from fieldtwin.gateway.runtime.buses.modbus.jobs import MAX_JOBS, BusJob
 from fieldtwin.gateway.runtime.tags import TagTable
 
 

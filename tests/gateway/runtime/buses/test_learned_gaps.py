@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, learnt_statuses
+from fieldtwin.gateway.runtime.buses.modbus.learnt_gaps import LearntFile, learnt_statuses
 from fieldtwin.gateway.runtime.gateway_status import LearntStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

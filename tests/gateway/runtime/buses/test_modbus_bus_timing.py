@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.unit_timing import UnitPace
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot, spread
 from fieldtwin.gateway.runtime.tags import TagTable
 

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.modbus_bus import BusJob
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable

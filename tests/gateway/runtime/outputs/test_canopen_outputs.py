@@ -35,7 +35,7 @@ from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoMapping
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.bus import HeldBack
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.canopen.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.outputs.output import Output
 from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
 from fieldtwin.gateway.runtime.tags import TagTable

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import partial
-from typing import TypeVar
 
-from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from fieldtwin.gateway.core.concurrency.timeout import ring, start_timeout
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.wakeup import Wakeup
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -32,57 +31,28 @@ from fieldtwin.gateway.core.errors import (
     WrongDevice,
 )
 from fieldtwin.gateway.core.histogram import response_times
-from fieldtwin.gateway.core.values import COMMAND, Reason
+from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, WriteProgress
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.frames.selection import framing_of
 from fieldtwin.gateway.protocols.modbus.requests.refusals import Acknowledged, GatewayRefusal, ServerBusy
-from fieldtwin.gateway.protocols.modbus.server.analysis import NO_RESPONSE
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeQueue
-from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent, status_of
-from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState, Turns, rates_of, restate, states_of
+from fieldtwin.gateway.runtime.buses.bus import MOST_LOCALS, Ended, not_sent, status_of
+from fieldtwin.gateway.runtime.buses.modbus.bridge_queue import BridgeQueue
+from fieldtwin.gateway.runtime.buses.modbus.bus_turns import DeviceState, Turns, restate, states_of
+from fieldtwin.gateway.runtime.buses.modbus.device_requests import DeviceRequests
+from fieldtwin.gateway.runtime.buses.modbus.jobs import BusJob, JobQueue
+from fieldtwin.gateway.runtime.buses.modbus.patience import Patience
+from fieldtwin.gateway.runtime.buses.modbus.unanswered import MOST_UNANSWERED, Unanswered
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
-from fieldtwin.gateway.runtime.buses.unanswered import MOST_UNANSWERED, Unanswered
+from fieldtwin.gateway.runtime.buses.poll_schedule import rates_of
+from fieldtwin.gateway.runtime.buses.reasons import reason_of
 from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 
-T = TypeVar("T")
-
-MAX_JOBS = 256
-
-
-def reason_of(error: FieldtwinError) -> Reason:
-    """Return the reason code for the bad quality of a tag after `error`."""
-    if isinstance(error, WrongDevice):
-        return Reason.WRONG_DEVICE
-    if isinstance(error, GatewayRefusal):
-        return Reason.TIMEOUT if error.code == NO_RESPONSE else Reason.UNREACHABLE
-    if isinstance(error, DeviceRefused):
-        return Reason.REFUSED
-    if isinstance(error, ReplyTimeout):
-        return Reason.TIMEOUT
-    return Reason.UNREACHABLE if isinstance(error, Unreachable) else Reason.WIRE_ERROR
-
-
-ALARM_NS = 10 * NS_PER_S
-"""The time for which the devices of a bus are polled with shortened timeouts after one of them stopped answering."""
 STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
-
-
-@dataclass
-class BusJob:
-    """A request to carry out on the bus before the next poll. `done` is called once, with None or the error."""
-
-    driver: RegisterDriver
-    run: Callable[[], Awaitable[None]]
-    done: Callable[[FieldtwinError | None], None]
-
-
-MOST_LOCALS = 64
-"""The number of local addresses that are remembered. Each opening of the bus adds one."""
 
 
 class ModbusBus:
@@ -114,8 +84,9 @@ class ModbusBus:
         """The error of the last attempt to open the bus. None while the bus is open, and after a loss until the next attempt
         has failed.
         """
+        self._wakeup = Wakeup(clock)
         self.guests = BridgeQueue()
-        self.guests.on_put = self._wake
+        self.guests.on_put = self._wakeup.wake
         self._guest_was_last = False
         line = config.endpoint
         t35_ns = round(3.5 * line.serial.char_time_s * NS_PER_S) if line.is_serial else 0
@@ -126,16 +97,12 @@ class ModbusBus:
         self._on_offline = on_offline
         self._offset = offset
         self._coming: PendingConfig | None = None
-        self._jobs: deque[BusJob] = deque()
-        self._awake = False
-        """Set when new work has arrived for the bus, whether `_serve` sleeps or not."""
-        self._sleeper: asyncio.Future[None] | None = None
+        self._jobs = JobQueue()
         self._idle = asyncio.Event()
         self._halted = False
-        self._alarm_until_ns = 0
-        """Until this time, devices that answer are polled with shortened timeouts, because one of them stopped
-        answering."""
         self.latency = response_times()
+        self._patience = Patience(config, self._turns, self.latency)
+        self._requests = DeviceRequests(config, clock, tags)
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 
@@ -186,24 +153,26 @@ class ModbusBus:
         """Queue a job ahead of all polls. If the queue is full or there is no connection, the job fails immediately."""
         if not self.connected:
             job.done(Unreachable(f"not connected: {self.error}", where=f"{self.config.name} {self.config.endpoint}"))
-        elif len(self._jobs) >= MAX_JOBS:
+        elif self._jobs.full:
             job.done(EndpointBusy("the bus has no room for another request", where=self.config.name))
         else:
-            self._jobs.append(job)
-            self._wake()
+            self._jobs.add(job)
+            self._wakeup.wake()
 
     def reconfigure(self, coming: PendingConfig) -> None:
         """Take over a new configuration between two polls: each device's part when no group of it is being read."""
         self._coming = coming
         if self._client is None:
             self._take_over()
-        self._wake()
+        self._wakeup.wake()
 
     def _take_over(self) -> None:
         coming, now_ns = self._coming, self._clock.monotonic_ns()
         assert coming is not None
         config = self.config = coming.bus
         self._turns.restate(config.probe_share)
+        self._patience.restate(config)
+        self._requests.restate(config)
         if self._client is not None:
             self._client.restate(
                 timeout_s=config.timeout_s, turnaround_s=config.turnaround_s, spacing_s=config.spacing_s
@@ -218,11 +187,6 @@ class ModbusBus:
         if all(d.driver.config is coming.devices[d.driver.config.name] for d in self.devices):
             self._coming = None
             coming.done.set()
-
-    def _wake(self) -> None:
-        self._awake = True
-        if self._sleeper is not None:
-            ring(self._sleeper)
 
     def totals(self) -> Counter[str]:
         """Return counters over all connections so far: requests, replies, timeouts and so on. `missed_polls` counts the
@@ -253,7 +217,7 @@ class ModbusBus:
     async def halt(self, timeout_s: float) -> None:
         """Stop sending. Return when the present request has ended, or after `timeout_s` seconds."""
         self._halted = True
-        self._wake()
+        self._wakeup.wake()
         if self._client is not None:
             try:
                 async with asyncio.timeout(timeout_s):
@@ -320,16 +284,15 @@ class ModbusBus:
         self.connected, self.error = False, str(error)
         for device in self.devices:
             self._offline(device, error)
-        while self._jobs:
-            self._jobs.popleft().done(error)
+        self._jobs.fail_all(error)
 
     async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
         unanswered = Unanswered(client)
         stream = self.config.endpoint.scheme in STREAMS
         while True:
-            self._awake = False
+            self._wakeup.reset()
             if client.units.late_ns:
-                self._heard_late(client)
+                self._patience.heard_late(self.devices, client.units, self._clock.monotonic_ns())
             if stream and unanswered.too_many(any(device.online for device in self.devices)):
                 raise ConnectionLost(
                     f"{MOST_UNANSWERED} consecutive requests were not answered: the gateway reconnects",
@@ -339,12 +302,12 @@ class ModbusBus:
                 self._take_over()
             if self._halted:
                 self._idle.set()
-                await self._sleep(None)
+                await self._wakeup.sleep(None)
                 continue
             now_ns = self._clock.monotonic_ns()
             wake_ns = now_ns + NS_PER_S
             if self._jobs:
-                job, wake_ns = self._next_job(client, now_ns)
+                job, wake_ns = self._jobs.next(client.units, now_ns)
                 if job is not None:
                     await self._run_job(job)
                     continue
@@ -358,18 +321,7 @@ class ModbusBus:
                 await self._poll(client, device, group)
                 backoff.reset()
             else:
-                await self._sleep(min(at_ns, wake_ns))
-
-    def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[BusJob | None, int]:
-        """Return the first queued job whose unit needs no more pause, or None, and the time at which to check again."""
-        wake_ns = now_ns + NS_PER_S
-        for place, job in enumerate(self._jobs):
-            ready_ns = client.units.spaced_ns(job.driver.config.address)
-            if ready_ns <= now_ns:
-                del self._jobs[place]
-                return job, now_ns
-            wake_ns = min(wake_ns, ready_ns)
-        return None, wake_ns
+                await self._wakeup.sleep(min(at_ns, wake_ns))
 
     async def _carry_guest(self) -> bool:
         """Carry out one waiting request of a bridge client. Return False if there was none."""
@@ -381,23 +333,6 @@ class ModbusBus:
         await self.guests.carry_out(guest, client, framing_of(self.config.endpoint) == "rtu")
         return True
 
-    async def _sleep(self, until_ns: int | None) -> None:
-        """Sleep until `until_ns`, or until `_wake` is called; with None, only until `_wake` is called."""
-        if self._awake:
-            return
-        loop, end = asyncio.get_running_loop(), None
-        if until_ns is None:
-            self._sleeper = loop.create_future()
-        else:
-            left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
-            self._sleeper, end = start_timeout(loop, left_s if left_s > 0.0 else 0.0)
-        try:
-            await self._sleeper
-        finally:
-            self._sleeper = None
-            if end is not None:
-                end()
-
     async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
         """Use the bus once for a device: for one transaction of a group, or for the first contact."""
         begun_ns = self._clock.monotonic_ns()
@@ -408,10 +343,10 @@ class ModbusBus:
                 device.tried, device.asked_ns = True, begun_ns
                 if device.timeout_ns:
                     client.units.hurry(unit, device.timeout_ns / NS_PER_S)
-                group = await self._bring_online(device)
+                group = await self._requests.bring_online(device)
             elif not device.alone:
-                client.units.hurry(unit, self._patience_s(device, begun_ns))
-            await self._turn(device, group)
+                client.units.hurry(unit, self._patience.timeout_s(device, begun_ns))
+            await self._requests.turn(device, group)
         except ConnectionLost:
             raise
         except ReplyTimeout as e:
@@ -429,33 +364,18 @@ class ModbusBus:
             if client.units.hurried(unit):
                 client.units.relax(unit)
 
-    def _patience_s(self, device: DeviceState, now_ns: int) -> float:
-        """Return the timeout in seconds for a device that is online, while other devices also need the bus."""
-        if now_ns < self._alarm_until_ns:
-            return self._turns.short_s(device, self.latency.recent_longest_ns, self.config.timeout_s)
-        return self._own_s(device)
-
-    def _own_s(self, device: DeviceState) -> float:
-        stated_s = device.driver.config.timeout_s
-        return self.config.timeout_s if stated_s is None else stated_s
-
     def _silent(
         self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
     ) -> None:
         """Handle a device that did not answer. If it answered before, its request is repeated while repetitions are left.
 
-        The other devices are polled meanwhile. Several devices often stop answering together, because of a cut cable. So for a
-        while the other devices are also polled with shortened timeouts. Otherwise each absent device would cost its whole
-        timeout, while the devices that still answer wait.
+        The other devices are polled meanwhile.
         """
         if not probed and not device.alone:
-            shortened = self._patience_s(device, begun_ns) < self._own_s(device)
-            if begun_ns >= self._alarm_until_ns:
-                self._turns.doubt_ns = begun_ns
-            self._alarm_until_ns = self._clock.monotonic_ns() + ALARM_NS
+            shortened = self._patience.fell_silent(device, begun_ns, self._clock.monotonic_ns())
             # A missing reply after a shortened timeout proves nothing. A slow device is tried again, with more time once its
             # late reply was received.
-            tries = max(self._retries_of(device), 1 if shortened else 0)
+            tries = max(self._requests.retries_of(device), 1 if shortened else 0)
             if device.reading is not None and device.silences < tries:
                 device.silences += 1
                 device.poll_errors += 1
@@ -474,72 +394,6 @@ class ModbusBus:
         device.fits = device.fits and probed and not answered_first
         device.last_cost_ns = clear_ns - begun_ns if answered_first else 0
         self._turns.failed(device, begun_ns, now_ns, clear_ns)
-
-    def _heard_late(self, client: ModbusClient) -> None:
-        """Handle devices that answered after their shortened timeout but within their own.
-
-        These devices are present, so they are asked again at once, with more time."""
-        for device in self.devices:
-            late_ns = client.units.late_ns.get(device.driver.config.address)
-            if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
-                device.late_ns, device.next_try_ns = max(device.late_ns, late_ns), self._clock.monotonic_ns()
-        client.units.late_ns.clear()
-
-    async def _bring_online(self, device: DeviceState) -> str:
-        """Contact a device for the first time, or again after a loss, and return the group to read first.
-
-        This checks the device's identity and reads the state of its mailboxes. If no identity is configured, the device is online
-        once it answers.
-        """
-        driver = device.driver
-        if driver.learnt.missing:
-            driver.ask_again()
-        await self._attempts(device, driver.identify)
-        if isinstance(driver, TransmitterDriver):
-            await self._attempts(device, driver.synchronise)
-        device.schedule.start(self._clock.monotonic_ns())
-        group = next(iter(device.schedule.due_ns), "")
-        # A device from which nothing is ever read counts as online, because no poll can show whether it is.
-        device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
-        if device.online:
-            device.error = ""
-            return group
-        return group if device.alone else min(device.schedule.due_ns, key=driver.cost)
-
-    async def _turn(self, device: DeviceState, group: str) -> None:
-        """Carry out the next transaction of `group`: its trigger, its first read, or a later read."""
-        if not group:
-            return
-        driver, reading = device.driver, device.reading
-        if reading is None:
-            now_ns = self._clock.monotonic_ns()
-            device.reading_due_ns = device.schedule.due_ns[group]
-            device.schedule.took(group, now_ns)
-            if driver.profile.form.trigger is not None and await self._trigger(device, group, now_ns):
-                return
-            reading = device.reading = driver.begin(group)
-        going = reading
-        if await self._attempts(device, lambda: driver.read_next(going), later=True):
-            device.reading = None
-            driver.finish(reading)
-
-    async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
-        """Trigger a device that measures on request. Return True if its values have to be read later.
-
-        The bus serves other devices meanwhile."""
-        driver = device.driver
-        wait_ms = driver.trigger_wait_ms(group)
-        if not wait_ms or group in device.triggered:
-            device.triggered.discard(group)
-            return False
-        if driver.may_trigger:
-            await self._attempts(device, driver.trigger)
-            device.triggered.add(group)
-            device.schedule.defer(group, self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
-        else:
-            names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
-            self._tags.put_bad(names, Reason.NOT_SAMPLING)
-        return True
 
     def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
         """Handle a device that answers but refuses this group. Its other groups are still read.
@@ -581,7 +435,7 @@ class ModbusBus:
             job.done(Unreachable(f"the device is lost: {device.error}", where=job.driver.config.where))
             return
         try:
-            await self._attempts(device, job.run)
+            await self._requests.attempts(device, job.run)
         except ConnectionLost as e:
             job.done(e)
             raise
@@ -589,27 +443,3 @@ class ModbusBus:
             job.done(e)
         else:
             job.done(None)
-
-    def _retries_of(self, device: DeviceState) -> int:
-        stated = device.driver.config.retries
-        return self.config.retries if stated is None else stated
-
-    async def _attempts(
-        self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False
-    ) -> T:
-        """Send a request up to `1 + retries` times, as long as it fails with a communication error.
-
-        A request that the device refuses is not repeated, and a device that was away is asked only once. With `later`, a timeout
-        is raised without a repetition if other devices wait for the bus.
-        """
-        retries = self.config.retries
-        if device is not None:
-            retries = self._retries_of(device) if device.retries_left else 0
-        while True:
-            try:
-                return await what()
-            except WireError as e:
-                wait = later and isinstance(e, ReplyTimeout) and device is not None and not device.alone
-                if not retries or wait:
-                    raise
-                retries -= 1

@@ -13,7 +13,7 @@ import asyncio
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 
 from msgspec.structs import replace
 
@@ -36,22 +36,21 @@ from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
 from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
-from fieldtwin.gateway.protocols.canopen.emcy_log import EmcyLog
-from fieldtwin.gateway.protocols.canopen.lss.frames import UNCONFIGURED, LssAddress
 from fieldtwin.gateway.protocols.canopen.lss.master import LssMaster
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
-from fieldtwin.gateway.protocols.canopen.nmt.states import NmtCommand, NmtState, NodeEvent, conflict_text
-from fieldtwin.gateway.protocols.canopen.pdo.sync import FrameProducer, SyncProducer, TimeProducer
+from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState, NodeEvent, conflict_text
 from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bus import Ended, status_of
-from fieldtwin.gateway.runtime.buses.bus_turns import rates_of
-from fieldtwin.gateway.runtime.buses.modbus_bus import MOST_LOCALS, reason_of
-from fieldtwin.gateway.runtime.buses.node_writes import Done, InOrder, NodeWrites
+from fieldtwin.gateway.runtime.buses.bus import MOST_LOCALS, Ended, status_of
+from fieldtwin.gateway.runtime.buses.canopen.boot import assign, bring_up
+from fieldtwin.gateway.runtime.buses.canopen.node_status import NodeStatus, device_status
+from fieldtwin.gateway.runtime.buses.canopen.node_writes import Done, InOrder, NodeWrites
+from fieldtwin.gateway.runtime.buses.canopen.producing import Producing
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
-from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule
-from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, EmcyStatus, TpdoStatus
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, rates_of
+from fieldtwin.gateway.runtime.buses.reasons import reason_of
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
@@ -64,42 +63,6 @@ def _nobody(driver: CanopenDriver) -> None:
 
 START_AGAIN_S = 2.0
 """Delay in seconds between a node's leaving OPERATIONAL by itself and the next start."""
-
-
-@dataclass
-class NodeStatus:
-    """The bus's record of one node. `wanted` is set while the node has to be brought up (again), `up` while it is
-    up."""
-
-    driver: CanopenDriver
-    writes: NodeWrites
-    schedule: PollSchedule
-    online: bool = False
-    error: str = "not asked yet"
-    boots: int = 0
-    conflicts: int = 0
-    conflict: str = ""
-    """The last sign of a second node with this node ID. It is kept, because nothing proves that the second node was removed."""
-    emcy_log: EmcyLog = field(default_factory=EmcyLog)
-    bring_ups: int = 0
-    polls: int = 0
-    poll_errors: int = 0
-    reading: bool = False
-    """A group is being read."""
-    polling: asyncio.Task[None] | None = None
-    start_again: asyncio.TimerHandle | None = None
-    wanted: asyncio.Event = field(default_factory=asyncio.Event)
-    up: asyncio.Event = field(default_factory=asyncio.Event)
-    booted: asyncio.Event = field(default_factory=asyncio.Event)
-    backoff: Backoff = field(init=False)
-
-    def __post_init__(self) -> None:
-        config = self.driver.config
-        self.backoff = Backoff(config.backoff_first_s, config.backoff_limit_s)
-
-    @property
-    def emcys(self) -> int:
-        return self.emcy_log.total
 
 
 class CanopenBus:
@@ -131,7 +94,7 @@ class CanopenBus:
         self._coming: PendingConfig | None = None
         self._nursery: Nursery | None = None
         self._stopping = False
-        self._not_produced = 0
+        self._producing = Producing(clock)
         self.sync_watch = SyncWatch()
         self._connector = connector
         self._clock = clock
@@ -185,7 +148,7 @@ class CanopenBus:
         """Return the number of SYNC, TIME and repeated RPDO messages that were not sent.
 
         The bus did not take them in time, or their time passed while the gateway did not run."""
-        return self._not_produced + sum(status.writes.not_sent for status in self.nodes.values())
+        return self._producing.not_produced + sum(status.writes.not_sent for status in self.nodes.values())
 
     def takes(self, device: str, tag: str) -> bool:
         """Return whether a write of this tag can be sent now: the node is up, and also OPERATIONAL if the tag goes by
@@ -235,38 +198,7 @@ class CanopenBus:
 
     def device_statuses(self, now_ns: int) -> dict[str, DeviceStatus]:
         return {
-            node.driver.config.name: DeviceStatus(
-                bus=self.config.name,
-                address=node.driver.node,
-                online=node.online,
-                error=node.error or node.conflict,
-                conflicts=node.conflicts,
-                conflict=node.conflict,
-                unstarted=self._unstarted(node),
-                identity_error=node.driver.identity_error,
-                boots=node.boots,
-                bring_ups=node.bring_ups,
-                emcys=node.emcys,
-                emcy=[f"{code:04X}h" for code in node.emcy_log.active],
-                emcy_log=[
-                    EmcyStatus(
-                        age_ms=(now_ns - entry.t_ns) // NS_PER_MS,
-                        code=f"{entry.emcy.code:04X}h",
-                        meaning=entry.emcy.meaning,
-                        register=entry.emcy.register,
-                        vendor=entry.emcy.vendor.hex(),
-                    )
-                    for entry in node.emcy_log.entries
-                ],
-                errors=node.driver.malformed_pdos + node.poll_errors,
-                polls=node.polls,
-                tpdos={
-                    str(t.number): TpdoStatus(cob_id=f"{t.cob_id:03X}h", tags=list(t.tags), frames=t.frames)
-                    for t in node.driver.tpdos
-                },
-                rpdos={str(r.number): [tag for tag in r.tags if tag] for r in node.driver.rpdos},
-                rpdos_sent=node.writes.frames,
-            )
+            node.driver.config.name: device_status(node, self.config.name, self._unstarted(node), now_ns)
             for node in self.nodes.values()
         }
 
@@ -334,8 +266,8 @@ class CanopenBus:
                             nursery.start(self._poll_unmapped(status), f"{name} tags without a TPDO")
                         if status.driver.config.poll:
                             status.polling = nursery.start(self._poll(status), f"{name} polls")
-                    for producer in self._producers():
-                        nursery.start(self._produce(producer, master), f"{self.config.name} {producer.name}")
+                    for producer in self._producing.producers(self.config.canopen) if self._allow_writes else ():
+                        nursery.start(self._producing.run(producer, master), f"{self.config.name} {producer.name}")
                     backoff.reset()
                     await nursery.wait()
             except ConnectionLost as e:
@@ -351,31 +283,6 @@ class CanopenBus:
                 self._taken_over()
                 self.connected = False
                 await connection.aclose()
-
-    def _producers(self) -> list[FrameProducer]:
-        """Return the SYNC and TIME producers that the system file configures, if writing is allowed."""
-        wanted, now_ns = self.config.canopen, self._clock.monotonic_ns()
-        made: list[FrameProducer] = []
-        if wanted.sync_ms and self._allow_writes:
-            made.append(SyncProducer(wanted.sync_ms * 1000, now_ns, overflow=wanted.sync_counter))
-        if wanted.time_ms and self._allow_writes:
-            made.append(TimeProducer(wanted.time_ms, now_ns))
-        return made
-
-    async def _produce(self, producer: FrameProducer, master: CanopenMaster) -> None:
-        """Send each message when it is due. A message that the bus does not take within one period is dropped and
-        counted."""
-        while True:
-            await self._clock.sleep_until_ns(producer.next_ns)
-            missed = producer.missed
-            frame = producer.due(self._clock.monotonic_ns(), self._clock.utc_ns())
-            self._not_produced += producer.missed - missed
-            if frame is not None:
-                try:
-                    async with asyncio.timeout(producer.period_ns / NS_PER_S):
-                        await master.send(frame)
-                except TimeoutError:
-                    self._not_produced += 1
 
     async def _pause(self, seconds: float) -> None:
         await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(seconds * NS_PER_S))
@@ -413,9 +320,9 @@ class CanopenBus:
             status.wanted.clear()
             status.booted.clear()
             try:
-                await self._bring_up(status.driver)
+                await bring_up(status.driver, self._audit, self._allow_writes)
             except ReplyTimeout as e:
-                self._failed(status, await self._assign(status.driver, e))
+                self._failed(status, await self._assigned(status.driver, e))
                 await self._rest(status)
             except ConnectionLost:
                 raise
@@ -487,49 +394,11 @@ class CanopenBus:
         self._tags.put_bad(status.driver.tag_names, reason_of(error))
         status.wanted.set()
 
-    async def _assign(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
-        """Assign the expected node ID, which no node has, over LSS to the node with the configured LSS address.
-
-        Return the error of a failed assignment, otherwise `error`.
-        """
-        address = driver.config.canopen.lss
-        if address is None or self._lss is None or not self._allow_writes:
+    async def _assigned(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
+        """Assign the node ID of a node that did not answer; return the error as `assign` does."""
+        if self._lss is None or not self._allow_writes:
             return error
-        try:
-            self._note_lss(driver, address)
-            had = await self._lss.assign(address, driver.node)
-            if had not in (UNCONFIGURED, driver.node):
-                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # the node takes its new ID when it boots
-        except ReplyTimeout:
-            return error  # no node with this LSS address is on the bus
-        except ConnectionLost:
-            raise
-        except FieldtwinError as e:
-            return e.at(f"{driver.config.where}, LSS")
-        return error
-
-    def _note_lss(self, driver: CanopenDriver, address: LssAddress) -> None:
-        what = f"node id {driver.node} for {address}"
-        self._audit.note("lss", driver.config.name, by="start-up", result="asked", what=what)
-
-    async def _bring_up(self, driver: CanopenDriver) -> None:
-        await driver.identify()
-        await driver.read_once()
-        if not self._allow_writes:
-            await driver.adopt()
-            return
-        name = driver.config.name
-        if await driver.to_be_halted():
-            self._audit.note("nmt", name, by="start-up", result="asked", what="pre-operational")
-            driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))
-            await driver.send()
-        if what := driver.to_configure:
-            self._audit.note("sdo", name, by="start-up", result="asked", what=what)
-        await driver.configure()
-        if driver.config.start:
-            self._audit.note("nmt", name, by="start-up", result="asked", what="start")
-            driver.consumer.observe(COMMAND(b"", "nmt_start"))
-            await driver.send()
+        return await assign(driver, self._lss, self._audit, error)
 
     def _restate_limits(self, driver: CanopenDriver) -> None:
         """Set the age limits of the node's values again, because they depend on whether its heartbeat is received."""

@@ -5,15 +5,15 @@ Pure: times are monotonic nanoseconds, passed in. This module must not know a co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import GroupReading, RegisterDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot, spread
-from fieldtwin.gateway.runtime.buses.probing import MARGIN_NS, Probing
+from fieldtwin.gateway.runtime.buses.modbus.probing import MARGIN_NS, Probing
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, PollSlot, rates_of
 
 FOREVER_NS = 2**62
 """The end of the free time of a bus on which no poll is planned."""
@@ -70,17 +70,6 @@ def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]
     rates = rates_of([driver.config for driver in drivers], offset)
     alone = len(drivers) == 1
     return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
-
-
-def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, PollSlot]]:
-    """Return the rates of the groups of one bus's devices, by device name."""
-    groups: list[tuple[tuple[str, str], int]] = []
-    stated: dict[tuple[str, str], int] = {}
-    for config in configs:
-        groups += [((config.name, group), every_ms) for group, every_ms in config.poll.items()]
-        stated |= {(config.name, group): phase_ms for group, phase_ms in config.phase.items()}
-    rates = spread(groups, stated, offset)
-    return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
 
 
 def _state(driver: RegisterDriver, rates: dict[str, PollSlot], alone: bool) -> DeviceState:

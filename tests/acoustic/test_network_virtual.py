@@ -119,6 +119,7 @@ def test_many_seeds_run_and_the_ledger_skips_its_entries(tmp_path: Path) -> None
     assert isinstance(again.exception, UsageError)
 
 
+@pytest.mark.long
 def test_the_minimal_faults_of_a_failing_seed_become_a_scenario_of_the_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,6 +33,7 @@ def ended(folder: Path, *args: str, unread: str) -> subprocess.CompletedProcess[
         os.close(writing)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unread", ["stdout", "stderr"])
 def test_a_verdict_is_the_same_with_any_reader(tmp_path: Path, unread: str) -> None:
     done = ended(tmp_path, "test", "x.scenario.yaml", unread=unread)

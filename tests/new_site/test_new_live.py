@@ -148,6 +148,7 @@ def emulated(tmp_path: Path, what: str, *args: str) -> Iterator[str]:
         process.communicate(timeout=PATIENCE_S)
 
 
+@pytest.mark.long
 def test_a_scan_finds_a_device_that_identifies_itself(tmp_path: Path) -> None:
     with emulated(tmp_path, "sunspec-inverter-103", *SUNSPEC) as url:
         done = run(tmp_path, "new", "plant", "--scan", f"{url}#125-126")
@@ -157,6 +158,7 @@ def test_a_scan_finds_a_device_that_identifies_itself(tmp_path: Path) -> None:
     assert run(tmp_path, "test", "plant").returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.timeout(120)
 def test_a_scan_drafts_a_profile_for_an_unknown_device(tmp_path: Path) -> None:
     (tmp_path / "tank.yaml").write_text(TANK)
@@ -172,6 +174,7 @@ def test_a_scan_drafts_a_profile_for_an_unknown_device(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} <= {"plant", "tank.yaml", "run"}, "the dump was temporary"
 
 
+@pytest.mark.long
 def test_a_scan_that_finds_nothing_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "tank.yaml").write_text(TANK)
     with emulated(tmp_path, "./tank.yaml") as url:
@@ -181,6 +184,7 @@ def test_a_scan_that_finds_nothing_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "plant").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("control", ["python", "st", "none", "own"])
 def test_a_new_site_runs_in_real_time(tmp_path: Path, control: str) -> None:
     devices = ("tank=example", "inclinometer-cia410", "ctd-reference@tcp://192.0.2.7")
@@ -191,6 +195,7 @@ def test_a_new_site_runs_in_real_time(tmp_path: Path, control: str) -> None:
     assert done.stdout.splitlines()[-1] == "ok"
 
 
+@pytest.mark.long
 def test_a_device_without_readable_registers_is_left_out_and_named(tmp_path: Path) -> None:
     (tmp_path / "far.yaml").write_text(TANK.replace("30001", "35001"))
     with emulated(tmp_path, "./far.yaml") as url:

@@ -55,6 +55,7 @@ def test_a_new_version_is_written_into_the_names_of_wheels(script: ModuleType, m
     assert script.corrected(LINES) == LINES.replace("0.1.0", "0.2.0")
 
 
+@pytest.mark.long
 def test_no_message_has_a_command_of_its_own() -> None:
     for folder in ("fieldtwin", "gateway", "plc", "emulators", "twin"):
         for path in (ROOT / folder).rglob("*.py"):

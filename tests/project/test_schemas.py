@@ -30,6 +30,7 @@ def test_the_script_finds_no_difference() -> None:
     assert subprocess.run([sys.executable, str(CHECKOUT / "scripts" / "schemas")], check=False).returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["profiles", "examples", "tests/emulators/faults/scenarios"])
 def test_an_editor_shows_no_error_in_a_file_that_the_program_accepts(folder: str) -> None:
     files = check_site(CHECKOUT / folder).files

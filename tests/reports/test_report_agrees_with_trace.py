@@ -257,6 +257,7 @@ def test_the_headline_names_the_rule_that_broke_and_not_the_step_that_it_interru
     assert rule.t_ns - rule.since_ns == pytest.approx(2 * NS, abs=NS // 25)
 
 
+@pytest.mark.long
 def test_an_unreachable_probe_is_reported_with_its_endpoint_and_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,6 +35,7 @@ FAULTS = "faults: [{name: delay, device: tank, by_ms: 10, from: 0}]\n"
 FILES = {"shed.yaml": SITE, "shed.prototype.yaml": PROTOTYPE, "tank.yaml": PROFILE, "faults.yaml": FAULTS}
 
 
+@pytest.mark.long
 def test_files_that_change_while_a_run_starts_do_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "r"))
     for name, text in FILES.items():

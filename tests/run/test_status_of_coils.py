@@ -36,6 +36,7 @@ tags:
 }
 
 
+@pytest.mark.long
 def test_a_coil_that_a_program_commands_and_a_named_value_are_in_the_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

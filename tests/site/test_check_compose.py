@@ -49,6 +49,7 @@ def test_a_new_site_of_each_kind_has_no_errors(tmp_path: Path, control: str) -> 
     assert check_site(folder, (), command_lines).files["compose.yaml"] == "compose"
 
 
+@pytest.mark.long
 def test_the_compose_file_of_the_checkout_has_no_errors() -> None:
     found = check_site(CHECKOUT, (), command_lines)
     assert found.files["docker-compose.yml"] == "compose"

@@ -100,6 +100,7 @@ def test_each_reference_to_a_renamed_program_is_reported(site: Path) -> None:
     assert all("relay." in error.message and "relais." in error.hint for error in errors), [str(e) for e in errors]
 
 
+@pytest.mark.long
 def test_each_reference_to_a_renamed_tag_of_a_profile_is_reported(site: Path) -> None:
     profile = (data_root() / "profiles" / "devices" / "ctd-reference.yaml").read_text()
     (site / "ctd-reference.yaml").write_text(re.sub(r"^  pressure:", "  depth:", profile, flags=re.MULTILINE))

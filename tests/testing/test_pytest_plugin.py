@@ -118,6 +118,7 @@ def pytest_collection_finish():
 """A user's environment with pytest and fieldtwin without its dependencies; nothing is imported before a test runs."""
 
 
+@pytest.mark.long
 def test_the_docs_examples_run_with_nothing_but_pytest_installed(pytester: pytest.Pytester) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (HERE / "docs/how-to/pytest.md").read_text(), re.DOTALL)
     for block in blocks:
@@ -171,6 +172,7 @@ def test_a_running_plc_is_steered(prototype, plc):
     assert properties == ["METER-3", "METER-7"]
 
 
+@pytest.mark.long
 def test_workers_of_xdist_do_not_meet(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """

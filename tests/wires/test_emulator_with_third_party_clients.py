@@ -122,6 +122,7 @@ def test_pymodbus_as_a_client(kind: str, tmp_path: Path) -> None:
     run(main())
 
 
+@pytest.mark.long
 @needs_openssl
 def test_fieldtwin_emulate_puts_one_device_on_every_wire(tmp_path: Path) -> None:
     pki = make_pki(tmp_path)

@@ -12,6 +12,7 @@ import termios
 from pathlib import Path
 from typing import Any
 
+import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.canopen.eds.dictionary import parse_eds
@@ -57,6 +58,7 @@ async def answer_at(end: PtyEnd, speed: int) -> None:
         os.close(port)
 
 
+@pytest.mark.long
 def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))

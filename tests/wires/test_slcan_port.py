@@ -160,6 +160,7 @@ def test_status_reports_bus_off_and_queued_frames_go_out_after_it() -> None:
     run(main())
 
 
+@pytest.mark.long
 def test_a_client_that_does_not_read_loses_frames_alone() -> None:
     async def main() -> None:
         async with bench(paced=False) as (server, port):

@@ -27,6 +27,7 @@ def _emulated(log: Path, what: str, bus: str) -> Iterator[None]:
             assert process.wait(30) == 0, log.read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("second", ["drive-cia402", "profiles/devices/io-cia401.eds"])
 def test_each_process_reports_the_other_once(tmp_path: Path, second: str) -> None:
     logs = [tmp_path / "first.log", tmp_path / "second.log"]

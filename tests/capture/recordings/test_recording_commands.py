@@ -57,6 +57,7 @@ def called(command: Any, *words: object) -> tuple[int, dict[str, Any]]:
     return done.return_value, json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.long
 def test_a_device_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
     device, twin, out = (
         f"rtu:{tmp_path}/dev?baudrate=115200",

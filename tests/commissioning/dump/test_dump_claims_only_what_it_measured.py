@@ -61,6 +61,7 @@ def silent_dump(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]
         return run_dump(url, out, "holding:0..2000", "--json"), out
 
 
+@pytest.mark.long
 def test_silence_is_not_reported_as_a_refusal(silent_dump: tuple[Result, Path]) -> None:
     result, _ = silent_dump
     found = json.loads(result.stdout)["maps"][0]
@@ -231,6 +232,7 @@ def test_blocks_of_eight_that_give_single_registers_or_pairs_are_found(
     assert readable == {int(a) for a in answer}
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(st.lists(block, max_size=4), st.sampled_from(["silent", "refuse"]), st.integers(1, 400))
 def test_reported_addresses_are_the_requested_ones(

@@ -97,6 +97,7 @@ def run_check(
     return done.returncode, {r["id"]: (r["verdict"], r["reason"]) for r in results}, done.stderr
 
 
+@pytest.mark.long
 def test_pymodbus_hands_a_late_rtu_reply_to_the_next_request(tmp_path: Path) -> None:
     code, found, said = run_check(
         tmp_path, "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "13,14,16",
@@ -190,6 +191,7 @@ while True:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("again", "verdict"), [(True, "passed"), (False, "failed")])
 def test_a_port_that_is_unplugged_comes_back_under_its_name(tmp_path: Path, again: bool, verdict: str) -> None:
     code, found, said = run_check(

@@ -42,6 +42,7 @@ def _run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(argv, capture_output=True, text=True, timeout=120, env=environment(), cwd=folder, check=False)
 
 
+@pytest.mark.long
 def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -> None:
     (tmp_path / "client.py").write_text(TAKES_ALL)
     words = [

@@ -69,6 +69,7 @@ def received(master: int) -> bytes:
         return b""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command",
     [

@@ -138,6 +138,7 @@ def test_the_table_has_every_fault() -> None:
     assert {row.name for row in ROWS} == set(FAULTS)
 
 
+@pytest.mark.long
 def test_each_fault_has_its_effect_and_ends_with_its_time() -> None:
     run = through([(row.wire, row.name, row.said) for row in ROWS], _by_hand)
     assert run.errors == []

@@ -101,6 +101,7 @@ VirtualLoop().run_until_complete(main())
 """
 
 
+@pytest.mark.long
 def test_sigterm_ends_a_virtual_run_whose_callback_never_ends() -> None:
     """One signal is sufficient: logic in Python has no separate limit."""
     with subprocess.Popen([sys.executable, "-c", SPINS], stdout=subprocess.PIPE, text=True) as child:

@@ -68,6 +68,7 @@ def judged(folder: Path, program: str) -> tuple[ScenarioResult, str]:
     return run_virtual(load_scenario(path)), path.read_text()
 
 
+@pytest.mark.long
 def test_a_crash_in_the_first_scan_is_blamed_on_no_fault(folder: Path) -> None:
     code, told = campaign(CRASHES_AT_ONCE)
     assert code == 1
@@ -81,6 +82,7 @@ def test_a_crash_in_the_first_scan_is_blamed_on_no_fault(folder: Path) -> None:
     assert result.verdict is Verdict.PASSED, result.reason
 
 
+@pytest.mark.long
 def test_a_crash_because_of_a_fault_is_blamed_on_that_fault(folder: Path) -> None:
     code, told = campaign(CRASHES_ON_BAD_LEVEL)
     assert code == 1

@@ -72,6 +72,7 @@ def test_a_state_that_does_not_follow_from_its_period_is_used_as_reported() -> N
     assert known.state("").programs["relay"] == {"period": 5, "period_s": 5, "state": 2}
 
 
+@pytest.mark.long
 def test_a_twin_queries_in_a_separate_process_and_an_unanswered_command_is_refused() -> None:
     """Real processes: a forbidden command, an allowed one, and one without an answer in time."""
 
@@ -177,6 +178,7 @@ def test_errors_in_a_query_are_reported_with_their_line(tmp_path: Path, text: st
     assert ":2" in str(caught.value)
 
 
+@pytest.mark.long
 def test_output_of_control_logic_is_not_an_answer_and_its_crash_is_reported(tmp_path: Path) -> None:
     """A custom system, whose program prints when it is imported, or ends the process."""
     (tmp_path / "loud.py").write_text(

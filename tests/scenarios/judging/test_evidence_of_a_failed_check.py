@@ -127,6 +127,7 @@ def test_a_passing_scenario_shows_no_frames(tmp_path: Path) -> None:
 LOADED = ("-p", "fieldtwin.pytest_plugin", "-p", "no:randomly", "-p", "no:hypothesispytest")
 
 
+@pytest.mark.long
 def test_a_failed_assertion_of_the_pytest_fixture_prints_the_exchanges_on_lines(pytester: pytest.Pytester) -> None:
     plant(pytester.path)
     pytester.makepyfile(

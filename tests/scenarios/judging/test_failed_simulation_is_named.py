@@ -82,6 +82,7 @@ def test_a_scenario_fails_and_names_file_line_and_exception(folder: Path, target
     assert "in line 7: ValueError: no pond" in result.reason
 
 
+@pytest.mark.long
 def test_a_run_names_it_in_its_errors(folder: Path) -> None:
     command = [sys.executable, "-m", "fieldtwin", "run", "pond.yaml", "--prototype", "--for", "3s", "--json"]
     ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=60)

@@ -73,6 +73,7 @@ def test_a_failure_stays_a_failure_and_also_reports_its_faults(tmp_path: Path) -
     assert result.faults[0].struck == 0
 
 
+@pytest.mark.long
 def test_faults_are_counted_in_processes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     idle = "  - fault: {id: idle, name: silence, device: modem, function: 23}\n"
@@ -110,6 +111,7 @@ def test_a_run_reports_how_often_each_of_its_faults_took_effect(tmp_path: Path) 
     assert [(one["id"], one["struck"] > 0) for one in summary["faults"]] == [("lost", True), ("idle", False)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seeds", "for_", "ended"), [("1..2", "10s", "inconclusive"), ("3..4", "6min", "ok")])
 def test_a_campaign_reports_how_often_faults_took_effect_and_needs_one(seeds: str, for_: str, ended: str) -> None:
     words = ["observatory", "--for", for_, "--seeds", seeds, "--faults", "random"]

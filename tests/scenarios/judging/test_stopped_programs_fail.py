@@ -95,6 +95,7 @@ def test_a_scenario_can_ask_for_a_program_that_stops(tmp_path: Path) -> None:
     assert "the PLC did not stop" in runs.reason
 
 
+@pytest.mark.long
 def test_terminal_html_and_junit_name_file_and_line_of_the_logic(tmp_path: Path) -> None:
     path = plant(tmp_path, DIVIDES_BY_ZERO, NO_FAULT)
     result = run(path)

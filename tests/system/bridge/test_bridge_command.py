@@ -96,6 +96,7 @@ def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
     run(main(), timeout_s=40)
 
 
+@pytest.mark.long
 def test_pymodbus_clients_through_the_bridge_are_read_only_by_default(tmp_path: Path) -> None:
     async def reads(port: int, unit: int) -> None:
         client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=10)

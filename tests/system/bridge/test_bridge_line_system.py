@@ -91,6 +91,7 @@ def check_a_client(port: Path) -> None:
     assert "timed out" in text, text  # a request to a different unit: on a shared line, the bridge ignores it
 
 
+@pytest.mark.long
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_a_client_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ def a_system(folder: Path) -> Path:
     return folder / "observatory.yaml"
 
 
+@pytest.mark.long
 def test_an_hmi_and_a_bridge_client_with_a_running_gateway(tmp_path: Path) -> None:
     system = a_system(tmp_path / "systems")
     with fieldtwin(tmp_path / "run", "run", str(system), "--prototype", "--instance", "s") as program:

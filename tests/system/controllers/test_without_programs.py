@@ -49,6 +49,7 @@ def site(tmp_path: Path) -> Path:
     return tmp_path / "site.yaml"
 
 
+@pytest.mark.long
 def test_its_prototype_runs_and_no_view_speaks_of_a_plc(site: Path, tmp_path: Path) -> None:
     ended = run_to_end(tmp_path / "r", "run", str(site), "--prototype", "--for", "7s")
     assert ended.process.returncode == 0, ended.err
@@ -60,6 +61,7 @@ def test_its_prototype_runs_and_no_view_speaks_of_a_plc(site: Path, tmp_path: Pa
     no_tracebacks(tmp_path / "r")
 
 
+@pytest.mark.long
 def test_the_same_file_runs_a_plant(site: Path, tmp_path: Path) -> None:
     port = site.read_text(encoding="utf-8").partition("127.0.0.1:")[2].partition('"')[0]
     with fieldtwin(

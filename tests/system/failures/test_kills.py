@@ -45,6 +45,7 @@ def make_active(run: Fieldtwin, instance: str, field: Asking, sequence: int = 1)
     wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0001", 10, "the sensor samples")
 
 
+@pytest.mark.long
 def test_a_killed_plc_leaves_the_sensor_safe_and_the_run_names_the_dead_process(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, *PROTOTYPE, "--instance", "p") as run:
         field = run.control("p", "field")
@@ -128,6 +129,7 @@ def test_a_killed_gateway_turns_the_plcs_inputs_bad(tmp_path: Path) -> None:
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.long
 def test_a_field_simulator_that_dies_and_returns_and_a_parent_that_is_killed(tmp_path: Path) -> None:
     """One system through all stages: lost, returned, written again; then the parent dies and the gateway leaves safe outputs."""
     ports = {name: free_port() for name in ("control", "lan", "can", "far")}

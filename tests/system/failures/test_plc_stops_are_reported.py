@@ -9,6 +9,7 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 from procs import every_device_online, fieldtwin, run_to_end
 
 PROFILE = """device: own/tank
@@ -45,6 +46,7 @@ class Once(Program):
 """
 
 
+@pytest.mark.long
 def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> None:
     (tmp_path / "tank.yaml").write_text(PROFILE)
     (tmp_path / "shed.yaml").write_text(SYSTEM)
@@ -55,6 +57,7 @@ def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> No
     assert "PLC: stopped without a request once, and restarted after that; the last time: program once" in done.out
 
 
+@pytest.mark.long
 def test_a_run_whose_gateway_died_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, "run", "observatory", "--prototype", "--for", "6s") as run:
         gateway = run.control("observatory", "gateway")

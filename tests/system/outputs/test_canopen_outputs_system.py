@@ -7,6 +7,7 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 from procs import fieldtwin, held_by, no_tracebacks, wait_for
 
 SYSTEM = """\
@@ -69,6 +70,7 @@ def write(folder: Path) -> str:
     return str(folder / "winch.yaml")
 
 
+@pytest.mark.long
 def test_a_plc_runs_a_drive_and_a_killed_plc_leaves_it_stopped(tmp_path: Path) -> None:
     system = write(tmp_path)
     with fieldtwin(tmp_path, "run", system, "--prototype", "--instance", "w", "--json") as run:

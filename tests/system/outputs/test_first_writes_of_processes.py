@@ -35,6 +35,7 @@ def running(plc: Asking) -> bool:
     return bool(plc("get", brief=True)["state"] == "running")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("language", ["st", "python"])
 def test_a_plant_is_not_written_with_values_that_were_never_read(tmp_path: Path, language: str) -> None:
     with devices(tmp_path, language=language) as system:

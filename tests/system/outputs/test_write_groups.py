@@ -49,6 +49,7 @@ def test_a_modbus_drive_is_not_started_with_its_old_speed(tmp_path: Path, system
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("by_rpdo", [True, False], ids=["in one RPDO", "over SDO"])
 def test_a_canopen_drive_is_not_started_with_its_old_speed(tmp_path: Path, *, by_rpdo: bool) -> None:
     system = WINCH_SYSTEM.replace(

@@ -133,6 +133,7 @@ def did(site: Path, environment: dict[str, str], *words: str) -> subprocess.Comp
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words",
     [

@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import pytest
 from procs import fieldtwin, no_tracebacks, wait_for
 
 SYSTEM = """
@@ -50,6 +51,7 @@ devices:
 """
 
 
+@pytest.mark.long
 def test_a_prototype_of_real_devices(tmp_path: Path) -> None:
     folder = tmp_path / "systems"
     folder.mkdir()

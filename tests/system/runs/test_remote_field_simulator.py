@@ -11,6 +11,7 @@ from procs import CHECKOUT, every_device_online, fieldtwin, free_port, no_traceb
 RUN = ("run", "observatory", "--prototype", "--json", "--instance", "r")
 
 
+@pytest.mark.long
 def test_the_printed_command_finds_a_system_of_the_user(tmp_path: Path) -> None:
     """The bare name of a system finds only shipped ones and those in ./profiles."""
     site = tmp_path / "hall"

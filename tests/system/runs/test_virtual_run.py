@@ -34,6 +34,7 @@ def run(*words: str, hash_seed: str = "0") -> dict[str, Any]:
     return summary
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     first = run("--seed", "7", "--trace", str(tmp_path / "a.jsonl"))
     second = run("--seed", "7", "--trace", str(tmp_path / "b.jsonl"), hash_seed="1")
@@ -49,6 +50,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     assert first["exchanges"]["line1"]["gateway"] == first["exchanges"]["line1"]["emulators"]
 
 
+@pytest.mark.long
 def test_several_seeds_run_in_several_processes() -> None:
     ended = fieldtwin(*SHORT, "--seeds", "1..3", "--jobs", "2")
     told = json.loads(ended.stdout)

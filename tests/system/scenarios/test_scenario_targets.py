@@ -97,6 +97,7 @@ steps:
 """
 
 
+@pytest.mark.long
 def test_a_plant_is_only_observed(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "shed.yaml").write_text(PLANT.format(port=port))

@@ -10,6 +10,7 @@ import pytest
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, wait_for
 
 
+@pytest.mark.long
 def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     shutil.copytree(CHECKOUT / "profiles", tmp_path / "profiles")

@@ -36,6 +36,7 @@ def test_python_is_named_and_runs_after_a_yes_only(dam: Path, tmp_path: Path, mo
     assert not marker.exists(), "asking, unpacking and examining run nothing"
 
 
+@pytest.mark.long
 def test_without_a_terminal_the_answer_is_no_and_trust_answers_yes(dam: Path, tmp_path: Path) -> None:
     marker = tmp_path / "it ran"
     with_python(dam, marker)

@@ -129,6 +129,7 @@ def test_emulate_reports_a_file_of_a_different_node_and_the_override(tmp_path: P
     assert not any("COB-IDs" in line for line in lines), lines
 
 
+@pytest.mark.long
 def test_emulate_reports_a_drive_without_a_model_and_how_to_choose_one(tmp_path: Path) -> None:
     sheet = DRIVE.replace("DefaultValue=0x00020192\n", "")
     lines, _, status = emulated(tmp_path, sheet)
@@ -153,6 +154,7 @@ def prototype_file(folder: Path, **devices: str) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_run_reports_contradictions_to_a_node_at_its_start(tmp_path: Path) -> None:
     path = prototype_file(tmp_path, drive="profile: odd.yaml", steering="cia: none")
     command = [sys.executable, "-m", "fieldtwin", "run", "lab_vehicle", "--prototype", "--prototype-file", str(path)]

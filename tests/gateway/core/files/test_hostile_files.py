@@ -42,6 +42,7 @@ def sparse(path: Path, head: bytes) -> None:
         file.truncate(LARGE)
 
 
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_pipes_devices_links_and_endless_lines_are_refused_by_every_reader(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "odd-pipe")

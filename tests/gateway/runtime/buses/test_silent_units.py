@@ -220,6 +220,7 @@ def test_a_late_reply_is_never_taken_for_the_answer_to_the_next_request_of_the_s
     assert v.bus.latency.total_ns < 30 * NS_PER_S
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("endpoint", [LINE, LAN], ids=["serial line", "tcp"])
 @pytest.mark.parametrize("live", [1, 31])
 def test_thirty_units_that_fall_silent_at_once_do_not_starve_the_one_that_still_answers(

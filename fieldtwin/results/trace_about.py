@@ -6,6 +6,7 @@ the results when it ends. A reader needs no program of the system for it, and ex
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -102,6 +103,8 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str = ""
     reason: str = ""
     checks: list[CheckAbout] = []
+    report: str = ""
+    """The HTML report of the run, as a path from the folder of the trace; empty without one."""
 
 
 def about_path(trace: Path) -> Path:
@@ -115,6 +118,14 @@ def write_results(
     """Write the description of a finished run. Does nothing for a run that has none. Raises `FileInvalid`."""
     if about is not None:
         write_about(trace, msgspec.structs.replace(about, finished=True, verdict=verdict, reason=reason, checks=checks))
+
+
+def note_report(trace: Path, report: Path) -> None:
+    """Name the report of a finished run in the description of its trace. Raises `FileInvalid`."""
+    about = read_about(trace)
+    if about is not None:
+        way = os.path.relpath(report.absolute(), trace.absolute().parent)
+        write_about(trace, msgspec.structs.replace(about, report=way))
 
 
 def write_about(trace: Path, about: TraceAbout) -> None:

@@ -133,6 +133,11 @@ def test_a_scenario_of_the_list_runs_and_its_steps_and_checks_are_returned(runni
     seen = {one["number"]: one["verdict"] for one in run["progress"]["steps"] + run["progress"]["checks"]}
     assert seen == {check["number"]: check["verdict"] for check in run["result"]["checks"]}
     assert {name for name, *_ in run["progress"]["values"]} >= {"ctd.pressure", "relay.state"}
+    with running.client(VIEW) as client:
+        assert run["report"] is True
+        assert silent["title"] in client.get(f"{SCENARIOS}/run/report").text
+        trace = client.get(f"/traces/{run['trace']}").json()
+        assert (trace["title"], trace["verdict"], trace["report"]) == (silent["title"], "passed", True)
 
 
 def test_a_scenario_with_an_error_reports_the_place(running: Studio, folder: Path) -> None:

@@ -21,7 +21,7 @@ TRACE = "/traces/fail.jsonl"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("traces")
-    failing_trace(made)
+    failing_trace(made, "--html", "report.html")
     return made
 
 
@@ -122,6 +122,34 @@ def test_programs_and_transitions_are_shown_without_the_program(client: httpx.Cl
     assert get(client, f"{TRACE}/plc/transitions", at_ns=349_999_999) == {"relay": []}
     [change] = get(client, f"{TRACE}/plc/transitions", at_ns=350_000_000)["relay"]
     assert (change["before"], change["after"]) == ("STANDBY", "ACTIVE")
+
+
+def test_the_report_of_the_run_links_to_its_trace_and_may_not_execute_scripts(client: httpx.Client) -> None:
+    assert get(client, TRACE)["report"] is True
+    answer = client.get(f"{TRACE}/report")
+    assert answer.status_code == 200, answer.text
+    assert f'href="/#/trace%3Afail.jsonl/overview?t={FAILED_NS / 1e9}"' in answer.text
+    policy = dict(rule.split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split("; "))
+    assert policy["default-src"] == "'none'"
+    assert policy["style-src"] == "'unsafe-inline'"
+    assert "script-src" not in policy
+
+
+def test_a_description_cannot_make_studio_serve_another_file(client: httpx.Client, folder: Path) -> None:
+    about = json.loads((folder / "fail.jsonl.about.json").read_text())
+    other, moved = folder / "other.jsonl", folder / "other.jsonl.about.json"
+    other.write_bytes((folder / "fail.jsonl").read_bytes())
+    try:
+        (folder / "secret").write_text("root:x:0:0")
+        moved.write_text(json.dumps(about | {"report": "secret"}))
+        answer = client.get("/traces/other.jsonl/report")
+        assert "root:x" not in answer.text
+        assert "not a report of fieldtwin" in answer.json()["error"]["message"]
+        moved.write_text(json.dumps(about | {"report": "no-such-file.html"}))
+        assert client.get("/traces/other.jsonl/report").status_code == 404
+    finally:
+        other.unlink()
+        moved.unlink()
 
 
 def test_only_known_traces_are_opened_and_the_role_view_may_read_them(client: httpx.Client, folder: Path) -> None:

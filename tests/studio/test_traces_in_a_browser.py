@@ -29,7 +29,7 @@ def at(page: Window, t_ns: int) -> None:
 
 
 def test_the_failed_check_of_a_trace_is_found_and_the_run_is_walked_through_by_keyboard(tmp_path: Path) -> None:
-    failing_trace(tmp_path)
+    failing_trace(tmp_path, "--html", "report.html")
     with studio("fail.jsonl", "--at", "0.1s", folder=tmp_path) as running, browser() as page:
         opened(page, running)
         at(page, 100_000_000)
@@ -74,6 +74,11 @@ def test_the_failed_check_of_a_trace_is_found_and_the_run_is_walked_through_by_k
         page.sees(".now-state", "STANDBY")
         page.click(".nav a", "Trends")
         page.sees(".trend", "ctd.pressure")
+
+        page.go(page.script("return [...document.querySelectorAll('.top a')].find((a) => a.text === 'Report').href"))
+        page.sees("h2", "Verdicts")
+        page.click("a", "Show the trace at this instant")
+        at(page, FAILED_NS)
         assert page.complaints() == []
 
 

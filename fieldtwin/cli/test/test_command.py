@@ -208,8 +208,12 @@ def command(
         write_junit(report, junit.junit, Flavour(junit.junit_flavour))
     if html:
         from fieldtwin.reports.run.html import write_html
+        from fieldtwin.results.trace_about import note_report
 
         write_html(report, Path(html))
+        for result in results:
+            if result.trace_file:
+                note_report(Path(result.trace_file), Path(html))
     if as_json:
         json.dump([_plain(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")

@@ -146,7 +146,7 @@ def _failure(report: Report, number: int, scenario: ScenarioResult, windows: lis
     failing = [c for c in scenario.checks if c.verdict.bad]
     return fill(
         "failure.html.j2", number=number, scenario=scenario, place=_place(scenario), failing=failing, drawn=drawn,
-        opened=opened, in_studio=_in_studio, **_SHARED,
+        opened=opened, in_studio=_in_studio, seconds=_seconds, **_SHARED,
     )  # fmt: skip
 
 
@@ -154,8 +154,13 @@ def _in_studio(scenario: ScenarioResult, t_ns: int | None) -> str:
     """Return the command that shows an instant of the scenario's trace in Studio, empty without such a trace."""
     if not scenario.trace_file:
         return ""
-    at = "" if t_ns is None else f"{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}".rstrip("0").rstrip(".") + "s"
-    return shlex.join(["fieldtwin", "studio", scenario.trace_file, *(["--at", at] if at else [])])
+    at = _seconds(t_ns)
+    return shlex.join(["fieldtwin", "studio", scenario.trace_file, *(["--at", f"{at}s"] if at else [])])
+
+
+def _seconds(t_ns: int | None) -> str:
+    """Return an instant in seconds, exactly; empty for None."""
+    return "" if t_ns is None else f"{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d}".rstrip("0").rstrip(".")
 
 
 def _place(scenario: ScenarioResult) -> str:

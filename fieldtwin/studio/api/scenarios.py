@@ -7,10 +7,14 @@ from typing import Any
 
 import msgspec
 from starlette.requests import Request
+from starlette.responses import Response
 
+from fieldtwin.results.trace_about import about_path
 from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, of_server, prototype, recordings_of
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
+from fieldtwin.studio.api.reports import report_response
+from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.scenarios.progress import MOST_VALUES
 from fieldtwin.studio.scenarios.runner import ScenarioRunner, known_scenarios
 
@@ -32,7 +36,7 @@ async def list_scenarios(request: Request) -> dict[str, Any]:
     """Return the scenario files of the system, and the present or latest run with its result."""
     attachment = await attached(request)
     files = known_scenarios(Path(attachment.record.path), folder_of(request))
-    return {"files": [msgspec.to_builtins(file) for file in files], "run": _runner(request).state(MOST_VALUES)}
+    return {"files": [msgspec.to_builtins(file) for file in files], "run": _run_of(request, MOST_VALUES)}
 
 
 async def run_scenario(request: Request) -> dict[str, Any]:
@@ -43,13 +47,23 @@ async def run_scenario(request: Request) -> dict[str, Any]:
     if form.path not in known:  # a page must not run arbitrary files
         raise NotFound(f"no scenario {form.path[:80]!r}", expected=", ".join(known) or "a scenario; there is none")
     await _runner(request).start(form.path, form.target)
+    of_server(request, "traces", Traces).latest_run = _runner(request).trace
     return {"run": _runner(request).state()}
 
 
 async def get_run(request: Request) -> dict[str, Any]:
     """Return the present or latest run: its progress while it runs, and at its end the result."""
     await attached(request)
-    return {"run": _runner(request).state(whole(request, "values_from", 0))}
+    return {"run": _run_of(request, whole(request, "values_from", 0))}
+
+
+async def get_run_report(request: Request) -> Response:
+    """Return the HTML report of the latest run, with a link to the trace of each failure."""
+    await attached(request)
+    report = _runner(request).report
+    if report is None:
+        raise NotFound("no run of a scenario has a report", expected="a run that has ended")
+    return report_response(report, of_server(request, "traces", Traces).in_report(report))
 
 
 async def stop_scenario(request: Request) -> dict[str, Any]:
@@ -84,6 +98,17 @@ async def save_scenario(request: Request) -> dict[str, Any]:
     return {"path": str(recordings_of(request).save(attachment, folder_of(request).resolve(), form.name))}
 
 
+def _run_of(request: Request, values_from: int) -> dict[str, Any] | None:
+    """Return the present or latest run, with the name of its trace; "" if Studio has none of it."""
+    run = _runner(request).state(values_from)
+    if run is not None:
+        traces = of_server(request, "traces", Traces)
+        path = _runner(request).trace
+        described = path is not None and about_path(path).is_file()
+        run["trace"] = traces.name_of(path) if path is not None and described else ""
+    return run
+
+
 def _runner(request: Request) -> ScenarioRunner:
     return of_server(request, "runner", ScenarioRunner)
 
@@ -99,6 +124,7 @@ OPERATIONS = (
         "Read the run of a scenario, its progress and its result",
         (Parameter("values_from", "integer", "the number of values that the client has already"),),
     ),
+    Operation("GET", f"{SCENARIOS}/run/report", get_run_report, "Read the HTML report of the latest run"),
     Operation("POST", f"{SCENARIOS}/run", run_scenario, "Run a scenario", body=RunScenario, changes=True),
     Operation("DELETE", f"{SCENARIOS}/run", stop_scenario, "Stop the running scenario", changes=True),
     Operation("GET", f"{SCENARIOS}/recording", get_recording, "Read the recording of a scenario"),

@@ -12,6 +12,7 @@ from fieldtwin.studio.api.common import of_server
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.frames import EXPORT, PAGE, file_of, frame_of, page_of
 from fieldtwin.studio.api.operation import Operation, Parameter, whole
+from fieldtwin.studio.api.reports import report_response
 from fieldtwin.studio.live.tag_history import MOST_POINTS
 from fieldtwin.studio.replay.instant import recent_at, state_at, transitions_at
 from fieldtwin.studio.replay.marks import failed_checks, marks_of
@@ -49,12 +50,22 @@ async def get_trace(request: Request) -> dict[str, Any]:
         "seed": about.seed if about is not None else None,
         "verdict": about.verdict if about is not None else "",
         "reason": about.reason if about is not None else "",
+        "report": of_server(request, "traces", Traces).named(replay.name).report is not None,
         "failed": [msgspec.to_builtins(check) for check in failed_checks(replay.log, about)],
         "marks": marks,
         "marks_left_out": left_out,
         "frames": True,
         "system": replay.description,
     }
+
+
+async def get_trace_report(request: Request) -> Response:
+    """Return the HTML report of the run, with links to the traces of its failures."""
+    traces = of_server(request, "traces", Traces)
+    report = traces.named(request.path_params["trace"]).report
+    if report is None:
+        raise NotFound("the run of this trace has no report", hint="fieldtwin test FILE --trace TRACE --html REPORT")
+    return report_response(report, traces.in_report(report))
 
 
 async def get_trace_state(request: Request) -> dict[str, Any]:
@@ -140,6 +151,7 @@ def _described(trace: KnownTrace) -> dict[str, Any]:
 OPERATIONS = (
     Operation("GET", "/traces", list_traces, "List the traces of virtual runs"),
     Operation("GET", TRACE, get_trace, "Describe a trace"),
+    Operation("GET", f"{TRACE}/report", get_trace_report, "Read the HTML report of the run"),
     Operation("GET", f"{TRACE}/state", get_trace_state, "Read the state at an instant", (AT,)),
     Operation("GET", f"{TRACE}/recent", get_trace_recent, "Read the minute before an instant", (AT,)),
     Operation(

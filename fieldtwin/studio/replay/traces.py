@@ -34,6 +34,14 @@ class KnownTrace:
     trouble: str = ""
 
     @property
+    def report(self) -> Path | None:
+        """Return the HTML report of the run, None without one."""
+        if self.about is None or not self.about.report:
+            return None
+        path = (self.path.parent / self.about.report).resolve()
+        return path if path.is_file() else None
+
+    @property
     def failed(self) -> bool:
         """Return whether the run has ended and has not passed."""
         return self.about is not None and self.about.finished and self.about.verdict != "passed"
@@ -56,6 +64,8 @@ class Traces:
         self._folder = folder
         self._named = named
         self._system = system
+        self.latest_run: Path | None = None
+        """The trace of the latest scenario that ran in Studio."""
         self._open: dict[Path, tuple[Replay, AsyncExitStack]] = {}
         self._lock = asyncio.Lock()
         self._read: dict[Path, tuple[tuple[int, int], TraceAbout | None, str]] = {}
@@ -72,17 +82,27 @@ class Traces:
         """Return the known traces, at most `MOST_LISTED`: those that the user named first, and failed runs before others."""
         named = [path for given in self._named for path in (_in(given) if given.is_dir() else [given])]
         found = [*_in(self._folder), *(path for sub in _folders(self._folder) for path in _in(sub))]
-        paths = dict.fromkeys(path.resolve() for path in [*named, *found])
+        ran = [self.latest_run] if self.latest_run is not None and self.latest_run.is_file() else []
+        paths = dict.fromkeys(path.resolve() for path in [*named, *found, *ran])
         own = {path.resolve() for path in named}
         known = [self._look(path) for path in list(paths)[:MOST_LISTED]]
         return sorted(known, key=lambda trace: (trace.path not in own, not trace.failed))
 
+    def named(self, name: str) -> KnownTrace:
+        """Return a known trace. Raises `NoTrace`."""
+        known = next((trace for trace in self.known() if trace.name == name), None)
+        if known is None:
+            raise NoTrace(f"no trace {name[:80]!r} is known", hint="name its file: fieldtwin studio TRACE")
+        return known
+
+    def in_report(self, report: Path) -> dict[str, str]:
+        """Return the traces whose run wrote this report, by the names of their files."""
+        return {trace.path.name: trace.name for trace in self.known() if trace.report == report.resolve()}
+
     async def opened(self, name: str) -> Replay:
         """Return an opened trace. Raises `NoTrace`, and `FileInvalid` if it cannot be read."""
         async with self._lock:
-            known = next((trace for trace in self.known() if trace.name == name), None)
-            if known is None:
-                raise NoTrace(f"no trace {name[:80]!r} is known", hint="name its file: fieldtwin studio TRACE")
+            known = self.named(name)
             found = self._open.get(known.path)
             if found is not None and not _replaced(found[0], known):
                 return found[0]

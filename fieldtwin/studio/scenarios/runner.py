@@ -13,7 +13,7 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.yaml_file import load
-from fieldtwin.scenarios.language.file_name import SUFFIX
+from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 from fieldtwin.studio.child_run import ChildRun
 from fieldtwin.studio.scenarios.progress import RunProgress
 
@@ -21,6 +21,8 @@ MOST_FILES = 200
 MOST_FILE_BYTES = 1 << 20
 LOOK_EVERY_S = 0.1
 TARGETS = ("virtual", "local")
+PROGRESS, REPORT = "progress", "report.html"
+"""Files in the folder of a run, beside its trace. The name of a trace ends with ``.jsonl``."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class ScenarioRunner:
 
     async def __aexit__(self, *error: object) -> None:
         await self.stop()
+        if self._run is not None:
+            self._run.forget()
 
     def state(self, values_from: int = 0) -> dict[str, Any] | None:
         """Return the present or the latest run, None if there was none. `values_from`: the first value of its progress."""
@@ -84,11 +88,24 @@ class ScenarioRunner:
         if self._run is not None and self._run.is_running:
             raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
         folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
-        progress = folder / "progress.jsonl"
-        arguments = ["test", path, "--target", target, "--json", "--progress", str(progress)]
-        run = await ChildRun.started(arguments, _result)
+        trace = folder / f"{case_of(Path(path))}.jsonl" if target == "virtual" else None
+        files = ["--progress", str(folder / PROGRESS), "--html", str(folder / REPORT)]
+        files += ["--trace", str(trace)] if trace is not None else []
+        run = await ChildRun.started(["test", path, "--target", target, "--json", *files], _result)
+        if self._run is not None:
+            self._run.forget()
         self._count += 1
-        self._run = _Run(self._count, path, target, run, progress)
+        self._run = _Run(self._count, path, target, run, folder, trace)
+
+    @property
+    def trace(self) -> Path | None:
+        """Return the trace of the present or latest run, None if it has none. It is deleted when another one starts."""
+        return self._run.trace if self._run is not None else None
+
+    @property
+    def report(self) -> Path | None:
+        """Return the HTML report of the latest run, None if it has not ended or wrote none."""
+        return self._run.report if self._run is not None else None
 
     async def stop(self) -> None:
         """Stop the run, if one is running."""
@@ -97,13 +114,16 @@ class ScenarioRunner:
 
 
 class _Run:
-    def __init__(self, number: int, path: str, target: str, run: ChildRun, progress: Path) -> None:
+    """A run whose files are in `folder`: its progress, report and trace."""
+
+    def __init__(self, number: int, path: str, target: str, run: ChildRun, folder: Path, trace: Path | None) -> None:
         self.path = path
+        self.trace = trace
         self._number = number
         self._target = target
         self._run = run
-        self._progress_file = progress
-        self._progress = RunProgress(progress)
+        self._folder = folder
+        self._progress = RunProgress(folder / PROGRESS)
         self._following = asyncio.ensure_future(self._follow())
 
     @property
@@ -119,18 +139,25 @@ class _Run:
             "elapsed_s": self._run.elapsed_s,
             "trouble": self._run.trouble,
             "result": self._run.result,
+            "report": self.report is not None,
             "progress": self._progress.state(values_from),
         }
 
+    @property
+    def report(self) -> Path | None:
+        path = self._folder / REPORT
+        return path if not self.is_running and path.is_file() else None
+
+    def forget(self) -> None:
+        """Delete the files of a run that has ended."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
     async def _follow(self) -> None:
-        try:
-            while self._run.is_running:
-                self._progress.look()
-                await asyncio.sleep(LOOK_EVERY_S)
-            while self._progress.look():
-                pass
-        finally:
-            shutil.rmtree(self._progress_file.parent, ignore_errors=True)
+        while self._run.is_running:
+            self._progress.look()
+            await asyncio.sleep(LOOK_EVERY_S)
+        while self._progress.look():
+            pass
 
     async def stop(self) -> None:
         """Interrupt the run, and kill it with its processes if it does not end."""

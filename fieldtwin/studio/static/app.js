@@ -2,7 +2,7 @@
 
 import { html, render, useEffect, useRef, useState } from "./vendor/preact.js";
 import { address } from "./lib/address.js";
-import { remove } from "./lib/api.js";
+import { remove, url } from "./lib/api.js";
 import { Guard } from "./lib/guard.js";
 import { Failure, useAction } from "./lib/parts.js";
 import { Store, useStore } from "./lib/store.js";
@@ -123,6 +123,7 @@ function Top({ store }) {
     ${mode && html`<span class="chip ${mode === "plant" ? "warn" : "accent"}">${mode}${writes ? `, ${writes}` : ""}</span>`}
     ${store.status?.plc &&
     states.map((name) => html`<span class="chip">${name}: ${store.word(name, "state", store.variable(name, "state"))}</span>`)}
+    ${store.isTrace && store.about?.report && html`<a href=${url(`${store.path}/report`)} target="_blank" rel="noopener">Report</a>`}
     <span class="grow"></span>
     ${!store.isTrace && store.about?.role === "view" && html`<span class="chip">view only</span>`}
     ${store.dropped > 0 && html`<span class="chip warn" title="This page was too slow to take them">${store.dropped} updates lost</span>`}

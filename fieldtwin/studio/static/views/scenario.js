@@ -1,10 +1,12 @@
 // Scenarios: record what is done to the simulated devices as one, and run those of the system with their verdicts as a timeline.
 
 import { html, useEffect, useMemo, useRef, useState } from "../vendor/preact.js";
-import { get, post, remove } from "../lib/api.js";
+import { address } from "../lib/address.js";
+import { get, post, remove, url } from "../lib/api.js";
 import { Charts, Cursors, Marks } from "../lib/chart.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
+import { PREFIX } from "../lib/trace_store.js";
 
 const LOOK_EVERY_MS = 1000;
 const FOLLOW_EVERY_MS = 300;
@@ -124,13 +126,13 @@ function Run({ store, path, files, run: now, error, again }) {
         ? html`<button class="danger" disabled=${busy} onClick=${() => does(() => remove(`${path}/run`))}>Stop</button>`
         : html`<button class="primary" disabled=${busy} onClick=${() => does(() => post(`${path}/run`, { path: file.path, target }))}>Run</button>`)}
     </div>`}
-    ${now && html`<${Summary} run=${now} />`}
+    ${now && html`<${Summary} run=${now} path=${path} />`}
   </section>`;
 }
 
 const TONE = { passed: "good", failed: "bad", error: "bad" };
 
-function Summary({ run }) {
+function Summary({ run, path }) {
   const { result, progress } = run;
   const file = run.path.split("/").pop();
   if (run.running) return html`<p role="status"><span class="chip accent">running</span> ${file}, ${progress.t_s.toFixed(1)} s of the system in ${run.elapsed_s.toFixed(0)} s</p>`;
@@ -138,6 +140,10 @@ function Summary({ run }) {
   return html`<p role="status">
       <span class="chip ${TONE[result.verdict] ?? "warn"}">${result.verdict}</span> <strong>${result.name}</strong>${" "}
       <span class="soft">${result.simulated_s.toFixed(1)} s of the system, target ${result.target}; the run took ${run.elapsed_s.toFixed(1)} s</span>
+    </p>
+    <p class="bar ways">
+      ${run.report && html`<a href=${url(`${path}/run/report`)} target="_blank" rel="noopener">Report</a>`}
+      ${run.trace && html`<a href=${address(PREFIX + run.trace)}>Look into the run at any instant</a>`}
     </p>
     ${result.reason && html`<p>${result.reason}</p>`}
     ${result.faults.length > 0 &&

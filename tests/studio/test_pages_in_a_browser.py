@@ -115,6 +115,10 @@ def test_a_view_that_throws_shows_the_error_and_the_page_goes_on(page: Window) -
     page.complaints()
 
 
+def test_the_page_replaces_the_note_that_it_is_loading(page: Window) -> None:
+    page.lacks("body", "Loading the page")
+
+
 def test_a_page_whose_frame_throws_offers_to_load_it_again(page: Window) -> None:
     page.click(".nav a", "Devices")
     page.sees("main", "ctd.status")

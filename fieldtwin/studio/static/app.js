@@ -176,4 +176,6 @@ function Banners({ store }) {
   </div>`;
 }
 
-render(html`<${Guard} title="Studio's page cannot be shown"><${App} /><//>`, document.getElementById("app"));
+const root = document.getElementById("app");
+root.replaceChildren(); // the note that the page is loading, which Preact would keep below the page
+render(html`<${Guard} title="Studio's page cannot be shown"><${App} /><//>`, root);

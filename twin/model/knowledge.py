@@ -27,15 +27,15 @@ LOSS_NAME = "knowledge"
 _SAYS_WHAT_IS = {int(Kind.VALUE), int(Kind.STATE)}
 
 MakeRoom = Callable[[], Awaitable[int]]
-"""Forgets events in the store and returns how many. 0 means that no event may be forgotten."""
+"""A function that deletes old events from the store and returns their number. 0 means that no event may be deleted."""
 
 
 class KnowledgeWriter:
     """The writer of one origin's events, in batches. `observe` never waits and never fails; `run` writes until cancelled.
 
     The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written, and with
-    ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When the store is full,
-    `make_room` may forget events that are no longer needed.
+    ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When the store is
+    full, `make_room` may delete events that are no longer needed.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class KnowledgeWriter:
         self._on_written = on_written
         self._make_room = make_room
         self._lost = 0
-        """Events that were dropped and whose loss is not on record yet."""
+        """Events that were dropped and whose loss is not recorded yet."""
 
     @property
     def queued(self) -> int:
@@ -151,7 +151,9 @@ class KnowledgeWriter:
             self._say("")
 
     def _say(self, text: str) -> None:
-        if text.partition(":")[0] != self.trouble.partition(":")[0]:  # do not report again because one MiB less is left
+        # the free room rose above the reserve, but by less than the margin: it is not reported again when it falls once
+        # more
+        if text.partition(":")[0] != self.trouble.partition(":")[0]:
             self.trouble = text
             self._on_trouble(text)
 
@@ -178,7 +180,7 @@ class Known:
 
 
 async def known_at(blocks: AsyncIterator[list[Event]]) -> Known:
-    """Replay blocks of events and return what was known at their end."""
+    """Replay blocks of events and return the knowledge at their end."""
     known = Known()
     async for block in blocks:
         known.learn(block)

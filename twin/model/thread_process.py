@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.values import DATA, RESPONSE, STATUS, TagValue
 from fieldtwin.gateway.store.event import Event, Kind, of_tag, stored
 
 KNOWLEDGE = 10_000
-"""Number of events that a process keeps to be shared."""
+"""The largest number of events that a process keeps until its thread connection collects them."""
 
 
 class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no operations
@@ -68,7 +68,9 @@ class PTDigitalThreadProcess(DigitalThreadProcess):
         self.share(Kind.VALUE, name, value)
 
     def respond(self, program: str, response: RESPONSE) -> None:
-        """Share what the control logic sent to its transmitter: a STATUS, or a measurement whose payload stays unchanged."""
+        """Share a message that the control logic sent to its transmitter: a STATUS, or a measurement whose payload stays
+        unchanged.
+        """
         self.share(Kind.STATE if isinstance(response, STATUS) else Kind.PAYLOAD, program, response)
 
 

@@ -37,7 +37,7 @@ class ModelVariable:
 
     @property
     def heard(self) -> bool:
-        """Return whether the plant ever reported this variable."""
+        """Return whether the plant has reported this variable at least once."""
         return self.t_ms > 0
 
     @property
@@ -65,7 +65,7 @@ class ModelVariable:
 class Variables(Mapping[str, ModelVariable]):
     """The variables of one model, by name, in the order of their declaration. Two models never share a variable.
 
-    `undeclared` counts reports about names that the model does not declare. It is not part of the model.
+    `undeclared` counts reports about names that the model does not declare. This counter is not part of the model's state.
     """
 
     __slots__ = ("_held", "undeclared")

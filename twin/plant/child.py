@@ -19,9 +19,10 @@ MOST_FILES = 65_536
 
 
 def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
-    """Raise SIGTERM in this process `linger_s` seconds after the process `parent` has ended. The kernel signals the end.
+    """Raise SIGTERM in this process `linger_s` seconds after the process `parent` has ended, of which the kernel notifies this
+    process (prctl).
 
-    Linux only; on other systems this does nothing.
+    Linux only; on other systems this function does nothing.
     """
     if not sys.platform.startswith("linux"):
         return

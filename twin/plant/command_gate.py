@@ -43,7 +43,7 @@ class CommandGate(PTDigitalThreadProcess):
         self._last: dict[str, int] = {}
 
     def restate(self, *, remote: bool, bounds: CommandLimits) -> None:
-        """Set a new switch position and new limits, which may change while the plant runs."""
+        """Set a new switch position and new limits. Both may change while the plant runs."""
         self._remote = remote
         self._check.restate(bounds)
 

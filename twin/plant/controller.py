@@ -46,7 +46,7 @@ from fieldtwin.twin.site.system import System, load_system
 FLUSH_EVERY_NS = NS_PER_S // 2
 LOOK_EVERY_NS = NS_PER_S // 20
 FLUSH_ROWS = 8
-"""Number of waiting rows that triggers an immediate flush: the PLC keeps what is not stored, and holds 16 rows of each
+"""Number of waiting rows that triggers an immediate flush: the PLC keeps rows until they are stored, at most 16 of each
 program.
 """
 MOST_COMMAND_BYTES = 64
@@ -113,7 +113,7 @@ class GatewayProcess:
         try:
             ecs = EmbeddedControlSystem(system)
             with attached(ecs.layout, run_dir / "image") as image:
-                # Keep the prototype's files apart: data learnt from emulators does not describe the plant's devices.
+                # A prototype has separate files: data learnt from emulators does not describe the plant's devices.
                 of = "" if self._config.mapping is None else ".prototype"
                 self._gateway = ecs.gateway(
                     connector,

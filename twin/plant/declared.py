@@ -15,7 +15,7 @@ from fieldtwin.twin.site.system import System
 def declared_variables(system: System, limits: Mapping[str, Limits] | None = None) -> tuple[ModelVariable, ...]:
     """Return the declared variables, in the system file's order. `limits`, if given, replace those of the profiles.
 
-    A transmitter's inbox is not a variable: it receives commands, which a model takes as such
+    A transmitter's inbox is not a variable: it receives commands, which the model processes as commands
     (`DigitalModel.process_event`).
     """
     tags = [

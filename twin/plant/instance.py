@@ -1,4 +1,4 @@
-"""An instance: one running system on this host, with its own run directory (DESIGN.md, "Instances").
+"""An instance: one running system on this host, with its own run directory.
 
 Sockets, virtual serial ports, process image, logs and store are in that directory, which only its owner may enter. Two
 instances of one system can run at the same time, under different names; an instance name can be in use once only.

@@ -25,8 +25,8 @@ MOST_WAITING = 64
 
 
 class RefusalPlaces:
-    """The lookup that completes the entries of `journal` over the PLC's control channel at `socket`, and then calls `tell` with
-    each.
+    """The lookup that completes the entries of `journal` over the PLC's control channel at `socket`, and then calls `tell`
+    with each completed entry.
     """
 
     def __init__(self, journal: Refusals, socket: Path, tell: Callable[[dict[str, Any]], None] | None = None) -> None:
@@ -83,7 +83,7 @@ class RefusalPlaces:
         return str(answer.get("program", "")), str(answer.get("place", ""))
 
     async def settle(self) -> None:
-        """Return when no entry waits for its line, after `ANSWER_S` at the latest."""
+        """Wait until no entry waits for its line, at most `ANSWER_S`."""
         try:
             async with asyncio.timeout(ANSWER_S):
                 await self._idle.wait()

@@ -132,7 +132,9 @@ def _is_live_in_profile(before: DeviceProfile, after: DeviceProfile, at: Loc) ->
 
 
 def _unexplained(old: System, new: System) -> list[ConfigChange]:
-    """Return differences that no changeable key explains: a DCF or an EDS that the files name, a profile's messages."""
+    """Return the differences that no changeable key explains, for example in a DCF or an EDS that the files name, or in a
+    profile's messages.
+    """
     found = []
     for name, device in new.devices.items():
         before = old.devices[name]

@@ -18,7 +18,7 @@ MOST = 50_000
 AT_ONCE = 10_000
 """The largest number of entries that fits into one line of the control channel."""
 Change = tuple[int, int, str, Any, str, str]
-"""Number (from 1), monotonic ns, tag, value (bytes as hex), quality, reason."""
+"""A change of a tag: number (from 1), monotonic time (ns), tag, value (bytes as hex), quality, reason."""
 
 
 class TagWatch:
@@ -31,14 +31,15 @@ class TagWatch:
         self._changes: deque[Change] = deque(maxlen=MOST)
         self._number = 0
         self._follows = False
-        """Whether changes are recorded: from the first question on."""
+        """Whether changes are recorded. Recording begins with the first request of a client."""
 
     def answer(self, args: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a `watch` question, with these keys:
 
         ``now_ns``; ``changes`` after number `since`, the oldest first, at most `AT_ONCE`; ``dropped``, how many of them
         are no longer kept; ``last``, the newest number; ``tags``, with value, quality, reason and source time (ns) of
-        each of `names`; ``refusals``, writes that did not reach their device, after entry number `refused`.
+        each of `names`; ``refusals``, the writes that did not reach their device, from the journal entry after number
+        `refused` on.
 
         Raises `UsageError` for an unknown tag.
         """

@@ -23,7 +23,7 @@ from fieldtwin.twin.site.system import System
 class FaultTarget:
     """The target of a fault.
 
-    Empty `units` stand for all units of the bus; `addresses` None and empty `functions` also stand for all.
+    Empty `units` means all units of the bus, `addresses` None all addresses, and empty `functions` all function codes.
     """
 
     bus: str

@@ -1,4 +1,6 @@
-"""How often each fault took effect, also of cleared faults, because a fault that never took effect has tested nothing."""
+"""The number of times that each fault took effect. Cleared faults are included, because a fault that never took effect has
+tested nothing.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ MOST = 10_000
 
 
 class FaultHistory:
-    """Every fault that was injected, the first one first."""
+    """Every fault that was injected, in the order of injection."""
 
     def __init__(self) -> None:
         self._put_in: deque[tuple[int, Active, str]] = deque(maxlen=MOST)
@@ -20,7 +22,7 @@ class FaultHistory:
         """Number of faults that were injected."""
 
     def add(self, active: Active, on: str) -> None:
-        """Add a fault that is injected into a device or bus."""
+        """Add a fault that was injected into the device or bus `on`."""
         self.count += 1
         self._put_in.append((self.count, active, on))
 

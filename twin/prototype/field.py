@@ -96,9 +96,9 @@ class FieldSimulator:
     """Builds every emulator of a prototype and runs them on their connections.
 
     Virtual serial ports get their links in `run_dir`. After `open`, `listening` holds the endpoint at which each
-    emulated bus listens (with the free ports that were chosen), and `far` those of the modems at the remote end of a link.
-    `water`: the acoustic connections of transmitters that are in a network's acoustic channel, and that therefore have no
-    separate remote modem.
+    emulated bus listens (with the free ports that were chosen), and `far` holds the endpoints of the modems at the remote end
+    of a link. `water`: the acoustic connections of transmitters that are in a network's acoustic channel, and that therefore
+    have no separate remote modem.
     """
 
     def __init__(
@@ -255,7 +255,9 @@ class FieldSimulator:
             ) from e
 
     def _replay(self, emulated: EmulatedDevice) -> tuple[ExchangeReplay, int]:
-        """Return a copy of the device's recording, and its unit ID there. Devices that share a recording read it once."""
+        """Return a copy of the device's recording, and the device's unit ID in it. Devices that share a recording read it
+        once.
+        """
         assert emulated.recording is not None
         profile, at_end = emulated.profile, EndOfRecording.parse(emulated.form.at_end)
         key = emulated.recording, profile.path, profile.hash, at_end
@@ -265,7 +267,7 @@ class FieldSimulator:
         return replay.copy(), unit_id
 
     def _kind(self, config: DeviceConfig) -> ConnectionKind:
-        """Return the kind of the plant's connection, whatever carries the connection in this run."""
+        """Return the kind of the plant's connection, such as a serial line, even if this run carries it over TCP or in memory."""
         return RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:

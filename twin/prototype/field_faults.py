@@ -66,7 +66,7 @@ class FieldFaults:
         self._disturb[bus], self._undisturb[bus] = disturb, undisturb
 
     def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
-        """Call `told` with the traffic on each line and socket from now on.
+        """Call `told` with the traffic on each serial line and socket from now on.
 
         Its arguments are the bus, the connection object, whether an emulator sent the bytes, and the bytes. CAN buses have their
         own listeners (`FieldSimulator.join`).

@@ -1,10 +1,11 @@
 """Leases on the simulated field devices. The faults and values that a test runner injects last only as long as it renews its
 lease.
 
-A test runner (a scenario on a running system; *judge* in messages) opens a lease on the control channel, injects faults and sets
-values under the lease's id, and renews it. Even after kill -9 or a lost network, everything that the test runner injected is
-removed when the lease ends: faults are cleared, and each device value is restored to that before the test runner's first `set`.
-Only one test runner at a time can hold the lease, because two test runners would falsify each other's verdicts.
+A test runner (a scenario on a running system; messages call it *judge*) opens a lease on the control channel, injects faults
+and sets values under the lease's id, and renews it. Even after kill -9 or a lost network, everything that the test runner
+injected is removed when the lease ends: faults are cleared, and each device value is restored to that before the test runner's
+first `set`. Only one test runner at a time can hold the lease, because the faults of one test runner would change the results
+of another.
 
 Pure: the time is passed in, in ns on the clock of the field process.
 """
@@ -42,7 +43,7 @@ class _Lease:
     until_ns: int
     faults: set[str] = field(default_factory=set)
     before: dict[tuple[str, str], float | None] = field(default_factory=dict)
-    """By device and tag: the value that was set before this lease, or None if none was set."""
+    """The values that were set before this lease, by device and tag; None for a tag that was not set."""
 
 
 class FieldLeases:
@@ -60,7 +61,7 @@ class FieldLeases:
         return None if self._lease is None else self._lease.until_ns
 
     def open(self, id: str, for_s: float, now_ns: int) -> None:
-        """Give the lease to test runner `id` for `for_s` seconds. Raises `LeaseTaken` while another test runner holds it."""
+        """Open the lease `id` of a test runner for `for_s` seconds. Raises `LeaseTaken` while another test runner holds it."""
         self.expire(now_ns)
         if not id or len(id) > MOST_ID:
             raise UsageError("the lease's id", expected=f"1 to {MOST_ID} characters", got=repr(id)[:60])
@@ -79,7 +80,7 @@ class FieldLeases:
         self.of(id, now_ns).until_ns = now_ns + _duration_ns(for_s)
 
     def of(self, id: str, now_ns: int) -> _Lease:
-        """Return the lease `id`. Raises `LeaseEnded` if it is over."""
+        """Return the lease with the identifier `id`. Raises `LeaseEnded` if it has ended."""
         self.expire(now_ns)
         if self._lease is None or self._lease.id != id:
             raise LeaseEnded(
@@ -96,7 +97,7 @@ class FieldLeases:
         return fault
 
     def set_value(self, id: str, device: str, tag: str, value: float | str | bool | None, now_ns: int) -> None:
-        """Set a device value under the lease; None ends the setting. The end of the lease restores the earlier value."""
+        """Set a device value under the lease; None removes the set value. The end of the lease restores the earlier value."""
         lease, before = self.of(id, now_ns), self._faults.value_set(device, tag)
         self._faults.set_value(device, tag, value)
         lease.before.setdefault((device, tag), before)
@@ -123,7 +124,9 @@ class FieldLeases:
             self._faults.set_value(device, tag, value)
 
     def moved_to(self, faults: FieldFaults) -> None:
-        """Move the lease to newly made devices with `faults`. The lease continues, without any fault or value under it."""
+        """Move the lease to devices that were created again, whose faults are `faults`. The lease continues, but no fault or
+        value belongs to it.
+        """
         self._faults = faults
         if self._lease is not None:
             self._lease = _Lease(self._lease.id, self._lease.until_ns)

@@ -3,7 +3,7 @@ inside `fieldtwin emulate SYSTEM`.
 
 Commands of the control channel: ready, get (listening endpoints, counters), held (the values that the devices really
 held), fault, clear, set, lease, fresh, stop. The channel is a Unix socket in the run directory, and TCP if configured,
-so that a controller elsewhere learns where each plant endpoint's emulator listens.
+so that a controller on another host learns where the emulator of each plant endpoint listens.
 
     lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`fieldtwin.twin.prototype.field_leases`);
               {"renew": true} prolongs it, {"release": true} ends it. What `fault` and `set` inject with "lease": ID is
@@ -44,7 +44,9 @@ from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System, load_system
 
 HELD_AT_ONCE = 5_000
-"""Entries of each device in one answer: after hours there are more than fit into one line of the control channel."""
+"""Largest number of entries of each device in one answer: after hours there are more than fit into one line of the control
+channel.
+"""
 
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -83,7 +85,7 @@ def resolve(config: FieldConfig, system: System | None = None) -> DigitalTwinPro
 
 
 def resolve_files(config: FieldConfig, system: System | None = None) -> tuple[System, Prototype]:
-    """Return system and prototype for the field devices only, without gateway, PLC and programs, as `config` says."""
+    """Return the system and the prototype that `config` names, for the field devices only: without gateway, PLC and programs."""
     if config.resolved:
         handed_over, prototype = read_resolved(config.resolved)
         assert isinstance(handed_over, System)

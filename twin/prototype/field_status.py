@@ -1,4 +1,5 @@
-"""The status of the field simulator on the control channel: the answer to `get`, for sender and receivers.
+"""The status of the field simulator on the control channel: the answer to `get`, used by the sender and the receivers of the
+answer.
 
 The fields are the keys of the JSON object, in this order. A field that later versions add has a default, so that an
 older field simulator in another container can still be read. This module must not import emulators: a run of a plant
@@ -15,18 +16,18 @@ Counts = dict[str, int]
 
 
 class SimulatedDeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One simulated device. Counters begin with 0 when the device is made."""
+    """One simulated device. Counters begin with 0 when the device is created."""
 
     profile: str
     recording: str
     """The recording, simulation or model that gives the device its values; "None" if it has none."""
     plays: str
-    """The same for a reader, in words."""
+    """The same data source, as a sentence for the user."""
     remarks: list[str] = []
     """Differences from a node's data sheet."""
     commands: list[str] = []
     executed: Counts = {}
-    """By command: the number of times that it was executed."""
+    """The number of executions of each command."""
     unlisted: int = 0
     """The number of requests that are not in the device's list of commands."""
     counters: Counts = {}
@@ -44,14 +45,14 @@ class ActiveFaultStatus(msgspec.Struct, frozen=True, kw_only=True):
     bus: str
     device: str
     struck: int
-    """How often it took effect."""
+    """Number of times that the fault took effect."""
 
 
 class StruckStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A fault that was injected, and how often it took effect."""
+    """A fault that was injected, and the number of times that it took effect."""
 
     number: int
-    """Its position among all faults of these devices, from 1."""
+    """The position of this fault among all faults that were injected into these devices, from 1."""
     id: str
     name: str
     on: str
@@ -86,18 +87,18 @@ class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     system_hash: str
     devices: dict[str, SimulatedDeviceStatus]
     clients: dict[str, dict[str, Counts]] = {}
-    """By bus and client: the requests that reached a device, and the replies."""
+    """The requests that reached a device, and the replies, by bus and client."""
     faults: list[ActiveFaultStatus] = []
     struck: list[StruckStatus] = []
-    """Every fault so far, the first one first."""
+    """Every fault so far, in the order of injection."""
     listening: dict[str, str] = {}
-    """By bus: the URL at which its simulated devices listen."""
+    """The URL at which the simulated devices of each bus listen."""
     far: dict[str, str] = {}
-    """By transmitter: the URL of the modem at the other end of its link."""
+    """The URL of the remote modem of each transmitter."""
     links: dict[str, Counts] = {}
-    """By transmitter: messages sent, sent again and delivered over the modems' link."""
+    """The messages sent, sent again and delivered over the modems' link, for each transmitter."""
     buses: dict[str, dict[str, Any]] = {}
-    """By URL: the statistics of a CAN bus that this process serves (`SoftBusServer.bus_stats`)."""
+    """The statistics of each CAN bus that this process serves, by URL (`SoftBusServer.bus_stats`)."""
     set: dict[str, float] = {}
     """The values that were set by hand or by a test, by DEVICE.TAG."""
     lease: LeaseStatus = LeaseStatus()

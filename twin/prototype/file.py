@@ -180,7 +180,7 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
 
 
 def _anywhere(listen: Endpoint) -> bool:
-    """Return whether the endpoint chooses a free port when it is opened, so that it cannot clash."""
+    """Return whether the operating system chooses a free port for the endpoint, so that it cannot clash."""
     if listen.is_can:
         return listen.path.endswith(":0")
     return listen.scheme != "pty" and listen.port == 0

@@ -35,7 +35,7 @@ class GroupMember:
 
 @dataclass(frozen=True)
 class SystemGroup(ABC):
-    """The systems of a run. It assigns names and faults to them.
+    """The systems of a run. This class gives them names and distributes faults to them.
 
     `members` are in the file's order; `seed` is the file's.
     """
@@ -51,7 +51,9 @@ class SystemGroup(ABC):
     @property
     @abstractmethod
     def whole(self) -> System:
-        """Return all systems combined as one, under the group's names. It is only for inspection and must never be run."""
+        """Return all systems combined as one system, with the names of the group. The result is for inspection and must never
+        be run.
+        """
 
     @property
     def shared(self) -> tuple[str, ...]:
@@ -76,7 +78,8 @@ class SystemGroup(ABC):
     def random_shared_faults(
         self, random: Random, kinds: Collection[str], mean_s: float, last_s: float
     ) -> list[dict[str, Any]]:
-        """Return random faults of the shared resources, in the form of a fault file. All are over after `last_s` seconds.
+        """Return random faults of the shared resources, in the form of a fault file. All of them have ended after `last_s`
+        seconds.
 
         `kinds` are names of faults; empty: all. `mean_s` is the mean time between two faults of a system, in seconds.
         """

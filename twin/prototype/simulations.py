@@ -59,7 +59,7 @@ def _check_source(file: YamlFile, simulation: SimulationForm, name: str) -> None
 
 
 def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceProfile, errors: ErrorCollector) -> None:
-    """Check that a device plays numeric tags of its own, from names that its simulation computes where those are known.
+    """Check that `plays` maps numeric tags of the device to names that its simulation computes, as far as these names are known.
 
     Raises `FileInvalid` if nothing can be checked; errors of single tags are added to `errors`.
     """
@@ -139,8 +139,8 @@ class Simulations:
         return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
-        """Return the signals that `device` plays: those of its entry, else every value of the simulation that has a
-        tag's name.
+        """Return the signals that `device` plays: those that its entry names, else every value of the simulation that has the
+        name of a tag.
         """
         assert form.simulation is not None
         simulation = self._made[form.simulation]

@@ -39,7 +39,9 @@ from fieldtwin.twin.site.system import System
 
 FLUSH_EVERY_NS = 60 * NS_PER_S
 STARTING_NS = NS_PER_S // 20
-"""Delay between the simulated devices and the control system: devices are ready before the first request, as in real time."""
+"""Delay (ns) between the start of the simulated devices and that of the control system: devices are ready before the first
+request, as in real time.
+"""
 _IN_MEMORY = Path(":memory:")
 
 
@@ -47,8 +49,8 @@ class VirtualPrototype(AsyncResource):
     """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit
     log and retained values; the exchange log is in memory.
 
-    `seed` replaces the prototype file's. `taps` observe the gateway's connections. `prepare` is called when everything
-    is made and nothing has run yet. `water`: the acoustic connections of transmitters that are in a network. After entering,
+    `seed` replaces the prototype file's. `taps` observe the gateway's connections. `prepare` is called when everything is
+    created and nothing has run yet. `water`: the acoustic connections of transmitters that are in a network. After entering,
     `field`, `gateway` and `plc` run.
     """
 
@@ -158,5 +160,7 @@ class VirtualPrototype(AsyncResource):
         return bool(self.outputs_confirmed_safe)
 
     def failure(self) -> BaseException | None:
-        """Return the exception that ended a part of the prototype by itself, if any. It is a bug of this project."""
+        """Return the exception that ended a part of the prototype unexpectedly, if any. Such an exception is a bug of this
+        project.
+        """
         return self._nursery.failure()

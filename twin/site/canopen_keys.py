@@ -66,7 +66,7 @@ def canopen_node(
 
 
 def check_rpdo1(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, profile: DeviceProfile, sync: bool) -> None:
-    """Check that RPDO1's tags may be written and fit into 8 bytes. `sync` says that the bus has a SYNC producer."""
+    """Check that RPDO1's tags may be written and fit into 8 bytes. `sync` states whether the bus has a SYNC producer."""
     if form.rpdo1 is None:
         return
     loc = (*loc, "rpdo1")

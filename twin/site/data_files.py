@@ -1,4 +1,4 @@
-"""Locations of shipped data: the wheel's copy, then the checkout (DESIGN.md decision 14).
+"""Finds shipped data: in the installed wheel if it holds a copy, otherwise in the checkout.
 
 Profiles and systems are searched in this order: the folders given by an option, FIELDTWIN_PROFILES, ./profiles, the
 shipped ones. A file inside a template searches the template first, because a template is complete and refers to its own
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 MAX_BYTES = 8 * 1024 * 1024
 # the path is not resolved yet, because in a checkout fieldtwin/twin is a link
 _HERE = Path(__file__).absolute().parents[3].resolve()
-"""site-packages where a wheel is installed, the checkout otherwise."""
+"""The folder site-packages if a wheel is installed, otherwise the checkout."""
 
 
 def data_root(base: Path = _HERE) -> Path:
@@ -29,7 +29,7 @@ def data_root(base: Path = _HERE) -> Path:
 
 
 TEMPLATE = "template.json"
-"""The manifest at the top of a template's folder (`fieldtwin.twin.template.template`)."""
+"""The file name of the manifest, which is at the top of a template's folder (`fieldtwin.twin.template.template`)."""
 
 
 def template_of(file: Path | None) -> list[Path]:
@@ -47,7 +47,9 @@ def search_path(extra: Iterable[Path] = ()) -> list[Path]:
 
 
 def device_files(folder: Path) -> list[Path]:
-    """Return the device profiles of a folder of the search path: those in its `devices`, and those in the folder itself."""
+    """Return the device profiles of a folder of the search path: those in its subfolder `devices`, and those in the folder
+    itself.
+    """
     return [*sorted((folder / "devices").glob("*.yaml")), *_with_key(folder, "device")]
 
 

@@ -30,7 +30,7 @@ def kind_of(data: Mapping[str, Any]) -> str:
 def group_file(name: str, profiles: Iterable[Path] = ()) -> tuple[str, Path] | None:
     """Return kind and path of the file that `name` refers to if it describes several systems.
 
-    None for any other file, and if the file does not exist.
+    Return None for any other file, and if the file does not exist.
     """
     try:
         path = find("systems", name, extra=profiles)

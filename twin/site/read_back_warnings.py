@@ -1,8 +1,8 @@
 """Warnings for the author of a system file about tags that the gateway reads only once, after it has connected.
 
 The value that the device holds in such a tag is unknown: the published value is the one read at the start, or there is
-none. It stays good while the device changes or is lost. A device that loses a written value does not get it again, and
-every start writes it again. Pure: it inspects a loaded system file.
+none. It stays good while the device changes or is lost. If the device loses a written value, the gateway does not notice it
+and does not write it again; every start of the gateway writes it again. Pure: it inspects a loaded system file.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tupl
 
 
 ONCE = ("identity", "setup")
-"""Poll groups whose values do not change while the device runs: they are read once on purpose."""
+"""Poll groups whose values do not change while the device runs. The gateway reads them only once, by design."""
 
 
 def read_only_once(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The error of a reference to a device that the system file does not have, or has with an error."""
+"""The error of a reference to a device that the system file does not declare, or declares with an error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 
 
 def no_device(file: YamlFile, loc: tuple[Key, ...], name: str, others: Iterable[str] = ()) -> FileInvalid:
-    """Return the error of a reference to the device `name`. The reference may also contain one of `others`."""
+    """Return the error of a reference to the device `name`. `others` are further names that the reference accepts; the message
+    suggests the nearest name.
+    """
     declared = list(file.data["devices"])
     if name in declared:
         return FollowingError(f"the device {name!r} has an error", path=file.path)

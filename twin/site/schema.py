@@ -312,7 +312,7 @@ class InvariantsForm(SiteModel):
 
 
 NONE_STATED = InvariantsForm()
-"""The invariants of a system that states none."""
+"""The invariants of a system whose file states none."""
 
 
 class SystemForm(SiteModel):

@@ -40,8 +40,8 @@ class Serving:
     def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
         """Return the sections as a gateway runs them.
 
-        With `free_ports` (a prototype) sockets take a free port of the same host. A serial line is also opened
-        elsewhere then, by the connector.
+        With `free_ports` (a prototype) sockets take a free port of the same host. In a prototype the connector also opens a
+        different port in place of a serial line.
         """
         bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
         if not free_ports:
@@ -165,7 +165,7 @@ def _tag(
 
 
 def _usual_type(tag: Tag) -> str:
-    """Return the device's own type if the value is an integer, else a floating-point type."""
+    """Return the default type of a served value: the device's own type for an integer, else a floating-point type."""
     if tag.type == "bool":
         return "uint16"
     if not tag.is_integer:

@@ -17,7 +17,7 @@ from fieldtwin.twin.site.schema import PlcForm
 def waits_for_its_command(file: YamlFile, plc: PlcForm, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
     """Return one warning for each program that waits for a measured value of a sensor whose period it commands.
 
-    An input that a number replaces (`if_bad: 0`) does not hold a program back after the timeout, so it gives none.
+    An input that a number replaces (`if_bad: 0`) does not hold a program back after the timeout, so it causes no warning.
     """
     found = []
     for name, program in plc.programs.items():

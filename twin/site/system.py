@@ -1,8 +1,8 @@
 """The system: a system file, resolved and checked as a whole. The plant and its prototype both start from it.
 
 Every error that can be found without a connection is found here, and reported with file, line and column: unknown buses
-and profiles, two devices with the same address, tags that no profile has, programs bound to nothing. This module does
-not know what is emulated.
+and profiles, two devices with the same address, tags that no profile has, programs whose variables are bound to no tag. This
+module does not know which devices are emulated.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def _check_programs(system: System, errors: ErrorCollector) -> None:
         loc: tuple[Key, ...] = ("plc", "programs", name)
         for variable, form in program.inputs.items():
             if form.tag.partition(".")[0] in system.plc.programs:
-                continue  # another program's variable: checked where the programs are assembled
+                continue  # a variable of another program, which is checked when the programs are assembled
             with errors.collect():
                 _check_input(system, (*loc, "inputs", variable, "tag"), form.tag)
         for variable, tag in program.outputs.items():
@@ -343,7 +343,9 @@ def _check_write_groups(system: System, errors: ErrorCollector) -> None:
 
 
 def _split(system: System, loc: tuple[Key, ...], tag: str, programs: Iterable[str] = ()) -> tuple[DeviceConfig, str]:
-    """Return the device and the local name of DEVICE.TAG. `programs` may be meant instead, for the error."""
+    """Return the device and the local name of DEVICE.TAG. `programs` are the names of programs, which the error message
+    suggests if the reference fits one of them.
+    """
     device, _, local = tag.partition(".")
     if device not in system.devices:
         raise no_device(system.file, loc, device, programs)

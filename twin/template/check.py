@@ -66,7 +66,7 @@ def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
 
 
 def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock) -> DigitalTemplate:
-    """Build the template's control system, and its prototype if it has one, as a run would do first.
+    """Build the template's control system, and its prototype if it has one, in the same way as a run does when it starts.
 
     This imports control logic in Python. Raises `FileInvalid`.
     """
@@ -118,7 +118,7 @@ def unified(path: str, *sides: tuple[Package, Content | None]) -> Iterator[str]:
     """Yield the lines of a unified diff of one text file; nothing for other files, and for files of more than
     `MAX_SHOWN_BYTES`.
 
-    `sides` are the two templates, each with its content under `path`.
+    `sides` are the two templates, each with the content that it has under `path`.
     """
     texts: list[list[str]] = []
     for package, content in sides:

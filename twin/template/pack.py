@@ -42,7 +42,7 @@ OUR_PROGRAMS = "fieldtwin"
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A file to pack: its kind, and the source of its bytes: a file, or generated `data`."""
+    """A file to pack: its kind, and the source of its bytes, which is either a file or generated `data`."""
 
     kind: Kind
     source: Path | None

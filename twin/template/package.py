@@ -36,15 +36,15 @@ from fieldtwin.twin.template.template import (
 
 BLOCK = 1 << 20
 MAX_RATIO = 200
-"""Highest ratio of unpacked to packed size, for files of more than a block. A recording of zeros compresses 100 times,
-a zip bomb 1,000 times.
+"""The highest permitted ratio of unpacked to packed size, for files of more than one block. A recording of zeros compresses
+100 times, a zip bomb 1,000 times.
 """
 MAX_DIRECTORY_BYTES = MAX_FILES * 600
 _END = struct.Struct("<4s4H2LH")
 """A zip's end of central directory record (APPNOTE 4.3.16)."""
 _LOCAL_CACHE = "__pycache__"
 _DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError)
-"""The exceptions of reading a damaged or foreign zip: `zipfile` passes on the errors of the modules that it uses."""
+"""The exceptions that reading a damaged or foreign zip can raise: `zipfile` passes on the errors of the modules that it uses."""
 
 
 def _reason(error: Exception) -> str:
@@ -65,8 +65,8 @@ class Package(ABC):
     path: Path
     manifest: Manifest
     caches: tuple[str, ...] = ()
-    """Cache files that Python writes where it imports from. They are not part of the template, and are code if they
-    come from an untrusted source.
+    """Cache files that Python writes where it imports from. They are not part of the template. In a template from an untrusted
+    source they count as code, because Python would run them.
     """
 
     @abstractmethod

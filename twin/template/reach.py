@@ -1,4 +1,4 @@
-"""The resources of this computer that a prototype would use, beyond its own run directory and the loopback interface.
+"""Lists the resources of this computer that a prototype would use, beyond its own run directory and the loopback interface.
 
 An untrusted prototype file may use the plant's own bus, name a CAN interface of the kernel, or listen on the network.
 The user is informed before it runs. Nothing is opened here.

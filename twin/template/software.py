@@ -28,7 +28,7 @@ untrusted wheel may be a zip bomb.
 """
 _DATA = f"{PACKAGE}/_data/"
 _NO_SOURCE = re.compile(r"(^|/)__pycache__/|\.pyc$|(^|/)\.")
-"""Files that are next to the modules on a computer that runs them, and never in a fieldtwin wheel."""
+"""Files that Python or the operating system creates next to modules, and that are never in a fieldtwin wheel."""
 
 
 def modules_hash(folder: Path = HERE) -> str:

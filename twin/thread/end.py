@@ -1,7 +1,7 @@
 """One side of a thread: a store, a carrier, and the protocol core between them, for as long as the twin runs.
 
-It opens a link again whenever one is lost, sends events from the store to the other side, stores those that it
-receives, and passes new ones on in order. It can send; a shadow is given the received events only (SPEC ruling 16).
+It opens a new link whenever one is lost, sends events from the store to the other side, stores the events that it receives,
+and passes new ones on in order. This class can send; a shadow is given the received events only (SPEC ruling 16).
 """
 
 from __future__ import annotations
@@ -57,9 +57,11 @@ class ThreadEnd:
         self.connected = False
         self.links = 0
         self.trouble = ""
-        """Why no frames are exchanged now, or the problem that the other side reported; empty if there is no problem."""
+        """The reason why no frames are exchanged now, or the problem that the other side reported; empty if there is no
+        problem.
+        """
         self._refused_by_store = ""
-        """Why this side's store refused the last request."""
+        """The reason why this side's store refused the last request."""
         self._store = store
         self._carrier = carrier
         self._schema = schema
@@ -69,7 +71,7 @@ class ThreadEnd:
         self._on_events = on_events
         self._insists = insists
         self.silent = "there was no link"
-        """A possible reason if nothing was ever received; empty as soon as anything was received."""
+        """A possible reason why nothing was ever received; empty as soon as anything was received."""
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
@@ -94,7 +96,7 @@ class ThreadEnd:
             self._news.set()
 
     async def make_room(self) -> int:
-        """Forget the older half of what the other side has confirmed, when this side's store is full.
+        """When this side's store is full, delete the older half of the events that the other side has confirmed.
 
         Return the number of events.
         """
@@ -175,7 +177,7 @@ class ThreadEnd:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
 
     async def _wait(self, now_ns: int) -> None:
-        """Wait until something arrives or is due."""
+        """Wait until a frame arrives, or until a frame has to be sent."""
         times = [self.into.wake_ns(now_ns), self.out.wake_ns(now_ns) if self.out is not None else None]
         due = min((t for t in times if t is not None), default=None)
         timeout_s = None if due is None else max(0.001, (due - now_ns) / NS_PER_S)

@@ -7,7 +7,7 @@ are differences, and a value takes only the bytes that it needs. Values are not 
     HELLO    tag, schema id, origin, first and last number of the log, whether from a prototype
     DATA     tag, first number, time, events with consecutive numbers
     PIECE    tag, number, count, index, part of a DATA frame that is too large for the carrier
-    ACK      tag, number up to which everything is stored, then lengths of the gaps and runs after it
+    ACK tag, number up to which every event is stored, then lengths of the gaps and runs after it
     LOST     tag, first and last number of events that are no longer in the log
     ASK      tag that the receiver does not know: requests a HELLO
     REFUSED  tag, id of a schema that the receiver does not have
@@ -82,7 +82,9 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Everything up to `through` is stored. `runs` follow it: pairs of a number of missing and a number of stored events."""
+    """The sender of this frame has stored every event up to number `through`. After it follow `runs`: pairs of a number of
+    missing and a number of stored events.
+    """
 
     tag: bytes
     through: int
@@ -128,7 +130,7 @@ def varint(number: int) -> bytes:
 
 
 def zigzag(number: int) -> bytes:
-    """Encode a signed number so that small ones of either sign are short."""
+    """Encode a signed number as an unsigned one, so that small positive and small negative numbers need few bytes."""
     return varint(number << 1 if number >= 0 else (-number << 1) - 1)
 
 

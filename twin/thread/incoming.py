@@ -15,7 +15,7 @@ from fieldtwin.gateway.store.event import Event, merged
 from fieldtwin.twin.thread.frames import MAX_RUNS, Ack, Ask, Data, Frame, Hello, Lost, Refused
 
 FAR_AHEAD = 100_000
-"""Numbers that are further than this after the first gap are not stored; they will be sent again."""
+"""Events whose numbers are more than this after the first gap are not stored; the sender will send them again."""
 MAX_STREAMS = 16
 MAX_RANGES = 1000
 
@@ -53,12 +53,12 @@ class _Stream:
     hello: Hello
     through: int = 0
     ranges: list[tuple[int, int]] = field(default_factory=list)
-    """Ranges that are stored after the first gap, in order."""
+    """Ranges of numbers that are stored after the first gap, in order."""
     under_way: set[int] = field(default_factory=set)
-    """Numbers whose storing is in progress."""
+    """Numbers of the events that are being stored now."""
     open: bool = False
     ack_ns: int | None = None
-    """Time at which to acknowledge."""
+    """Time (ns) at which this end has to acknowledge the stored events."""
 
     def has(self, number: int) -> bool:
         return number <= self.through or number in self.under_way or any(a <= number <= b for a, b in self.ranges)
@@ -169,7 +169,7 @@ class IncomingLogs:
         return [stream for stream in self._streams.values() if stream.hello.origin == origin]
 
     def through(self, origin: str) -> int:
-        """Return the number up to which everything of `origin` is in the store, or recorded as lost."""
+        """Return the number up to which every event of `origin` is in the store, or recorded as lost."""
         return max((stream.through for stream in self._of(origin) if stream.open), default=0)
 
     def _acknowledge(self, stream: _Stream, now_ns: int, *, at_once: bool = False) -> None:

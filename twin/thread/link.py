@@ -24,14 +24,16 @@ class Link(ABC):
     """A connection to the other side, until it is lost. It has one reader and one writer."""
 
     trouble = ""
-    """Why no frames are exchanged now although the link is not lost; empty if there is no problem."""
+    """The reason why no frames are exchanged now although the link is not lost; empty if there is no problem."""
     quiet = "nothing came"
     """Explanation for the user if nothing is ever received over this link."""
     ack_delay_ns = 0
-    """How long an ACK may be delayed. On a link with seconds of latency, one ACK serves for many frames."""
+    """The time (ns) by which an ACK may be delayed. On a link with seconds of latency, one ACK serves for many frames."""
 
     linger_ns = 0
-    """How long events may wait for more events. On a link with seconds of latency, frames should be full."""
+    """The time (ns) that events may wait for further events that fill the frame. On a link with seconds of latency, frames
+    should be full.
+    """
 
     @abstractmethod
     async def send(self, frame: Frame) -> None:

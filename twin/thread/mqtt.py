@@ -28,7 +28,7 @@ GOODBYE_S = 1.0
 
 
 FAILURE = 0x80
-"""SUBACK codes from here on are refusals (MQTT 3.9.3)."""
+"""SUBACK codes of this value and above are refusals (MQTT 3.9.3)."""
 ACCESS = (
     "the user needs permission to read and write the topics of group and node, and STATE (docs/explanation/thread.md)"
 )
@@ -46,7 +46,7 @@ class _Socket(ssl.SSLSocket):
 
 
 class _Heard(logging.Handler):
-    """A log handler that keeps the last message of paho, which is the only source for the reason of a lost connection."""
+    """A log handler that keeps the last message of paho. No other source states why a connection was lost."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -158,7 +158,7 @@ class MqttLink(Link):
         return self.side.fit(events)
 
     def knows(self, schema: bytes) -> bool:
-        """Return True: births announce every name, so the schema need not be known beforehand."""
+        """Return True: birth messages announce every name, so that this side need not know the schema beforehand."""
         return True
 
     async def aclose(self) -> None:

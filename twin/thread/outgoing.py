@@ -19,7 +19,7 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.twin.thread.frames import Ack, Data, Frame, Hello, Lost, tag_of
 
 WINDOW = 2000
-"""Events in memory, in flight or waiting to be sent; the rest waits in the store."""
+"""The largest number of events in memory, which are in flight or wait to be sent. Further events wait in the store."""
 RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
 
 URGENT = frozenset((Kind.COMMAND, Kind.STATE))
@@ -33,7 +33,7 @@ Fit = Callable[[bytes, Sequence[Event]], int]
 class _Slot:
     event: Event
     sent_ns: int = -1
-    """Time at which it was last sent; -1 if it was not sent yet."""
+    """Time (ns) at which the event was last sent; -1 if it was not sent yet."""
     tries: int = 0
 
 
@@ -76,13 +76,15 @@ class OutgoingLog:
         self.through = 0
         """Every event up to this number is in the other side's log."""
         self.refused = False
-        """The other side does not have this side's schema. HELLO is repeated now and then, because it may get the schema."""
+        """Whether the other side does not have this side's schema. HELLO is repeated periodically, because the other side may
+        get the schema later.
+        """
         self.resent = 0
         self.linger_ns = 0
-        """How long events wait for more events that fill the frame. The carrier sets it."""
+        """The time (ns) that events wait for further events that fill the frame. The carrier sets it."""
         self.contradicted = False
-        """The other side has more of this log than this side: the store was replaced by an older copy, for example from a backup.
-        New events would have numbers that the other side already has.
+        """Whether the other side has more events of this log than this side: the store was replaced by an older copy, for
+        example from a backup. New events would have numbers that the other side already has.
         """
         self._schema = schema
         self._prototype = prototype
@@ -99,7 +101,7 @@ class OutgoingLog:
         self._doubt_ns: int | None = None
         """Time at which to verify with HELLO that the other side has what it confirmed; None while there is no doubt."""
         self._asked_ns: int | None = None
-        """Time at which that was first asked."""
+        """Time (ns) at which this side first asked for that with a HELLO."""
         self._rto = _Rto()
         self._lost: deque[tuple[int, int]] = deque()
         """Ranges of lost events that are yet to be reported."""
@@ -144,7 +146,7 @@ class OutgoingLog:
     # -- what comes -------------------------------------------------------------------------------------------------------
 
     def connected(self, now_ns: int) -> None:
-        """Start over on a link, which may be new: frames in flight may be lost, and the other side may be a different one."""
+        """Begin to send over a link that was opened: frames in flight may be lost, and the other side may be a different one."""
         self._known = False
         self._hello_ns = now_ns
         self._doubt_ns = self._asked_ns = None
@@ -194,7 +196,7 @@ class OutgoingLog:
             self._rto.calm()
 
     def _is_less(self, through: int, now_ns: int) -> bool:
-        """Handle an ACK for less than was confirmed before: it is late, or the other side is a different one.
+        """Handle an ACK that confirms fewer events than an earlier one: it is late, or the other side is a different one.
 
         A HELLO asks the other side, whose answer then counts, because the earlier confirmations may be those of a different side.
         Return whether to use this ACK.
@@ -288,7 +290,7 @@ class OutgoingLog:
         return now_ns < self._gathers_ns + self.linger_ns and not any(event.kind in URGENT for event in events)
 
     def _time_out(self, now_ns: int) -> None:
-        """Send events again that waited too long for their ACK. It is enough to check the oldest event."""
+        """Send the events again whose ACK is overdue. It is enough to check the oldest event."""
         oldest = next(iter(self._window.values()), None)
         if oldest is None or oldest.sent_ns < 0 or now_ns < oldest.sent_ns + self._rto.now_ns:
             if oldest is None and not self._lost and self.through < self._loaded and self._tail_due(now_ns):

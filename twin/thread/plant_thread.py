@@ -243,7 +243,8 @@ class PlantThread:
                     await self._hand_over(client, origin, event)
                 finally:
                     await client.aclose()
-            except FieldtwinError as e:  # not tried again: a command is meant for now
+            # not tried again, because a command applies to the moment at which it was sent
+            except FieldtwinError as e:
                 self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
 
     async def _hand_over(self, client: ControlClient, origin: str, event: Event) -> None:

@@ -51,7 +51,7 @@ MAX_BYTES = 60_000
 
 
 def types_of(system: System) -> dict[str, MetricType]:
-    """Return the type with which each tag is announced."""
+    """Return the metric type with which the birth message announces each tag."""
 
     def kind(tag: Tag) -> MetricType:
         return MetricType.STRING if tag.is_text else MetricType.INT64 if tag.is_integer else MetricType.DOUBLE
@@ -111,7 +111,7 @@ def _is_online(data: bytes) -> bool:
 
 
 class _Side:
-    """The common part of edge node and host."""
+    """The base class of `EdgeNode` and `HostApplication`."""
 
     def __init__(self) -> None:
         self._codec = FrameCodec((), 1400)
@@ -251,7 +251,7 @@ class HostApplication(_Side):
         super().__init__()
         self.subscriptions = tuple(topic(group, kind, node) for kind in ("NBIRTH", "NDATA", "NDEATH"))
         self.alive = False
-        """Whether the edge node has been born and has not died since."""
+        """Whether the edge node has sent its birth message, and no death message (NDEATH) has arrived since."""
         self.missed = 0
         """Number of messages that are missing according to `seq`."""
         self._group, self._node, self._state = group, node, state_topic(host)

@@ -73,7 +73,7 @@ def state_topic(host: str) -> str:
 
 
 def type_of(value: Value) -> MetricType:
-    """Return the type that holds a value exactly."""
+    """Return the metric type that represents a value exactly."""
     if isinstance(value, int):
         return MetricType.INT64
     if isinstance(value, float):

@@ -12,7 +12,7 @@ class ReceivedLog(msgspec.Struct, frozen=True, kw_only=True):
     """A log that this end receives."""
 
     through: int
-    """The last event up to which everything is stored, or recorded as lost."""
+    """Number of the last event up to which every event is stored, or recorded as lost."""
     lost: int
     """Events that the sender's store no longer had, since this process began."""
 
@@ -23,9 +23,9 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     carrier: str
     connected: bool
     since_ms: int | None
-    """Since when it is connected, or not (UTC); None before the thread began."""
+    """The time of the last connection or disconnection (UTC); None before the thread began."""
     links: int
-    """How many links were opened so far."""
+    """Number of links that were opened so far."""
     origin: str
     sent_through: int | None
     """The last event that the other end has acknowledged; None before the first link."""
@@ -36,9 +36,9 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     received: dict[str, ReceivedLog]
     """The logs of the other end, by their origin."""
     silent: str
-    """Why nothing arrives although the link is open; empty if data arrive."""
+    """The reason why no events arrive although the link is open; empty if events arrive."""
     trouble: str
-    """Why events cannot be sent or stored; empty if they can."""
+    """The reason why events cannot be sent or stored; empty if they can."""
 
 
 class PlantThreadStatus(ThreadStatus, frozen=True, kw_only=True):
@@ -48,8 +48,8 @@ class PlantThreadStatus(ThreadStatus, frozen=True, kw_only=True):
     """The URL at which it listens."""
     written: int
     dropped: int
-    """Events that its log lost."""
+    """Number of events that could not be written into its log."""
     store_trouble: str
-    """Why its log cannot be stored; empty if it is stored."""
+    """The reason why its log cannot be stored; empty if it is stored."""
     commands_taken: int
     commands_refused: int

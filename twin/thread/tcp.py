@@ -44,9 +44,9 @@ class StreamLink(DatagramLink):
         """A frame that arrived while a control message was expected."""
         self._heard = asyncio.Event()
         self.who = b""
-        """The identifier of the other side, if it sent one."""
+        """The identifier that the other side has sent, if any."""
         self.read = False
-        """Whether a thread reads from this link."""
+        """Whether a thread has begun to read from this link."""
         self.over = asyncio.Event()
 
     async def send_datagram(self, data: bytes) -> None:
@@ -84,7 +84,7 @@ class StreamLink(DatagramLink):
         await self._first(LET_IN_WITHIN_S)
 
     async def introduced(self) -> None:
-        """Wait until the other side has identified itself, has sent something else, or took too long."""
+        """Wait until the other side has identified itself, has sent a different frame, or has exceeded `SAYS_WITHIN_S`."""
         await self._first(SAYS_WITHIN_S)
 
     async def _first(self, within_s: float) -> None:

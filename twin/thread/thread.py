@@ -79,7 +79,7 @@ class ThreadConnection(Generic[P]):
         return count
 
     async def run(self) -> None:
-        """Pump until cancelled."""
+        """Call `pump` periodically until cancelled."""
         while True:
             self.pump()
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + COLLECT_MS * NS_PER_MS)

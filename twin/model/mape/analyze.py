@@ -1,8 +1,8 @@
 """Analyze: the second stage. It compares what the plant reports with the digital model and emits its findings.
 
-It finds state mismatches, values outside the model's limits, and bad and stale values. It also computes the twinning
-figures: how often plant and model agree, the twinning rate, and the lag. This module must never depend on a connection, or on
-code that can send a command.
+It finds state mismatches, values outside the model's limits, and bad and stale values. It also computes the twinning figures:
+the share of statuses in which plant and model agree, the twinning rate (Hz), and the lag (ms). This module must never depend
+on a connection, or on code that can send a command.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 LAGS = 10_000
-"""How many of the latest events count in the figures of the lag."""
+"""Number of the latest events from which the figures of the lag are computed."""
 LATE_MS = 10_000
 """An event that is older than this when it arrives counts as backfilled history, and so does an event from before this twin
 was started. Both are counted, and left out of the lag and the rate.
@@ -132,7 +132,7 @@ class Analyze(DTDigitalThreadProcess):
         yield "outside", "inside", outside, text
 
     def look(self) -> None:
-        """Report the tags that have not been updated for `stale_after_ms`. The caller has to call this periodically."""
+        """Report the tags that have not been updated for `stale_after_ms`. The caller must call this method periodically."""
         now_ms = self._clock.utc_ns() // 1_000_000
         for name, heard_ms in self._heard.items():
             if now_ms - heard_ms > self._stale_after_ms:

@@ -50,7 +50,7 @@ class DecisionLog:
         self._open: deque[tuple[Decision, COMMAND]] = deque(maxlen=MOST)
         """Planned commands that are neither sent nor refused, in order."""
         self._states: dict[str, str] = {}
-        """The last agreed state of each program."""
+        """The last state of each program on which plant and model agreed."""
 
     def newest(self, most: int) -> list[Decision]:
         """Return the newest decisions, oldest first."""
@@ -82,7 +82,7 @@ class DecisionLog:
         decision.outcome, decision.reason, decision.settled_ms = REFUSED, why, now_ms
 
     def asked(self, command: COMMAND, question: Question) -> None:
-        """Record that a prototype is asked about a command."""
+        """Record that a prototype is simulated before a command is sent."""
         for decision, planned in self._open:
             if planned is command:
                 decision.outcome = SIMULATING

@@ -45,7 +45,7 @@ class CommandCheck:
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
     def restate(self, bounds: CommandLimits) -> None:
-        """Use new bounds from now on. Commands that were taken before still count towards the rate."""
+        """Replace the limits. Commands that were taken before still count towards the rate."""
         if bounds != self.bounds:
             self.bounds = bounds
             self._taken = deque(self._taken, maxlen=bounds.per_minute)
@@ -64,15 +64,15 @@ class CommandCheck:
         return ""
 
     def take(self) -> None:
-        """Count a command as taken now."""
+        """Count a command towards the rate, at the present time."""
         self._taken.append(self._clock.monotonic_ns())
 
 
 class Execute(DTDigitalThreadProcess):
     """SPEC row Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
 
-    If the planner gives a command no question, `what_if` is asked the twin's default `question`. The command is sent only
-    after an answer without an objection. `decisions` records the outcomes.
+    `what_if` answers the question of each command, by simulation; the default `question` applies if the planner gives none.
+    The command is sent only after an answer without an objection. `decisions` records the outcomes.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Execute(DTDigitalThreadProcess):
 
     @property
     def asking(self) -> bool:
-        """Return whether a command waits for its answer; commands planned meanwhile wait in the queue."""
+        """Return whether a command waits for the answer of a prototype; commands planned meanwhile wait in the queue."""
         return self._pending is not None
 
     def change_state(self, command: COMMAND) -> str:

@@ -12,7 +12,7 @@ _REASONS = frozenset(int(reason) for reason in Reason)
 
 @dataclass(frozen=True, slots=True)
 class SeenStatus(STATUS):
-    """A STATUS of the state machine `whose`, at `t_ms` on the plant and at `arrived_ms` on this side (both UTC)."""
+    """A STATUS of the state machine `whose`, sent by the plant at `t_ms` and received at `arrived_ms` (both UTC)."""
 
     whose: str = ""
     t_ms: int = 0
@@ -21,7 +21,7 @@ class SeenStatus(STATUS):
 
 @dataclass(frozen=True, slots=True)
 class SeenMeasurement(MEASUREMENT):
-    """A value or a payload, with its complete event."""
+    """A measurement: a value or a payload, with the complete event that carried it."""
 
     event: Event = Event(0, 0, 0, "")  # noqa: RUF009  immutable
     arrived_ms: int = 0

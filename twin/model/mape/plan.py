@@ -86,7 +86,7 @@ class Plan(DTDigitalThreadProcess):
     """SPEC row Plan: consume, Planning, emit.
 
     `take` consumes findings, and `plan_next` plans for the first of them. Findings may wait while a prototype is asked
-    about a command; `overtaken` counts those that `only_newest` dropped because a newer finding superseded them.
+    about a command; `overtaken` counts the findings that `only_newest` dropped because a newer finding superseded them.
     `decisions` records what is planned.
     """
 

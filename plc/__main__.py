@@ -1,4 +1,6 @@
-"""``python -m fieldtwin.plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; diagnostics go to stderr."""
+"""``python -m fieldtwin.plc CONFIG.json``: one PLC process. Its exit codes are those of the command line
+(docs/explanation/design.md); diagnostics go to stderr.
+"""
 
 from __future__ import annotations
 

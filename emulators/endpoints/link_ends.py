@@ -1,6 +1,6 @@
 """The ends between which an emulated connection forwards bytes: an outgoing or incoming TCP connection, and a serial device.
 
-They share no code with the gateway's ends (DESIGN.md), so that a mistake in one cannot be hidden by the same mistake in
+They share no code with the gateway's ends, so that a mistake in one cannot be hidden by the same mistake in
 the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. These ends know no protocol.
 """
 

@@ -4,7 +4,7 @@ The record is a transport format, not a protocol under test, so the gateway and 
 24 bytes, in network byte order: flags u8, dlc u8, two spare bytes, identifier u32, time stamp u64 (ns), and 8 data
 bytes padded with zeros. On a connection that carries CAN FD, records have 80 bytes; they differ only in their 64 data
 bytes, and their dlc is the number of bytes. The size is fixed so that a reader can take exactly one record from a
-socket and leave the rest readable (DESIGN.md, decision 4).
+socket and leave the rest readable.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Every error that leaves fieldtwin is a `FieldtwinError`. Foreign exceptions (``O
 translated once, where they arise; code above that place does not catch them. Bad quality is data and never an error
 (SPEC ruling 11): these classes state why a value is missing.
 
-The class decides the exit code of the command line (DESIGN.md, command line contract).
+The class decides the exit code of the command line (docs/explanation/design.md, "Command line contract").
 """
 
 from __future__ import annotations

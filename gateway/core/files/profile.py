@@ -1,8 +1,8 @@
 """A device profile with everything resolved: addresses as sent, sizes, groups, commands.
 
 The driver and the emulator read the same profile and share nothing else: the driver decodes with
-fieldtwin.gateway.devices.codec, the emulator encodes with its own codec (DESIGN.md, the one idea). Addresses are shown
-in two forms, as printed in manuals and as sent (decision 9).
+fieldtwin.gateway.devices.codec, the emulator encodes with its own codec, so that a mistake in one codec is not hidden by the
+same mistake in the other. Addresses are shown in two forms, as printed in manuals and as sent.
 """
 
 from __future__ import annotations

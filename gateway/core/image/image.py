@@ -2,7 +2,7 @@
 
 There are normally two regions: `INPUTS`, written by the gateway, and `OUTPUTS`, written by the PLC. Each publication
 carries a counter and a time, which show the other process that the writer is alive. Both ends of the memory compare a
-hash of the layout. This module has no mmap, no file and no clock (DESIGN.md, "Who shares the process image").
+hash of the layout. This module has no mmap, no file and no clock: the caller provides the memory and the time.
 
 Messages (a modem's mailbox) go through a region as rings. The *other* region holds the sequence of the last message that has
 been handled: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for every

@@ -1,11 +1,11 @@
 """The writing of outputs: the values that the PLC commands, safe values, and the check whether a write is allowed.
 
 A stopped PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's heartbeat
-stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from the value that the device last confirmed. It
-is written again after the device was lost, or when the device reads back a different value. At the start the writer waits for the
-first reading of an output, and writes nothing if the device already holds the wanted value. Outputs that share one frame (an
-RPDO) are written together. Nothing is written to a plant where writing is not allowed, and every write and refusal is recorded in
-the audit log before it is sent.
+stops. A value is written when it differs from the value that the device last confirmed. It is written again after the device
+was lost, or when the device reads back a different value. At the start the writer waits for the first reading of an output,
+and writes nothing if the device already holds the wanted value. Outputs that share one frame (an RPDO) are written together.
+Nothing is written to a plant where writing is not allowed, and every write and refusal is recorded in the audit log before it
+is sent.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_a_recording_that_was_cut_off_is_used_up_to_its_last_whole_row(tmp_path: Path) -> None:
-    """A killed recorder leaves half a line; the lines before it are valid (DESIGN.md, decision 7)."""
+    """A killed recorder leaves half a line; the lines before it are valid, and the emulated device replays them."""
     write_cast(tmp_path / "sta1.cnv")
     assert run_to_end(tmp_path, "import", "sta1.cnv", name="import").process.returncode == 0
     whole = (tmp_path / "sta1.jsonl").read_bytes()

@@ -61,7 +61,8 @@ def pytest_configure(config: pytest.Config) -> None:
         "are (docs/reference/pytest-plugin.md)",
     )
     config.addinivalue_line("markers", "requirement(*ids): requirements that the test covers")
-    if config.getoption("--fieldtwin-html") and not hasattr(config, "workerinput"):  # with xdist, once for all workers
+    # with xdist, the report is written once for all workers
+    if config.getoption("--fieldtwin-html") and not hasattr(config, "workerinput"):
         from fieldtwin.testing.results import Results
 
         config.stash[_RESULTS] = Results(config)
@@ -100,7 +101,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """A failure shows what was on the wires."""
+    """Add the observed traffic to the report of a failed test."""
     report = yield
     if report.failed and report.when == "call" and (wires := item.stash.get(_WIRES, None)):
         from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
@@ -133,7 +134,7 @@ def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
 
 
 def _runner(config: pytest.Config) -> WorkerProcess:
-    """The worker process, which is started when a test first needs it."""
+    """Return the worker process, which is started when a test first needs it."""
     if _RUNNER not in config.stash:
         from fieldtwin.testing.runner import WorkerProcess, command_of
 
@@ -240,7 +241,7 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
         whole: PrototypeHandle = request.getfixturevalue("prototype")
         places = _places(request)
         yield _or_fail(lambda: RunningPlc(runner, whole.id, places["profiles"]))
-        return  # it ends with the field simulator
+        return  # gateway and PLC end together with the field simulator
     if "plc" not in said:
         pytest.fail(
             'the program is missing: @pytest.mark.fieldtwin(plc="pump.st"), or system="observatory"', pytrace=False

@@ -146,7 +146,7 @@ def _realtime() -> DoctorCheck:
 
 
 def _files() -> DoctorCheck:
-    """Check the hard limit: a process that serves many devices raises its own limit up to it."""
+    """Check the hard limit of open files, up to which a process that serves many devices raises its own limit."""
     hard = here.most_open_files()
     if hard is None:
         return DoctorCheck("open files", HostVerdict.OK, "no limit")

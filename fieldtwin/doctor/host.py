@@ -93,7 +93,7 @@ def _quota_in(file: Path) -> list[float]:
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of struct timex (adjtimex(2)); the rest is room."""
+    """The beginning of struct timex (adjtimex(2)), followed by padding for its remaining fields."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -107,7 +107,7 @@ class _Timex(ctypes.Structure):
 
 
 def clock_state() -> ClockState | None:
-    """Return the kernel's clock state (adjtimex(2) without a change); None where it cannot be read."""
+    """Return the kernel's clock state, which adjtimex(2) reads without a change; None if it cannot be read."""
     year = datetime.now(UTC).year
     if not sys.platform.startswith("linux"):
         return None
@@ -139,7 +139,7 @@ def join_advice(ports: Sequence[str]) -> str:
         return 'their groups may not either: a udev rule such as SUBSYSTEM=="tty", GROUP="dialout", MODE="0660"'
     try:
         user = pwd.getpwuid(os.geteuid()).pw_name
-    except KeyError:  # a container's
+    except KeyError:  # the user of a container may have no entry in the list of users
         return f"run with the group {', '.join(sorted(set(groups)))} (docker --group-add)"
     wanted = sorted(set(groups))
     return f"sudo usermod -aG {','.join(wanted)} {user}, and log in again"

@@ -8,7 +8,9 @@ from enum import Enum
 
 MIN_INOTIFY = 16
 MIN_CPUS = 1.0
-"""Gateway, PLC and the run's own process share the processors; fewer than one makes scans late."""
+"""Smallest number of processors. Gateway, PLC and the process of the run share them, and with fewer than one processor scans
+are late.
+"""
 
 
 class HostVerdict(Enum):

@@ -48,7 +48,7 @@ def spelled_out(sources: str) -> str:
 
 
 def _weight(case: About) -> str:
-    """Return how much a failure weighs, also on the transports on which it weighs differently."""
+    """Return the weight of a failure, with the transports on which the weight is different."""
     others = [f"On {other.wire}: {WEIGHT[other.basis]}" for other in case.elsewhere if other.basis is not case.basis]
     return " ".join([WEIGHT[case.basis], *others])
 

@@ -91,7 +91,7 @@ class SiteDevice:
 def site_devices(wishes: Iterable[DeviceWish], profiles: tuple[Path, ...] = ()) -> list[SiteDevice]:
     """Return the devices of the new site, each with a bus and a unique address.
 
-    Raises `UsageError` and `FileInvalid` for a profile that is missing or wrong, and for addresses that clash.
+    Raises `UsageError` and `FileInvalid` for a profile that is missing or invalid, and for addresses that clash.
     """
     chosen = list(wishes) or [DeviceWish(EXAMPLE)]
     if len(chosen) > MOST_DEVICES:

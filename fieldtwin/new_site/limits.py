@@ -13,9 +13,9 @@ NEVER_POLLED = ("identity", "setup")
 """Poll groups that the profiles read once, after the connection."""
 _PERCENT = (0.0, 100.0)
 _SETPOINT = {"set", "setpoint", "wanted", "target", "reference"}
-"""Parts of names of values that are wanted and not measured."""
+"""Parts of names that show that a value is a setpoint and not a measurement."""
 _FEW = 10
-"""A range of fewer whole numbers has no room for two limits."""
+"""A range with fewer whole numbers than this has no room for two limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """A tag that the program commands, and its two values. `samples` says that it is a sampling period."""
+    """A tag that the program commands, and its two values. `samples` states whether it is a sampling period."""
 
     tag: Tag
     on: float

@@ -77,7 +77,7 @@ class DeviceView:
 
     @property
     def _number(self) -> Tag:
-        assert self.watched is not None  # templates ask supervised devices only
+        assert self.watched is not None  # templates use this property of supervised devices only
         return self.watched
 
     @property
@@ -162,7 +162,9 @@ class DeviceView:
 
 
 def site_files(wishes: Wishes, devices: list[SiteDevice]) -> dict[str, str]:
-    """Return the text of every file of the new site by its path in the folder, the files to read first first."""
+    """Return the text of every file of the new site by its path in the folder, those that the user should read first at the
+    beginning.
+    """
     program = _program(wishes)
     views = [DeviceView(device, program is not None) for device in devices]
     files: dict[str, tuple[str, str]] = {

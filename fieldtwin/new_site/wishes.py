@@ -1,4 +1,4 @@
-"""The choices for a new site: devices, control, CI and Compose. Parses the text of options and answers.
+"""The choices for a new site: devices, control, CI and Compose. This module parses the text of options and answers.
 
 This module opens no file and no connection.
 """

@@ -20,7 +20,7 @@ from fieldtwin.reports.markup import clean
 from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
 
 MOST_TEXT = 20_000
-"""Characters of the text of one test case."""
+"""Largest number of characters in the text of one test case."""
 
 
 class Flavour(Enum):

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from fieldtwin.results.trace import TraceEvent
 
-if TYPE_CHECKING:  # verdicts and results are also created where no system can be read
+# imported for types only, because verdicts and results are also created where the modules that read systems are not
+# installed
+if TYPE_CHECKING:
     from fieldtwin.twin.site.system import System
 
 
@@ -26,7 +28,7 @@ class Verdict(Enum):
 
     @property
     def bad(self) -> bool:
-        """Whether the verdict needs the attention of a user: FAILED and ERROR."""
+        """Return whether the verdict needs the attention of a user: FAILED and ERROR do."""
         return self in (Verdict.FAILED, Verdict.ERROR)
 
 
@@ -50,8 +52,8 @@ class CheckResult:
     where: str = ""
     names: tuple[str, ...] = ()
     vacuous: bool = False
-    """The check had nothing to check, because the event that it is about did not occur in this run. It may occur in another
-    run.
+    """Whether the check had nothing to check, because the event that it is about did not occur in this run. The event may
+    occur in another run.
     """
 
 
@@ -67,7 +69,9 @@ class Struck:
 
     @property
     def is_set(self) -> bool:
-        """Whether it is not a fault, but a value that a step has set. A set value takes effect when the device sends it."""
+        """Return whether this is not a fault but a value that a step has set. A set value takes effect when the device sends
+        it.
+        """
         return self.id == f"set {self.on}"
 
     @property
@@ -80,7 +84,9 @@ class Struck:
 
 @dataclass
 class AccessCounts:
-    """What was accessed, and how often. `touched` and `refused`: (device, access, table, address, count, subindex)."""
+    """The counts of accesses to devices, of refusals, and of states. `touched` and `refused`: (device, access, table, address,
+    count, subindex).
+    """
 
     services: Counter[tuple[str, str]] = field(default_factory=Counter)
     problems: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -153,12 +159,12 @@ class ScenarioResult:
 
     @property
     def attempts(self) -> int:
-        """Number of times that it ran."""
+        """Return the number of times that the scenario ran."""
         return len(self.earlier) + 1
 
     @property
     def title(self) -> str:
-        """The name, with the seed if it has one, to distinguish several runs of a scenario."""
+        """Return the name, with the seed if there is one, to distinguish several runs of a scenario."""
         return f"{self.name} [seed {self.seed}]" if self.seed is not None else self.name
 
 
@@ -212,10 +218,12 @@ class Report:
     served: Sequence[str] = ()
     """The buses on which the remote client sends the requests."""
     machines_of: Mapping[SystemKey, Sequence[Machine]] = field(default_factory=dict)
-    """The state machines of the systems of scenarios, where these are not `system`."""
+    """The state machines of the systems of scenarios, for scenarios whose system is not `system`."""
 
     def part_of(self, scenario: ScenarioResult) -> Report:
-        """Return the report as it is for the system of one scenario: with its names, secrets and state machines."""
+        """Return the part of the report that concerns the system of one scenario, with the names, secrets and state machines
+        of that system.
+        """
         system = scenario.system
         if system is None or (self.system is not None and key_of(system) == key_of(self.system)):
             return self
@@ -233,12 +241,12 @@ class Report:
 
     @property
     def counts(self) -> dict[Verdict, int]:
-        """Number of scenarios with each verdict."""
+        """Return the number of scenarios with each verdict."""
         return {v: sum(s.verdict is v for s in self.scenarios) for v in Verdict}
 
     @property
     def verdict(self) -> Verdict:
-        """The worst verdict of all scenarios; a run without scenarios is inconclusive."""
+        """Return the worst verdict of all scenarios; a run without scenarios is inconclusive."""
         found = {s.verdict for s in self.scenarios}
         for verdict in (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED):
             if verdict in found:

@@ -21,7 +21,7 @@ from fieldtwin.results.trace_about import about_path
 
 CAPACITY = 200_000
 _AT_ONCE = 256
-"""Events that are encoded and hashed together: one at a time takes three times as long."""
+"""Number of events that are encoded and hashed together. Processing one event at a time takes three times as long."""
 TOPSIDE = "topside"
 
 
@@ -58,7 +58,7 @@ class TraceEvent(NamedTuple):
 
 
 _Noted = tuple[int, TraceKind, str, dict[str, Any]]
-"""An event's fields."""
+"""The fields of an event that is stored but not yet a `TraceEvent`."""
 
 
 _decoder = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]])
@@ -115,16 +115,18 @@ class Trace:
             kind,
             where,
             data,
-        )  # a tuple, because there are millions: a `TraceEvent` is made only for listeners
+        )  # stored as a tuple, because there are millions of events: a `TraceEvent` is created only for listeners
         self._kept.append(noted)
         self._pending.append(noted)
         if len(self._pending) >= _AT_ONCE:
             self.flush()
-        if self._told[kind._value_]:  # `value` goes through a descriptor, a Kind's hash through Python: slow
+        # this avoids `value`, which goes through a descriptor, and the hash of a Kind, which is computed in Python: both
+        # are slow
+        if self._told[kind._value_]:
             self.tell(t_ns, kind, where, data)
 
     def tell(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
-        """Call the listeners with an event, in the order of their registration."""
+        """Pass an event to the listeners, in the order of their registration."""
         event = TraceEvent(t_ns, kind, where, data)
         for listener in self._told[kind._value_]:
             listener(event)

@@ -1,4 +1,4 @@
-"""The description of a trace: which system it is of, the programs of its PLC, and the results of its checks.
+"""The description of a trace: its system, the programs of the PLC, and the results of the checks.
 
 A trace holds events only. The run writes the description into a second file (`about_path`) when it begins, and again with
 the results when it ends. A reader needs no program of the system for it, and executes nothing.
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.input_file import read_input
 SUFFIX = ".about.json"
 VERSION = 1
 MOST_BYTES = 8 << 20
-"""Size of a description that is read. The source texts of programs are the largest part, and have at most 1 MiB."""
+"""Largest size of a description that is read. The source texts of programs are the largest part, and have at most 1 MiB."""
 
 
 class CheckAbout(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,7 +84,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
 
     version: int
     run: str = ""
-    """A number that no other run has. It tells whether a file of the same name was written anew."""
+    """A number that no other run has. It shows whether a file of the same name was written again by another run."""
     system: str
     """The name of the system."""
     system_path: str
@@ -98,7 +98,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     seed: int | None = None
     programs: dict[str, ProgramAbout] = {}
     stale_after_ms: dict[str, int | None] = {}
-    """By tag: how long its value is good without being read again; None: for good."""
+    """The time for which the value of each tag is good without being read again; None: forever."""
     finished: bool = False
     verdict: str = ""
     reason: str = ""

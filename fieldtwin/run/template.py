@@ -31,7 +31,7 @@ class ForeignParts:
 
 
 Ask = Callable[[ForeignParts], bool]
-"""Asks the user whether it may be run, showing the template's contents."""
+"""Shows the contents of a template to the user, and asks whether it may be run."""
 
 
 def system_file(
@@ -55,7 +55,7 @@ def system_file(
         try:
             found = find("systems", name, extra=profiles)
         except UsageError:
-            return name  # its later reader reports the error in it
+            return name  # the later reader of the file reports the error in it
         if _templates_above(found, prototype_file):
             agree(ask, path, [(load_system(name, profiles), prototype_file)], plant=plant, virtual=virtual)
         return name
@@ -109,7 +109,7 @@ def agree(
 
 
 def _templates_above(*files: Path | None) -> list[Path]:
-    """Return the folders of the templates that contain these files, at any depth."""
+    """Return the folders of the templates that contain these files, directly or in subfolders."""
     found: dict[Path, None] = {}
     for file in files:
         if file is not None and file.is_file():

@@ -18,16 +18,16 @@ from fieldtwin.results.trace import Trace
 
 
 class Can(Enum):
-    """Capabilities of a target. The values are the words of a scenario's `needs`."""
+    """The capabilities of targets. The values are the words of a scenario's `needs`."""
 
     INJECT_FAULT = "inject_fault"
     SEND_COMMAND = "send_command"
     SET_VALUE = "set_value"
     SEE_WIRE = "see_wire"
     SEE_HELD = "see_held"
-    """Read the values that the devices held, against which the oracle compares."""
+    """Read the values that the devices held, with which published values are compared."""
     EXACT_TIME = "exact_time"
-    """The host's lateness never affects the run."""
+    """Time is exact: load of the host never affects the run."""
     PROBE = "probe"
     FRESH_START = "fresh_start"
     """Restart PLC, simulations and devices before the scenario (`start: fresh`)."""
@@ -74,7 +74,7 @@ class Stopped:
 
 
 class NothingKnown(FieldtwinError):
-    """The test runner itself was interrupted: its observations prove nothing about the system, and the scenario is
+    """Raised when the test runner itself was interrupted: its observations prove nothing about the system, and the scenario is
     INCONCLUSIVE.
     """
 
@@ -84,7 +84,7 @@ class Bench(Protocol):
 
     @property
     def target(self) -> str:
-        """virtual, local, compose or real."""
+        """The kind of the target: virtual, local, compose or real."""
         ...
 
     @property
@@ -105,7 +105,7 @@ class Bench(Protocol):
         ...
 
     async def sleep_until_s(self, t_s: float) -> None:
-        """Return at or after `t_s` seconds since the start, with `reading` and `trace` up to date."""
+        """Wait until `t_s` seconds since the start, or slightly later, and update `reading` and `trace`."""
         ...
 
     def names(self) -> list[str]:
@@ -124,7 +124,7 @@ class Bench(Protocol):
         ...
 
     def stopped(self) -> Stopped | None:
-        """Return the part of the system that does not run, or None. A plant has no simulated field devices."""
+        """Return a part of the system that should run and does not, or None. A plant has no simulated field devices."""
         ...
 
     def not_started(self) -> str:
@@ -148,11 +148,13 @@ class Bench(Protocol):
         ...
 
     async def send(self, period_s: int) -> None:
-        """Let the remote client command a period."""
+        """Send a period as a command of the remote client."""
         ...
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value` for `tag` from now on, whatever its recording says; None ends that."""
+        """Make the device hold `value` for `tag` from now on, instead of its recorded or simulated value; None restores that
+        value.
+        """
         ...
 
     async def inject(self, fault: dict[str, Any]) -> None:

@@ -137,7 +137,7 @@ class RunService:
             self._notifier.ready(event.message if event is not None else "read again")
 
     async def _reloaded(self) -> ServiceEvent | None:
-        """Return the result of a failed reload; None if something was applied, which the statuses show."""
+        """Return the result of a failed reload. Return None if a change was applied, because the statuses show that."""
         try:
             done = await self._session.reload("SIGHUP")
         except FieldtwinError as e:

@@ -35,7 +35,7 @@ class ServiceEvent:
 
 
 def changes(before: RunState | None, now: RunState) -> list[ServiceEvent]:
-    """Yield the events between two snapshots. Without an earlier snapshot, everything that is not well is an event."""
+    """Yield the events between two snapshots. Without an earlier snapshot, every fault that is present is an event."""
     return [
         *_children(before, now),
         *_buses(_buses_of(before), _buses_of(now)),

@@ -1,8 +1,8 @@
 """A run's metrics for monitoring: the latest statuses of gateway and PLC.
 
-Neither values nor names of tags are among them: they may be confidential, and so a plant with 100,000 tags has no more series
-than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the rest is counted as left out. It sends no
-requests: it is given statuses that were polled anyway.
+They contain neither values nor names of tags, because these may be confidential, and because a plant with 100,000 tags then
+has no more series than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the rest is counted as left
+out. It sends no requests: it is given statuses that were polled anyway.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
 
 
 def _clients(page: Page, gateway: GatewayStatus) -> None:
-    """Add the clients' requests: servers and bridges."""
+    """Add the requests of clients of the servers and bridges."""
     counted = page.counter("server_events", "Counters of a server or bridge, by event.")
     fronts: list[tuple[str, Mapping[str, FrontStatus]]] = [("serve", gateway.serve), ("bridge", gateway.bridge)]
     for kind, servers in fronts:
@@ -195,7 +195,7 @@ def _clients(page: Page, gateway: GatewayStatus) -> None:
 
 
 def _watchers(page: Page, gateway: GatewayStatus) -> None:
-    """Count devices by their problem, so that an alert needs no text matching."""
+    """Add the number of devices with each problem, so that an alert need not match texts."""
     page.gauge("devices_wrong", "Devices that differ from those in the system file.").add(
         sum(bool(d.identity_error) for d in gateway.devices.values())
     )
@@ -247,5 +247,5 @@ def _some(named: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def _set(number: int | UnsetType) -> int | None:
-    """Return a field that some devices and buses do not have, as a sample that is left out."""
+    """Return a counter as a sample; None, which leaves the sample out, for a device or bus that does not have this counter."""
     return None if isinstance(number, UnsetType) else number

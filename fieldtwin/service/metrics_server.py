@@ -40,7 +40,9 @@ class MetricsServer:
         self.refused = 0
 
     async def open(self, host: str, port: int) -> str:
-        """Listen; return the URL. Raises `EndpointBusy` if the address is in use, `Unreachable` if it cannot be bound."""
+        """Start listening and return the URL. Raises `EndpointBusy` if the address is in use, `Unreachable` if it cannot be
+        bound.
+        """
         try:
             self._server = await asyncio.start_server(self._serve, host, port, limit=MOST_HEAD)
         except OSError as e:
@@ -75,7 +77,7 @@ class MetricsServer:
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             self.refused += 1  # the client has gone, is too slow, or does not speak HTTP: no reply is possible
         except asyncio.CancelledError:
-            pass  # we are closing
+            pass  # this server is being closed
         finally:
             self._clients.discard(task)
             writer.close()

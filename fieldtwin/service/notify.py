@@ -28,7 +28,9 @@ class Notifier:
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
-        """Read systemd's environment variables and remove them, so that child processes do not notify in our name."""
+        """Read systemd's environment variables and remove them, so that child processes do not notify in the name of this
+        process.
+        """
         address = environment.pop("NOTIFY_SOCKET", "")
         interval = environment.pop("WATCHDOG_USEC", "")
         meant_for = environment.pop("WATCHDOG_PID", "")

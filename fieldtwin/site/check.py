@@ -206,7 +206,9 @@ class _Site:
 
 
 def _aims_in(system: System | None) -> Callable[[FaultSpec], object] | None:
-    """Return the check of a fault's aim. Without a single system it is unknown at what the faults of a file are aimed."""
+    """Return a function that checks a fault's aim. Return None without a system: the aims cannot be checked then, because a
+    fault file does not name its system.
+    """
     return None if system is None else lambda spec: target(system, spec)
 
 

@@ -1,6 +1,6 @@
 """The JSON schemas of all kinds of files that users write, made from the pydantic models that read these files.
 
-The folder `SHIPPED` has them as files, for editors; ``scripts/schemas --write`` makes these files anew.
+The folder `SHIPPED` has them as files, for editors; ``scripts/schemas --write`` creates these files again.
 """
 
 from __future__ import annotations

@@ -65,7 +65,9 @@ class DeviceHandle:
         return getattr(self.endpoint, name)
 
     def set(self, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value`, in engineering units, instead of its own values; None: return to its own values."""
+        """Make the device hold `value`, in engineering units, instead of its own values; with None it returns to its own
+        values.
+        """
         __tracebackhide__ = True
         self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
 

@@ -26,7 +26,7 @@ class Results:
         self._problem = ""
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Record the worst of a test's phases."""
+        """Record the worst result among a test's phases (setup, call, teardown)."""
         if report.when != "call" and report.passed:
             return
         properties = list(report.user_properties)

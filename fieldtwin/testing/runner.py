@@ -35,7 +35,7 @@ class FieldtwinRefused(Exception):
 
 
 def command_of(said: str = "") -> list[str]:
-    """Return the command `fieldtwin`: `said`, else FIELDTWIN_COMMAND, else this Python's."""
+    """Return the command that runs fieldtwin: `said`, else FIELDTWIN_COMMAND, else that of this Python."""
     text = said or os.environ.get(COMMAND_VARIABLE, "")
     return shlex.split(text) if text else [sys.executable, "-P", "-m", "fieldtwin"]
 
@@ -46,7 +46,7 @@ class WorkerProcess:
     def __init__(self, command: Sequence[str] = (), *, trust: bool = False) -> None:
         self.command = list(command) or command_of()
         self.trust = trust
-        """Templates of strangers may run."""
+        """Whether templates from other sources may run without a question."""
         self._process: subprocess.Popen[str] | None = None
         self._answers: Queue[str | None] = Queue()
         self._said: IO[str] | None = None
@@ -127,7 +127,7 @@ class WorkerProcess:
         return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
 
     def close(self) -> None:
-        """End the process, and with it all that it runs."""
+        """End the process, and with it everything that it runs."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -135,7 +135,7 @@ class WorkerProcess:
         try:
             process.stdin.close()
         except OSError:
-            pass  # it had ended by itself
+            pass  # the process had already ended
         try:
             process.wait(END_WITHIN_S)
         except subprocess.TimeoutExpired:

@@ -21,7 +21,7 @@ class RunningPlc:
     """A running PLC.
 
     ``plc["relay.state"]`` is the current value of a program's variable or a device's tag, a state by its name. It runs
-    by the wall clock; `wait` waits. A test's commands are recorded as those of ``test``, in the way of a user's.
+    by the wall clock; `wait` waits. Commands of a test are recorded like commands of a user, under the name ``test``.
     """
 
     def __init__(self, runner: WorkerProcess, bench: int, profiles: Sequence[str] = ()) -> None:
@@ -94,7 +94,7 @@ class RunningPlc:
         self._steer("go")
 
     def restart(self, *, cold: bool = False) -> None:
-        """Recreate the programs; `cold`: without retained values."""
+        """Create the programs again; `cold` discards retained values."""
         self._steer("restart", cold=cold)
 
     def why(self, tag: str) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from fieldtwin.testing.runner import WorkerProcess
 
 POLL_S = 0.02
 SHOWN = 10
-"""Exchanges that a failed expectation shows: the last ones."""
+"""The number of exchanges that the error of a failed expectation shows: the last ones."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class RecordedTraffic:
         at_most: int | None = None,
         **like: Any,
     ) -> list[Exchange]:
-        """Do as `expect` does, without blocking the event loop."""
+        """Do the same as `expect`, without blocking the event loop."""
         __tracebackhide__ = True
         wanted = _Wanted.of(times, at_least, at_most, like)
         until = time.monotonic() + within_s
@@ -180,9 +180,9 @@ class RecordedTraffic:
             await asyncio.sleep(POLL_S)
 
     def _look(self, wanted: _Wanted, like: dict[str, Any], until: float) -> tuple[list[Exchange], bool]:
-        """Return the exchanges, and whether the wait is over.
+        """Return the exchanges, and whether to stop waiting.
 
-        Raises `AssertionError` when their number can no longer be right.
+        Raises `AssertionError` when the expected number can no longer be reached.
         """
         __tracebackhide__ = True
         late = time.monotonic() >= until

@@ -1,7 +1,7 @@
 """Checks that cases share: pure functions of an `Observation`.
 
-The first ones apply to every client in every case: it continues, it does not flood, it sends only valid requests, and
-it never publishes the value of a bad frame. The others are specific to cases.
+The first ones apply to every client in every case: the client continues, does not flood the device, sends only valid requests,
+and never publishes the value of a bad frame. The other checks are specific to cases.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import Verdict
 
 FLOOD_FACTOR = 5.0
-"""Multiple of the usual rate that is a flood. A client that tries four times and polls on stays below it."""
+"""A rate of requests that is this many times the usual rate is a flood. A client that tries four times and polls on stays
+below it.
+"""
 FLOOD_FLOOR = 30
 """Number of requests within the case that is not a flood, however low the usual rate is."""
 NEEDS_PROBE = "only its published values show this: give --probe"
@@ -96,7 +98,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
 
 
 def publishes_good_again(seen: Observation) -> Finding | None:
-    """Check that the device's value is published again after the device has recovered."""
+    """Check that the client publishes the device's value again after the device has recovered."""
     if seen.probed and not any(shown.word is seen.last for shown in seen.of(ValuePublished, seen.over_ns)):
         waited = (seen.until_ns - seen.over_ns) / NS_PER_S
         return failed(f"the correct value was not published within {waited:.1f} s after the last faulty answer")
@@ -126,12 +128,12 @@ def needs_probe(seen: Observation) -> Finding | None:
 
 
 def owes(*rules: Rule) -> CheckFunction:
-    """Check the duties of every client, then `rules`; passed only if the probe saw all published values."""
+    """Return a check of the duties of every client, followed by `rules`. It passes only if the probe saw all published values."""
     return all_of(*DUTIES, *rules, sees_all_values)
 
 
 rejects = owes(needs_probe)
-"""A bad frame that only the values betray."""
+"""Check a client after a bad frame whose acceptance shows only in the published values."""
 survives = owes()
 """Check a client after an answer without values, so that only its frames are examined."""
 
@@ -176,7 +178,7 @@ def keeps_waiting(seen: Observation) -> Finding | None:
 _TAKES: tuple[Rule, ...] = (took_odd_answer, publishes_good_again, sees_all_values)
 accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, *_TAKES)
 accepts_on_line = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, keeps_waiting, *_TAKES)
-"""Check as `accepts`, for a client that sends one request at a time."""
+"""Apply the check `accepts`, for a client that sends one request at a time."""
 either = owes(needs_probe)
 """Check a reply that the client may either use or discard. Only a wrong value fails."""
 
@@ -226,7 +228,7 @@ def _gap_after(seen: Observation, told: ReplySent) -> Iterator[tuple[float, floa
 
 
 def backs_off(seen: Observation) -> Finding | None:
-    """Check that a busy device is not asked more often than usual."""
+    """Check that the client does not ask a busy device more often than usual."""
     busy = list(seen.of(RequestSeen, seen.begun_ns, seen.over_ns))
     span_s = (seen.over_ns - seen.begun_ns) / NS_PER_S
     if len(busy) < 3 or span_s <= 0:
@@ -261,7 +263,9 @@ def quarantines(seen: Observation) -> Finding | None:
 
 
 def late_is_not_data(seen: Observation) -> Finding | None:
-    """Check as `publishes_nothing_bad`, but inconclusive without the client's timeout, within which it may accept a reply."""
+    """Apply the check `publishes_nothing_bad`. The result is inconclusive if the client's timeout is unknown, because the
+    client may accept a reply within this time.
+    """
     bad = publishes_nothing_bad(seen)
     if bad is not None and not seen.timeout_s:
         return inconclusive(f"{bad.reason}; a failure if its timeout is {seen.habit.silent_gap_s:.2f} s: say --timeout")
@@ -309,7 +313,7 @@ def reconnects(seen: Observation) -> Finding | None:
 
 
 def asked_once(seen: Observation) -> Finding | None:
-    """Check that a broadcast, which no device answers, is not repeated for lack of an answer."""
+    """Check that the client does not repeat a broadcast for lack of an answer, because no device answers a broadcast."""
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
     again = next((a for a in seen.of(RequestSeen, first.t_ns + 1) if a.target == first.target), None) if first else None
     if first is None or again is None:
@@ -327,7 +331,7 @@ def _when(seen: Observation, t_ns: int) -> str:
 
 
 def asks_for_less(seen: Observation) -> Finding | None:
-    """Check that a read that was refused is repeated in parts."""
+    """Check that the client repeats a refused read in parts."""
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if first is None:
         return inconclusive("no such read was seen")

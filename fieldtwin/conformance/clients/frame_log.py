@@ -1,7 +1,7 @@
 """Log the frames of a client under test and its hostile device.
 
-The JSON lines are like those of `fieldtwin.commissioning.access.frame_log`. The directions are the client's: the frames that it
-sent, and those that it received.
+The JSON lines are like those of `fieldtwin.commissioning.access.frame_log`. The directions are those of the client: "sent"
+means sent by the client.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from fieldtwin.conformance.core.observation import Event, Garbled, ReplySent, Re
 
 
 class ClientLog(FrameLog):
-    """Appends to `path`; `where` is the endpoint on which the client is served, `words` the command line."""
+    """A log that appends to `path`. `where` is the endpoint on which the client is served, `words` the command line."""
 
     def __init__(self, path: Path, where: str, words: str) -> None:
         super().__init__(path, words)

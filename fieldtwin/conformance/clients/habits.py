@@ -14,7 +14,7 @@ TURNAROUND_MS = 100
 NO_DELAY_MS = 10
 """A pause shorter than this is not a turnaround delay."""
 MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
-"""AP 6: how many bits or registers a request of each function may name."""
+"""The largest number of bits or registers in a request of each function (AP 6)."""
 MOST_CONNECTIONS = 4
 """The largest number of simultaneous connections that does not count as a leak, because old connections may need time to
 close.

@@ -28,7 +28,7 @@ _ANY_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.]*\w
 MAX_LINE = 10_000
 """Maximum number of characters of a line that are examined."""
 MAX_FORMS = 1_000
-"""Forms of lines that a probe remembers."""
+"""Largest number of forms of lines that a probe remembers."""
 SHOWN_CHARACTERS = 80
 PERIOD_S = 0.05
 """Period in seconds of a `tcp://` probe. docs/how-to/check-a-client.md states it, because a shorter-lived value may be missed."""
@@ -62,7 +62,7 @@ class Classifier:
             return False
         known = self._known.get(self.latest)
         if known is not None and known is not word:
-            return False  # not arrived yet
+            return False  # the word has not arrived yet
         self._known[self.latest] = word
         return True
 
@@ -129,7 +129,7 @@ class RegisterProbe:
 
 
 class _Lines:
-    """Whole lines of output and log; of an incomplete line the last `MAX_LINE` characters are kept."""
+    """A splitter of output and log into whole lines. It keeps the last `MAX_LINE` characters of an incomplete line."""
 
     def __init__(self) -> None:
         self._pending = {False: "", True: ""}

@@ -16,7 +16,7 @@ MOST_EVENTS = 200_000
 
 
 class Recorder:
-    """Events in order. `marks`: names of moments, for windows."""
+    """The events of a run in order. `marks` gives names to moments, which limit the windows that are examined."""
 
     def __init__(self) -> None:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)

@@ -1,4 +1,6 @@
-"""Results of a test of a client as JSON and for JUnit. `fieldtwin.conformance.core.results` has what devices have too."""
+"""Results of a test of a client as JSON and for JUnit. The parts that tests of devices also need are in
+`fieldtwin.conformance.core.results`.
+"""
 
 from __future__ import annotations
 

@@ -231,12 +231,12 @@ class ClientRun(Generic[C]):
         return ""
 
     async def _well(self) -> bool:
-        """Wait until correct answers were given and their word was published; return whether both happened."""
+        """Wait until the client received correct answers and published their word; return whether both happened."""
         since_ns = self.stage.now_ns()
         return await self._good_again(since_ns)
 
     async def _well_anew(self) -> bool:
-        """Restart the program, and check as `_well`."""
+        """Restart the program, and then do the same as `_well`."""
         if self.restart is None:
             return False
         self._ended = None
@@ -283,7 +283,7 @@ class ClientRun(Generic[C]):
         self._say(last)
         over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
         await self._good_again(over_ns)
-        while stage.last_ns > over_ns:  # a transfer in progress continued
+        while stage.last_ns > over_ns:  # a transfer that was in progress has continued
             over_ns = stage.last_ns
             await self._good_again(over_ns)
         await asyncio.sleep(case.trail_s)

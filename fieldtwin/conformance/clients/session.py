@@ -138,7 +138,7 @@ async def _judged(
 async def _open(
     listen: Endpoint, stage: HostileServer, nursery: Nursery, closing: AsyncExitStack, framing: str
 ) -> Endpoint:
-    """Serve `listen`; returns the client's side of it."""
+    """Begin to serve at `listen`, and return the endpoint that the client opens."""
     if listen.scheme in ("tcp", "rtu+tcp"):
         server = await OsPorts().listen(listen, stage.serve, MAX_CLIENTS)
         closing.push_async_callback(server.aclose)
@@ -155,7 +155,7 @@ async def _open(
 
 
 def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, OnText]:
-    """Return the probe, and the receiver of the program's output."""
+    """Return the probe, and the function that receives the program's output."""
     if not options.probe:
         return None, lambda text, log: None
     kind, _, mark = options.probe.partition(":")

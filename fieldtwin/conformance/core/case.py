@@ -1,6 +1,6 @@
 """A test case: its ID in the test-case list, the action of the device, the expected reaction of the client, and its check.
 
-Protocols are elsewhere.
+This module does not depend on a protocol.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ TRAIL_S = 0.3
 
 
 class Impact(Enum):
-    """Impact level of a case on the equipment behind the client, in rising order."""
+    """The impact levels of a case on the equipment that the client controls, in rising order."""
 
     OBSERVE = "observe"
-    """No effect: it only listens."""
+    """No effect: the case only listens."""
     READ = "read"
     """The simulated device answers reads with faults; the plant behind the client stays unchanged."""
     WRITE = "write"
@@ -40,7 +40,7 @@ class Basis(Enum):
     STANDARD = "standard"
     """The clause of the standard that the case names requires it: a failure is a deviation."""
     ROBUSTNESS = "robustness"
-    """No clause requires it. A device or master that fails is less tolerant than it could be, and still conforms."""
+    """No clause requires it. A device or master that fails the case is less tolerant than it could be, and still conforms."""
     FIELD = "field problem"
     """Known products fail here; the case names the project to which that was reported.
 
@@ -49,7 +49,7 @@ class Basis(Enum):
 
 
 OTHER_WIRE = "not on this kind of bus"
-"""The reason for skipping a case for other transports."""
+"""The reason that is shown for a skipped case that is for other transports."""
 OWN = "fieldtwin"
 """The source of a case that is based neither on a clause nor on a report of another project."""
 
@@ -92,7 +92,7 @@ def inconclusive(reason: str) -> Finding:
 
 
 CheckFunction = Callable[[Observation], Finding]
-"""The check of a case. It is pure: the same observation always gives the same finding."""
+"""A function that checks a case. It is pure: the same observation always gives the same finding."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from fieldtwin.gateway.protocols.canopen import cob_id
 from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import meaning
 
 MOST_LINES = 200
-"""Lines of evidence that a case keeps: its first and its last ones."""
+"""Largest number of lines of evidence for a case: its first and its last ones are kept."""
 ABORT = 0x80
 
 

@@ -68,8 +68,9 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class ObservedConnection:
-    """A connection of the client, numbered from 1. A serial line and a bus have one that is always there; `by_us`: the case
-    took the port away and gave it back."""
+    """A connection of the client, numbered from 1. A serial line and a bus have one connection, which always exists. `by_us`:
+    the case removed the port and restored it.
+    """
 
     t_ns: int
     client: int
@@ -121,7 +122,7 @@ E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, ObservedConnection, Left
 
 @dataclass(frozen=True, slots=True)
 class Habit:
-    """The polling behaviour of the client without faults. Seconds.
+    """The polling behaviour of the client without faults; times are in seconds.
 
     `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests;
     `silent_gap_s`: from an unanswered request to the next request, 0 if not measured; `rate_per_s`: requests.
@@ -162,5 +163,5 @@ class Observation:
                 yield event
 
     def since_s(self, t_ns: int) -> float:
-        """Return the seconds since the misbehaviour began."""
+        """Return the seconds from the first wrong reply to `t_ns`."""
         return (t_ns - self.begun_ns) / NS_PER_S

@@ -24,11 +24,11 @@ class CaseResult:
     took_s: float = 0.0
     waived: str = ""
     wire: tuple[Line, ...] = ()
-    """The frames and events that the verdict rests on."""
+    """The frames and events on which the verdict is based."""
 
     @property
     def verdict(self) -> Verdict:
-        """A waived failure counts as skipped: it neither failed nor passed."""
+        """Return the verdict. A waived failure counts as skipped: it neither failed nor passed."""
         return Verdict.SKIPPED if self.waived else self.finding.verdict
 
     @property
@@ -45,7 +45,7 @@ R = TypeVar("R", bound=CaseResult)
 
 
 def waive(result: R, waivers: Waivers, today: date) -> R:
-    """Apply the waiver of the result, if there is one. An expired waiver is a failure, whatever the finding."""
+    """Return the result with its waiver applied, if there is one. An expired waiver is a failure, whatever the finding."""
     waiver = waivers.of(result.case.id, result.case.row)
     if waiver is None:
         return result

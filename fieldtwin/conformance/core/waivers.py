@@ -6,8 +6,8 @@
         reason: the driver is replaced in May, ticket 4711
         expires: 2027-05-31
 
-An ID is that of a case, or of an entry of the test-case list with all its cases; scenarios use their own IDs. Code that has
-results calls `of`.
+An ID is that of a case, or of an entry of the test-case list with all its cases; scenarios use their own IDs. Code that
+processes results calls `Waivers.of`.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ CaseProcedure = Callable[[W], Awaitable[Finding]]
 class DeviceCase(About, Generic[W]):
     """A case for devices.
 
-    `wires`: the transports on which it makes sense, all if empty. `needs`: inputs that the user has to give for it
+    `wires`: the transports on which the case applies; empty for all. `needs`: inputs that the user has to give for it
     (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
     """
 
@@ -37,7 +37,7 @@ class DeviceCase(About, Generic[W]):
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """A chunk or a frame that was sent or received. `t_ns` counts from the start of the case, `text` is hex or a frame in
+    """Bytes or a frame that were sent or received. `t_ns` counts from the start of the case, `text` is hex or a frame in
     candump's notation.
     """
 

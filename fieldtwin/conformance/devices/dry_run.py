@@ -1,7 +1,7 @@
 """A dry run of a check, `--dry-run`, which shows the frames that would be sent.
 
-The check runs on a simulated device in memory, in virtual time. Nothing is opened. A real device with different answers
-leads to other frames in places: its answers decide how a case continues.
+The check runs on a simulated device in memory, in virtual time. Nothing is opened. With a real device some frames differ,
+because the answers of the device decide how a case continues.
 """
 
 from __future__ import annotations

@@ -19,13 +19,13 @@ from fieldtwin.gateway.core.errors import Unreachable
 MOST_SPOKEN = 400
 """Maximum number of chunks or frames that are kept of a case; later ones are dropped."""
 MOST_BYTES = 512
-"""Maximum number of bytes that are kept of one chunk."""
+"""Maximum number of bytes that are kept of one piece of received data."""
 MOST_LOST = 3
 """Number of cases before which the device could not be recovered; then the run stops."""
 
 
 class Settling(Protocol):
-    """The interface of a connection for a run."""
+    """The interface of a connection that a run of cases needs."""
 
     impact: Impact
     traits: frozenset[str]
@@ -34,7 +34,7 @@ class Settling(Protocol):
 
 
 class Transcript(Tap):
-    """All traffic since `begin`, bounded."""
+    """A record of all traffic since `begin`, with a size limit."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -19,7 +19,7 @@ from fieldtwin.reports.file import put
 from fieldtwin.results.subject import Subject
 
 MOST_LINES = 60
-"""Maximum number of lines of one case's bytes."""
+"""Maximum number of lines that show the bytes of one case."""
 
 
 def write_html(

@@ -18,7 +18,7 @@ from fieldtwin.reports.pages import fill
 from fieldtwin.results.model import Verdict
 
 OPEN_LINES = 24
-"""Lines of a case's frames that are shown without a click."""
+"""Number of lines of a case's frames that are shown without a click."""
 BASIS = {
     Basis.STANDARD: "required by the standard",
     Basis.ROBUSTNESS: "robustness: the standard does not require it",

@@ -15,7 +15,7 @@ CHAR = 7.25
 LINE = 16.0
 EDGE = 20.0
 ROOM = 1000.0
-"""A wider drawing puts devices into another row."""
+"""Largest width of a row of devices in px; further devices are drawn in another row."""
 LONGEST = 44
 WIRE, LOGIC = 90, 34
 """The maximum length of a text in a device's box, next to a bus, in the controller. A tooltip shows the whole text."""
@@ -86,7 +86,7 @@ def _width(rows: list[tuple[str, str]], most: int = LONGEST) -> float:
 
 
 def _lines(x: float, y: float, rows: list[tuple[str, str]], most: int = LONGEST) -> list[Markup]:
-    """Return texts below each other, each with its class; the base line of the first is at `y`."""
+    """Return text elements below each other, each with its class; the base line of the first one is at `y`."""
     return [_text(x, y + n * LINE, words, cls, most) for n, (words, cls) in enumerate(rows)]
 
 

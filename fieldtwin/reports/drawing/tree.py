@@ -1,4 +1,4 @@
-"""The buses of a system as lines of text, for a terminal or a pipe. It does not know the terminal."""
+"""The buses of a system as lines of text, for a terminal or a pipe. It does not depend on the terminal."""
 
 from __future__ import annotations
 

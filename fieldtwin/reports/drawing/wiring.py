@@ -1,6 +1,6 @@
-"""The facts of a drawing: controller, buses, devices, and their emulators.
+"""The content of a drawing: controller, buses, devices, and their emulators.
 
-Takes a loaded system and, for a prototype, its file; opens nothing and draws nothing.
+The input is a loaded system and, for a prototype, its file. This module opens nothing and draws nothing.
 """
 
 from __future__ import annotations

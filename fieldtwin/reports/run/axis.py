@@ -68,7 +68,7 @@ def fitted(axis: TimeAxis, said: str, x1: float, x2: float, y: float, cls: str, 
 
 
 def _room(x1: float, x2: float) -> int:
-    """Return the number of characters that fit between two positions."""
+    """Return the number of characters that fit between two positions in px."""
     return int((x2 - x1 - 8) / CHAR)
 
 

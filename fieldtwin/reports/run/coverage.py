@@ -23,7 +23,7 @@ from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST = 2000
-"""Number of different things of a kind that are counted."""
+"""Largest number of different entries of one kind that are counted."""
 
 K = TypeVar("K", bound=Hashable)
 
@@ -39,7 +39,7 @@ class Collector:
         self._faults: dict[str, str] = {}
 
     def feed(self, event: TraceEvent) -> None:
-        """Take an event."""
+        """Count an event of the trace."""
         self.take(event, self._decoder.feed(event))
 
     def finish(self) -> AccessCounts:
@@ -48,12 +48,12 @@ class Collector:
         return self.counts
 
     def add(self, exchanges: Iterable[DecodedExchange]) -> None:
-        """Take exchanges that were finished by the end of a trace."""
+        """Count exchanges that were completed by the end of the trace."""
         for exchange in exchanges:
             self._exchange(exchange)
 
     def take(self, event: TraceEvent, exchanges: Iterable[DecodedExchange]) -> None:
-        """Take an event that the caller has already decoded into `exchanges`."""
+        """Count an event that the caller has already decoded into `exchanges`."""
         if event.kind is TraceKind.FRAME:
             self.add(exchanges)
         elif event.kind is TraceKind.STATE and event.where in self._machines:
@@ -159,7 +159,7 @@ _Key = tuple[str, str, str, int, int, int]
 def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
     """Yield the tags of a device, and its mailboxes by their head.
 
-    Each as name, place, whether readable, whether writable.
+    Each entry has the name, the place, and whether it can be read and written.
     """
     profile = config.profile
     for tag in profile.tags.values():

@@ -1,4 +1,4 @@
-"""Coverage as tables of the HTML report: what was accessed, and always what was not."""
+"""Coverage as tables of the HTML report. They show which items were accessed and which were not."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from fieldtwin.reports.run.coverage import aborts_missing, devices_covered, exce
 from fieldtwin.results.model import AccessCounts, Machine, Report
 
 MOST_ROWS = 200
-"""Rows of one table; the rest is counted."""
+"""Largest number of rows of one table; further rows are only counted."""
 Cell = tuple[str, str]
-"""Class and text."""
+"""A cell of a table: its CSS class and its text."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Grid:
 
 
 def coverage_section(report: Report, counts: AccessCounts) -> Markup:
-    """Return the section with everything that was counted."""
+    """Return the section of the report with all counts."""
     spoken = {b.endpoint.is_can for b in report.system.buses.values()} if report.system is not None else set()
     codes = []
     if False in spoken or counts.exceptions:

@@ -199,7 +199,7 @@ def _kind(exchange: DecodedExchange) -> str:
 
 
 def _short(exchange: DecodedExchange) -> str:
-    """Return a short description: the service and its place, or the problem."""
+    """Return a short description of an exchange: the service and its address, or the problem."""
     if exchange.problem == "exception" and exchange.exception is not None:
         return f"exception {exchange.exception:02X}"
     if exchange.problem == "abort" and exchange.abort is not None:

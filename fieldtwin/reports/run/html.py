@@ -26,14 +26,14 @@ from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioR
 MOST_DRAWN = 16
 """Largest number of failures with a diagram and frames."""
 BUDGET = 2_500_000
-"""Characters of all diagrams and frames; the first failures take what they need."""
+"""Largest number of characters of all diagrams and frames together. The first failures use as many as they need."""
 MOST_SCENARIOS = 2000
 MOST_CHECKS = 3000
-"""Rows of the tables of checks, over all scenarios."""
+"""Largest number of rows in the tables of checks, over all scenarios."""
 MOST_SAID = 2000
-"""Characters of a check's expected value, and of its actual value."""
+"""Largest number of characters of a check's expected value, and of its actual value."""
 PER_SCENARIO = 2
-"""Checks of one scenario that are drawn."""
+"""Largest number of checks of one scenario that are drawn."""
 _ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED, Verdict.PASSED)
 _SHARED = {"NS_PER_S": NS_PER_S, "MOST_SAID": MOST_SAID, "MOST_FRAMES": MOST_FRAMES}
 
@@ -105,7 +105,7 @@ def _why(scenario: ScenarioResult) -> str:
 
 @dataclass
 class _Studied:
-    """The traces, read once: `parts` have the counts by system, each with the report for that system."""
+    """The results of a single pass over the traces. `parts` holds the counts of each system, with the report for that system."""
 
     parts: dict[SystemKey | None, tuple[Report, AccessCounts]] = field(default_factory=dict)
     failures: list[Markup] = field(default_factory=list)

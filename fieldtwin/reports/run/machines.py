@@ -11,7 +11,7 @@ from fieldtwin.twin.site.system import System
 def machines_of(system: System) -> tuple[Machine, ...]:
     """Return the state machine of every program that has a table (`fieldtwin.plc.states`).
 
-    Raises `FileInvalid` for a program that cannot be made.
+    Raises `FileInvalid` for a program that cannot be created.
     """
     found = []
     for name, form in system.plc.programs.items():

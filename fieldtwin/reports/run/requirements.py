@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fieldtwin.results.model import Report, Verdict
 
 MOST_COLUMNS = 16
-"""Largest number of scenarios as columns; if there are more, each requirement lists its own."""
+"""Largest number of scenarios that are shown as columns; if there are more, each requirement lists its scenarios."""
 MOST_ROWS = 1000
 MOST_NAMED = 12
 _WORST = (Verdict.FAILED, Verdict.ERROR, Verdict.INCONCLUSIVE, Verdict.SKIPPED, Verdict.PASSED)

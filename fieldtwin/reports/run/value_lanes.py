@@ -16,7 +16,7 @@ MOST_POINTS = 300
 """Largest number of changes that are drawn in a lane."""
 _QUALITIES = {"": "good", "good": "good", "simulated": "good", "substituted": "doubt", "uncertain": "doubt"}
 _FEW = 3
-"""A state with at most this many different numbers is drawn as words, because a line would not be informative."""
+"""A state with at most this many different values is drawn as words, because a line would show nothing useful."""
 
 
 def value_lane(

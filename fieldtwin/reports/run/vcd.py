@@ -25,7 +25,7 @@ from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.twin.site.system import System
 
 MOST_CHARACTERS = 48
-"""Characters of a word; a longer one is cut and ends with a dot."""
+"""Largest number of characters of a word; a longer word is cut and ends with a dot."""
 _BITS = {"wire": 1, "real": 64, "reg": 8 * MOST_CHARACTERS}
 """Bits of each type of variable. A type can show the values of the types before it."""
 _TYPES = tuple(_BITS)
@@ -106,7 +106,7 @@ def _changes(events: Iterable[TraceEvent], system: System | None, machines: dict
                 decoded = decoder.decode(event)
                 yield VcdChange(t_ns, event.where, "sent" if data.get("dir") == "sent" else "received", decoded.text)
                 for exchange in decoded.exchanges:
-                    if exchange.latency_ns is not None:  # a request waited for its answer
+                    if exchange.latency_ns is not None:  # a request was still waiting for its answer
                         waiting = f"waiting_{exchange.unit}"
                         yield VcdChange(max(0, exchange.t_ns), event.where, waiting, True)
                         yield VcdChange(max(0, exchange.end_ns), event.where, waiting, False)

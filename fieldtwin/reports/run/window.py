@@ -19,7 +19,7 @@ from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioR
 from fieldtwin.results.trace import TraceEvent, TraceKind
 
 MOST_FRAMES = 160
-"""Number of frames before the failure; after it, a quarter as many."""
+"""Largest number of frames before the failure; after it, a quarter as many are kept."""
 MOST_STEPS = 600
 MOST_EXCHANGES = 1500
 LONGEST_NS = 60 * NS_PER_S
@@ -77,7 +77,7 @@ class Window:
     before: deque[FrameLine] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
     after: list[FrameLine] = field(default_factory=list)
     bad: dict[tuple[str, int], str] = field(default_factory=dict)
-    """The problem of the frame on a bus at a time."""
+    """The problem of each frame that has one, by bus and time."""
     frames: int = 0
     thinned: set[str] = field(default_factory=set)
     """Buses, tags and variables of which only a part is kept, because there was too much."""

@@ -30,7 +30,7 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table to print as it is. Each row has one text for each of the `columns`."""
+    """A table that is printed as it is. Each row has one text for each of the `columns`."""
 
     title: str
     columns: tuple[str, ...]
@@ -63,7 +63,7 @@ class DocumentPiece:
 
     @property
     def good(self) -> bool:
-        """Return whether the action ended as expected."""
+        """Return whether the verdict is passed, whole, sampled or met, so that the action needs no attention."""
         return self.verdict in ("passed", "whole", "sampled", "met")
 
 

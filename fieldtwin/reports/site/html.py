@@ -18,7 +18,7 @@ WORDS = {
     "waived": "waived",
 }  # fmt: skip
 NOTED: dict[Weight, str] = {"robustness": "robustness finding", "field problem": "known field problem"}
-"""Findings that do not deviate from the standard, as counted in the result."""
+"""The words with which the result counts findings that do not deviate from the standard."""
 
 
 def write_html(document: SiteDocument, path: Path) -> None:

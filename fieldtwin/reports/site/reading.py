@@ -36,7 +36,7 @@ SUFFIXES = (".json", ".jsonl")
 
 
 class UnknownFileKind(FileInvalid):
-    """The file is of a kind that does not belong in the document."""
+    """Raised for a file of a kind that does not belong in the document."""
 
 
 def read_site(

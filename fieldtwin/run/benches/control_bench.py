@@ -55,7 +55,7 @@ PLC_EVERY_S = 0.25
 STARTING_S = 5.0
 ENDS_WITHIN_S = 2.0
 """How long a process that has closed its control channel may take to end."""
-"""Time in seconds in which a PLC may start and receive the gateway's first heartbeat."""
+"""Time in seconds within which a PLC must start and receive the gateway's first heartbeat."""
 HELD_KEPT = 20_000
 SERVED_WITHIN_S = 5.0
 SERVED_LOOK_S = 0.005
@@ -269,7 +269,7 @@ class ControlBench(AsyncResource):
 
     @property
     def _field_at(self) -> str:
-        """The host of the field simulator."""
+        """Return the host of the field simulator."""
         return self._where.field_host.rpartition(":")[0] or self._where.field_host or "localhost"
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
@@ -397,7 +397,7 @@ class ControlBench(AsyncResource):
             raise await self._reason_of(e) from e
 
     async def _reason_of(self, lost: ConnectionLost) -> FieldtwinError:
-        """Return why a process closed its control channel. A process that fails does so a moment before it has ended."""
+        """Return why a process closed its control channel. A process that fails closes the channel a moment before it ends."""
         until_s = self.now_s() + ENDS_WITHIN_S
         while (gone := self._gone()) is None and self.now_s() < until_s:
             await asyncio.sleep(0.02)
@@ -429,7 +429,7 @@ class ControlBench(AsyncResource):
             t_ns = entry["t_ns"] - self._start_ns
             if (
                 t_ns >= 0 or self.target == "local" or entry["standing"]
-            ):  # refused earlier in this run, or refused now as well
+            ):  # the output was refused earlier in this run, or it is refused again now
                 events.append(TraceEvent(max(0, t_ns), TraceKind.REFUSED, entry["tag"], refusal_data(entry)))
         for number, t_ns, tag, value, quality, reason in answer["changes"]:
             self._since = number
@@ -444,7 +444,7 @@ class ControlBench(AsyncResource):
             return []
         snapshot = self._outputs.snapshot()
         if snapshot.stopped and self._stopped is None:
-            self._plc_due_s = 0.0  # query the reason of the stop at once
+            self._plc_due_s = 0.0  # the reason of the stop is queried at once
         if not snapshot.counter:
             return []
         events = []
@@ -475,7 +475,7 @@ class ControlBench(AsyncResource):
         self._worst_us, self._overruns = worst_us, overruns
         self._plc_due_s = self.now_s() + PLC_EVERY_S
         if self._field is not None:
-            await self._field.call("ready")  # raises if the field simulator is gone
+            await self._field.call("ready")  # this call raises if the field simulator is lost
 
     def _what_stopped(self, told: PlcStatus) -> Stopped | None:
         """Return the stopped part according to the PLC's status: the PLC itself, or the gateway, whose heartbeat it monitors."""
@@ -487,7 +487,7 @@ class ControlBench(AsyncResource):
             return Stopped("plc", what, told.error_at, late_s if watchdog else 0.0)
         if state == "paused" or (state == "ready" and not starting):
             return Stopped("plc", "the PLC is paused" if state == "paused" else "the PLC was not started")
-        if state == "waiting" and told.error:  # it has waited for its inputs for too long
+        if state == "waiting" and told.error:  # the program has waited for its inputs for too long
             return Stopped("plc", told.error)
         self._gateway_seen |= told.gateway_alive
         if told.gateway_alive or (starting and not self._gateway_seen):

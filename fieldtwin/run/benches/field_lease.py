@@ -20,13 +20,15 @@ from fieldtwin.twin.prototype.field_leases import LEASE_S
 
 RENEW_EVERY_S = 2.0
 OPEN_WITHIN_S = 2 * LEASE_S
-"""Time in seconds to wait for a lease: that of a killed process has to expire first."""
+"""Time in seconds to wait for a lease, because the lease of a killed process has to expire first."""
 TRY_EVERY_S = 0.2
 FRESH_TIMEOUT_S = 30.0
 
 
 class LeaseLost(NothingKnown):
-    """The lease ended before its scenario. Its faults and values were removed meanwhile, so no verdict is possible."""
+    """Raised when the lease ended before its scenario. Its faults and values were removed meanwhile, so no verdict is
+    possible.
+    """
 
 
 class FieldLease:

@@ -16,13 +16,16 @@ from fieldtwin.run.benches.field_lease import FieldLease
 
 BY = "fieldtwin test, start: fresh"
 WITHIN_S = 60.0
-"""Time limit in seconds: the gateway retries a silent device at growing intervals, and a busy host starts slowly."""
+"""Time limit of a reset in seconds. It is long, because the gateway retries a silent device at growing intervals, and a busy
+host starts slowly.
+"""
 SCANS_WITHIN_S = 10.0
 LOOK_EVERY_S = 0.05
 
 
 async def make_fresh(lease: FieldLease, gateway: ControlClient, plc: ControlClient) -> None:
-    """Return when the PLC runs from its beginning on values of the new devices. Forces are removed; retained values too.
+    """Reset the system, and return when the PLC runs from its initial state on values of the new devices. Forces and retained
+    values are removed.
 
     Raises `ReplyTimeout` where a simulated device is not back within `WITHIN_S` seconds. The PLC is not left paused.
     """

@@ -1,7 +1,7 @@
-"""The lateness of a test on the same host as the system. Times are in seconds since the scenario's start.
+"""The lateness of a test that runs on the same host as the system. Times are in seconds since the scenario's start.
 
-Two measures that must not be mixed. *Own* lateness is the time by which a sleep of the testing process ended too late:
-the host did not serve it, and the system under test has no part in it. *Any* lateness also includes slow answers and
+There are two measures, which must not be mixed. *Own* lateness is the time by which a sleep of the testing process ended too
+late: the host did not serve it, and the system under test has no part in it. *Any* lateness also includes slow answers and
 scans of the PLC that began late: the cause may be the host, or a gateway that is stuck.
 """
 
@@ -27,7 +27,9 @@ class HostLateness:
             self._own.append((t_s, late_s - SLACK_S))
 
     def waited(self, t_s: float, late_s: float) -> None:
-        """Record that a check ended at `t_s`, or a scan of the PLC began by then, `late_s` seconds late."""
+        """Record a delay of `late_s` seconds that the host or the system may have caused, and that was seen at `t_s`: a check
+        that ended late, or a scan of the PLC that began late.
+        """
         if late_s > SLACK_S:
             self._any.append((t_s, late_s))
 

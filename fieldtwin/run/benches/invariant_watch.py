@@ -27,10 +27,10 @@ class InvariantWatch:
         self._system = system
         stated = invariants_of(system)
         self.names = sorted(stated.names)
-        """The tags and variables that they use."""
+        """The tags and variables that the invariants use."""
         self._rules: list[Rule] = [*map(always_rule, stated.stated), *map(within_rule, stated.followed)]
         self._broken: dict[str, tuple[Verdict, str, float]] = {}
-        """By rule: verdict, explanation, and the second of the run at which it was broken."""
+        """For each broken rule: the verdict, the explanation, and the time in seconds of the run at which it was broken."""
         self._ended = ""
         self._now_s = 0.0
 
@@ -46,7 +46,7 @@ class InvariantWatch:
             await bench.sleep_until_s(bench.now_s() + every_s)
 
     def end(self, why: str) -> None:
-        """Stop checking, because of `why`."""
+        """Stop checking, for the reason `why`."""
         self._ended = f"; not checked from {self._now_s:.3f} s on: {why}"
 
     def _look(self, now_s: float, knowledge: Knowledge, bench: Bench) -> None:

@@ -24,7 +24,8 @@ MOST_EVENTS = 50_000
 
 
 class Probes:
-    """All probes of a scenario. ``await run()`` until cancelled; meanwhile `reading`, and `changes` since the last call.
+    """All probes of a scenario. ``await run()`` polls them until cancelled; `reading` returns the latest values, and `changes`
+    the changes since its last call.
 
     `served` returns the endpoint of a server of the system itself, by name.
     """

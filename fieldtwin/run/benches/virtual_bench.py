@@ -41,7 +41,8 @@ from fieldtwin.twin.site.system import System
 ASKED_KEPT = 64
 _QUALITIES = {quality: quality.name.lower() for quality in Quality}
 _REASONS = {reason: reason.name.lower() for reason in Reason}
-_FRAME, _TAG, _SENT = TraceKind.FRAME, TraceKind.TAG, Direction.SENT  # an Enum's members are slow to look up
+# module constants, because looking up members of an Enum is slow
+_FRAME, _TAG, _SENT = TraceKind.FRAME, TraceKind.TAG, Direction.SENT
 
 
 class VirtualBench(AsyncResource):
@@ -88,7 +89,7 @@ class VirtualBench(AsyncResource):
             self.can = self.can | {Can.PROBE}
         self._probes: Probes | None = None
         self.asked_ns: dict[str, deque[int]] = {bus: deque(maxlen=ASKED_KEPT) for bus in system.buses}
-        """By bus: the times when the gateway sent frames, on the loop's clock, the latest last."""
+        """The times at which the gateway sent frames on each bus, on the loop's clock, the latest last."""
         self._updates: dict[str, int] = {}
         self._words = {
             f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
@@ -145,7 +146,7 @@ class VirtualBench(AsyncResource):
 
     @property
     def now_ns(self) -> int:
-        """Since the run's start."""
+        """Return the time in ns since the run's start."""
         return self.loop.now_ns - self.run.started_ns
 
     def note(self, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
@@ -170,7 +171,7 @@ class VirtualBench(AsyncResource):
         self.note(TraceKind.REFUSED, entry.tag, refusal_data(asdict(entry.status())))
 
     def _named(self, tag: str, value: Any) -> Any:
-        """Return a value; a state is replaced by its name."""
+        """Return `value`, or the name of the state if `tag` is a state that has names."""
         return self._words[tag].get(value, value) if tag in self._words else value
 
     def states(self) -> dict[str, str]:

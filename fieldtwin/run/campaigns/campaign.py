@@ -26,12 +26,12 @@ from fieldtwin.scenarios.language.form import Scenario, load_scenario
 SHORTEST_S = 600.0
 """Default duration in seconds of a run with random faults."""
 _BY_RUN = ("running", "refused", "judge")
-"""Checks whose text does not depend on the cause of the failure."""
+"""Names of checks whose text does not depend on the cause of the failure."""
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """A scenario file and the choices of its seeds.
+    """A scenario file, and the options from which each seed chooses its faults.
 
     `duration_s` 0: the scenario's maximum duration, at least `SHORTEST_S`.
     """
@@ -88,7 +88,7 @@ def schedule(campaign: Campaign, scenario: Scenario, seed: int) -> tuple[dict[st
 
 
 def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None) -> ScenarioResult:
-    """Run the scenario with a seed; with `faults` instead of those that the seed chooses, if they are given."""
+    """Run the scenario with a seed; if `faults` are given, they replace the faults that the seed chooses."""
     scenario = campaign.check()
     by_chance = None
     if campaign.random_faults is not None:
@@ -101,7 +101,9 @@ def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | N
 
 
 def _slim(campaign: Campaign, seed: int) -> ScenarioResult:
-    """Run a seed and drop its events: those of two hundred seeds would not fit into memory. A seed can be run again."""
+    """Run a seed and drop the events of its run, because those of two hundred seeds would not fit into memory. A seed can be
+    run again to see them.
+    """
     result = run_seed(campaign, seed)
     return replace(result, trace=(), dropped=0)
 
@@ -139,7 +141,7 @@ def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult]) -> Scenari
 
 
 def _seeds_check(results: Sequence[ScenarioResult]) -> list[CheckResult]:
-    """Return one check: every seed passed."""
+    """Return the check that every seed passed."""
     bad = [result for result in results if result.verdict is not Verdict.PASSED]
     failed = [result for result in bad if result.verdict.bad]
     verdict = Verdict.FAILED if failed else Verdict.INCONCLUSIVE if bad else Verdict.PASSED

@@ -18,7 +18,9 @@ from fieldtwin.run.campaigns.many_seeds import SeedResult
 
 
 class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run. `what` is its `many_seeds.what_runs`; `wrong` of the `checked` values were never held by their device."""
+    """One finished run. `what` is the fingerprint that `many_seeds.what_runs` returns; `wrong` of the `checked` values were
+    never held by their device.
+    """
 
     what: str
     version: str
@@ -51,11 +53,11 @@ class Ledger:
             os.truncate(path, len(data) - len(rest))
 
     def done(self, what: str) -> set[int]:
-        """Return the seeds that this version has run of `what`."""
+        """Return the seeds with which this version has run `what`."""
         return {e.seed for e in self.entries if e.what == what and e.version == __version__}
 
     def add(self, what: str, hours: float, result: SeedResult) -> None:
-        """Add a result, which is on disk when the call returns."""
+        """Add a result and write it to disk."""
         entry = LedgerEntry(
             what,
             __version__,
@@ -77,12 +79,12 @@ class Ledger:
         self.entries.append(entry)
 
     def failed_of(self, what: str, seeds: range) -> set[int]:
-        """Return which of these seeds failed when they were run of this, by this version."""
+        """Return which of these seeds failed when this version ran them with this fingerprint."""
         return {e.seed for e in self.failed if e.what == what and e.version == __version__ and e.seed in seeds}
 
     @property
     def hours(self) -> float:
-        """The sum of all virtual hours in the ledger."""
+        """Return the sum of all virtual hours in the ledger."""
         return sum(e.hours for e in self.entries)
 
     @property
@@ -91,5 +93,5 @@ class Ledger:
 
     @property
     def failed(self) -> list[LedgerEntry]:
-        """The runs that did not end well."""
+        """Return the runs that failed."""
         return [e for e in self.entries if not e.ok]

@@ -28,7 +28,7 @@ class SeedResult:
     events: int
     sha256: str
     faults: tuple[tuple[str, int, int], ...] = ()
-    """By fault name: how many were injected, and how often they took effect."""
+    """For each name of a fault: how many were injected, and how often they took effect."""
 
 
 def fingerprint(*parts: str) -> str:
@@ -49,7 +49,7 @@ def what_runs(options: VirtualOptions) -> str:
 
 
 def run_seed(options: VirtualOptions) -> SeedResult:
-    """Make one complete run."""
+    """Make one complete run with this seed."""
     run = VirtualRun(options)
     run.run()
     summary = run.summary()

@@ -77,7 +77,7 @@ def kind_of(error: str) -> str:
 
 
 def same_failure(found: Iterable[str], again: Iterable[str]) -> bool:
-    """Return whether an error of `again` is of the kind of one of `found`."""
+    """Return whether an error in `again` is of the same kind as an error in `found`."""
     return not {kind_of(error) for error in found}.isdisjoint(kind_of(error) for error in again)
 
 
@@ -121,7 +121,9 @@ def _seconds(time_s: float) -> str:
 
 
 def flow(value: Any) -> str:
-    """Return plain data as YAML in one line. Texts are always quoted; a float has a point, which our YAML asks for."""
+    """Return plain data as YAML in one line. Texts are always quoted, and a float has a decimal point, as the reader of these
+    files requires.
+    """
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)}: {flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -13,7 +13,7 @@ DEFAULT_BIT_RATE = 125_000
 
 
 def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
-    """Return the one bus among the endpoints; raises `UsageError` for anything else."""
+    """Return the bus if `endpoints` is exactly one bus. Raises `UsageError` otherwise."""
     if len(wires) != 1 or not wires[0].is_can:
         raise UsageError(
             "a CANopen node needs a CAN bus",
@@ -24,7 +24,7 @@ def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
 
 
 async def open_bus(wire: Endpoint, bitrate: int | None) -> tuple[CanPort, str]:
-    """Make the software bus at `wire` in this process, at `bitrate` bit/s.
+    """Create the software bus at `wire` in this process, at `bitrate` bit/s.
 
     If it exists already, or is a kernel bus, the returned port joins it. Returns the port and a description of its place.
     Raises `Unreachable`, `EndpointBusy`, or `UsageError` where a bus runs at a bit rate other than the requested one

@@ -98,7 +98,7 @@ async def run_device(
     profile = load_profile(path) if kind != "recording" else None
     units: dict[int, ModbusUnit] = {}
     faults = None
-    if extras.faults:  # their times count from now
+    if extras.faults:  # the times of the faults count from now
         start_ns = round(asyncio.get_running_loop().time() * NS_PER_S)
         faults = DeviceFaults(extras.faults, profile, extras.seed, start_ns)
     try:
@@ -188,7 +188,7 @@ def replayed_units(
 
 
 def _kind(profile: DeviceProfile, wires: list[Endpoint]) -> ConnectionKind:
-    """Return the connection of the emulated device: that of its first endpoint. A modem is on TCP."""
+    """Return the kind of connection of the emulated device, which is that of its first endpoint. A modem is on TCP."""
     on_line = plant_of(wires[0]).is_serial and profile.inbox is None
     return RS232Connection if on_line else TCPConnection
 
@@ -283,7 +283,9 @@ async def _serve_node(
 
 
 def as_it_was_recorded(wire: Endpoint, recorded: str) -> Endpoint:
-    """Return `wire`, with the recording's serial settings where it does not state them and the recording is of a line."""
+    """Return `wire`; if it does not state serial settings and the recording was made on a serial line, add the settings of the
+    recording.
+    """
     then = Endpoint.parse(recorded) if recorded.partition(":")[0] in SERIAL_SCHEMES else None
     if then is None or wire.scheme not in ("pty", *SERIAL_SCHEMES) or _is_ascii(wire) != (then.scheme == "ascii"):
         return wire

@@ -1,4 +1,4 @@
-"""How often faults took effect, for the end of a run. A fault that never took effect has tested nothing."""
+"""Prints how often faults took effect, at the end of a run. A fault that never took effect has tested nothing."""
 
 from __future__ import annotations
 

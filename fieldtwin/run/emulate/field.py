@@ -72,8 +72,8 @@ def _say(side: FieldSimulator, process: FieldProcess, options: FieldOptions) -> 
 
 
 def _word(name: str, options: FieldOptions) -> str:
-    """Return the system as the user can give it to another command: a bare name if it finds this file from every folder,
-    else the path. A folder of that name finds it only from the present working directory.
+    """Return the word by which the user can name the system in another command: its bare name if that finds this file from
+    every folder, else the path. The name of a folder finds the file only from the present working directory.
     """
     try:
         if (

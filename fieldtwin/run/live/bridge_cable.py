@@ -20,7 +20,7 @@ class BridgeCable:
     """A replacement for the line `plant`, with its speed. The gateway opens `gateway`; a client opens the link `master`."""
 
     def __init__(self, plant: Endpoint, inside: PtyEnd, outside: PtyEnd) -> None:
-        """Use `open`."""
+        """Create a cable that is not open; the caller uses the class method `open`."""
         self.plant = plant
         self.gateway = plant.with_path(str(inside.link))
         self.master = outside.link

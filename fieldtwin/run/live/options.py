@@ -39,7 +39,7 @@ class RunOptions:
     thread: str = ""
     """The destination of the plant's side of a digital thread (`fieldtwin.twin.thread.place`), empty for none."""
     thread_store: str = ""
-    """The store of its log; by default a file of the instance."""
+    """The store of its log; the default is a file in the run directory."""
     thread_every_s: float | None = None
     """Minimum time in seconds between two new values of a tag in it. None: every value; over a modem, one a second."""
     seed: int | None = None
@@ -49,7 +49,7 @@ class RunOptions:
     fault_file: Path | None = None
     """A file of further faults; the run checks it against its system."""
     water: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Transmitters that are in a network's water (`fieldtwin.twin.prototype.field_process.FieldConfig`)."""
+    """Transmitters that are in a network's acoustic channel (`fieldtwin.twin.prototype.field_process.FieldConfig`)."""
 
     def __post_init__(self) -> None:
         """Raise `UsageError` for a password in a URL, before the URL is passed to a process or a file."""

@@ -25,7 +25,9 @@ class Oracle:
         self.wrong: list[str] = []
         self.wrong_count = 0
         self.unknown = 0
-        """Number of values from the time when the field simulator was away: its devices' values of that time are lost."""
+        """Number of values that cannot be checked, because the field simulator was away at their time and the values that its
+        devices held then are lost.
+        """
         self._published = 0
         self._held_numbers: dict[str, int] = {}
         self._held: dict[str, set[str]] = defaultdict(set)
@@ -35,11 +37,12 @@ class Oracle:
         self._gap = False
 
     async def update(self, gateway: ControlClient, field: ControlClient) -> None:
-        """Fetch the published values first, then the held ones, so that the held ones cover the published ones.
+        """Fetch the next published values, then the held values, and compare them. In this order the held values cover the
+        published ones.
 
-        Both come in pieces.
+        Both are fetched in pieces.
         """
-        while len(self._unjudged) < KEPT:  # the rest is checked with the next call
+        while len(self._unjudged) < KEPT:  # the next call checks the rest
             piece = (await gateway.call("published", since=self._published))["entries"]
             if not piece:
                 break
@@ -53,8 +56,8 @@ class Oracle:
         self._gap = False
 
     def begin_again(self) -> None:
-        """Handle a new process of the field simulator: its journals begin again, and the last entries of the old journals were
-        not read.
+        """Start again with a new process of the field simulator, whose journals begin at 1. The last entries of the old
+        journals were not read.
         """
         self._held_numbers.clear()
         self._gap = True

@@ -61,9 +61,9 @@ MODEM_EVERY_S = 1.0
 """Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
 WATCH_S = 0.02
 ANSWERS_WITHIN_S = 5.0
-"""Time in seconds after which a process without a status counts as stopped, or without processor time."""
+"""Time in seconds after which a process that has not answered counts as stopped, or as one that gets no processor time."""
 STILL_S = 3.0
-"""Time in seconds between two checks after which this process counts as stopped itself."""
+"""If more time than this (seconds) lies between two checks, this process was itself stopped or got no processor time."""
 ORACLE_S = 1.0
 INVARIANTS_S = 0.1
 """Period in seconds of the checks of the system file's invariants."""
@@ -129,7 +129,7 @@ class RunSession(AsyncResource):
         self.thread_status: PlantThreadStatus | None = None
         self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
-        self.answered_ns: dict[str, int] = {}  # when gateway and PLC last answered
+        self.answered_ns: dict[str, int] = {}  # the times at which gateway and PLC last answered
         self._looked_ns = 0
         """The time of this process's last check of the others."""
         self._still_ns = -(1 << 62)
@@ -141,7 +141,7 @@ class RunSession(AsyncResource):
         self._resolved = ""
         """The file that hands the system to gateway and thread; the prototype has its own, which a gateway cannot read."""
         self.made_anew = 0
-        """How often a scenario reset the simulated devices."""
+        """How often a scenario has reset the simulated devices."""
         self.field_return: FieldReturn | None = None
         """The reconnection to a remote field simulator."""
 
@@ -253,7 +253,7 @@ class RunSession(AsyncResource):
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:
-            for fault in self.faults:  # each has its own start time
+            for fault in self.faults:  # each error contains its own time
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
 
     async def _start_thread(self, run_dir: Path) -> None:
@@ -346,10 +346,11 @@ class RunSession(AsyncResource):
             stderr.print(remark, soft_wrap=True, markup=False)
 
     async def _lay_cables(self, run_dir: Path) -> None:
-        """Make a cable for each bridge that listens on a serial line. The plant's own ports are not opened."""
+        """Create a cable for each bridge that listens on a serial line, so that the plant's own ports are not opened."""
         for bridge in self.system.serving.bridges:
             if bridge.listen.is_serial:
-                from fieldtwin.run.live.bridge_cable import BridgeCable  # of a prototype: a plant has no emulators
+                # imported here, because a plant has no emulators installed
+                from fieldtwin.run.live.bridge_cable import BridgeCable
 
                 cable = await BridgeCable.open(bridge.listen, run_dir, bridge.name)
                 self._stack.push_async_callback(cable.aclose)
@@ -442,12 +443,12 @@ class RunSession(AsyncResource):
                 self.note_error(str(failed))
 
     def note_error(self, text: str) -> None:
-        """Record an error; each text once."""
+        """Record an error, unless the same text is already recorded."""
         if text not in self.errors:
             self.errors.append(text)
 
     async def _ask(self) -> None:
-        """Refresh the three statuses twice a second and run the check of values once a second."""
+        """Query the three statuses twice a second, and run the check of values once a second."""
         next_oracle = 0.0
         while True:
             await self.refresh()
@@ -457,7 +458,7 @@ class RunSession(AsyncResource):
             await asyncio.sleep(0.4)
 
     async def refresh(self) -> None:
-        """Ask every process for its status."""
+        """Query the status of every process."""
         self.gateway_status = await self._answer(
             self._clients.get("gateway"), "gateway", lambda c: c.ask("get", GatewayStatus, ANSWERS_WITHIN_S)
         )
@@ -505,11 +506,11 @@ class RunSession(AsyncResource):
             self._maybe_lost(client, e)
             if isinstance(e, ReplyTimeout) and name and not self._stood_still():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
-            return None  # the process is ending or has ended: _notice_deaths reports it with its reason
+            return None  # the process is ending or has ended, which _notice_deaths reports with the reason
 
     def _stood_still(self) -> bool:
-        """Return whether this process itself was stopped, or got no processor time: then it does not know whether the other
-        processes answered.
+        """Return whether this process was itself stopped, or got no processor time. It then cannot know whether the other
+        processes would have answered.
         """
         gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
         if self._looked_ns and gap_s > STILL_S:
@@ -530,7 +531,7 @@ class RunSession(AsyncResource):
         try:
             await self.oracle.update(gateway, field)
         except FieldtwinError:
-            pass  # as above; the next query reports a loss
+            pass  # the next query reports a lost process
 
     async def reload(self, by: str) -> Reloaded:
         """Make the gateway read its files again (`fieldtwin.run.processes.reloading`); no poll is lost."""
@@ -552,7 +553,7 @@ class RunSession(AsyncResource):
             await self._nursery.__aexit__(None, None, None)
 
     async def _end_judging(self) -> None:
-        """Stop checking invariants: the outputs' change to safe values at the stop is not a violation."""
+        """Stop checking invariants, because the change of the outputs to safe values at the stop is not a violation."""
         if self._judging is not None:
             self._judging.cancel()
             await asyncio.wait([self._judging])

@@ -20,7 +20,7 @@ from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
 MOST_REFUSED = 10
-"""Refused outputs that a summary names one by one."""
+"""Largest number of refused outputs that a summary names one by one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,16 +36,16 @@ class RunFacts:
     calm: bool
     """There were no faults, or the last one has been over for long enough that the system must have recovered."""
     errors: Sequence[str]
-    """The errors that the run noted while it ran."""
+    """The errors that were recorded during the run."""
     gateway: GatewayStatus | None
-    """The last status of the gateway; None if it did not answer at the end. `plc` and `field` likewise."""
+    """The last status of the gateway; None if it did not answer at the end. The same applies to `plc` and `field`."""
     plc: PlcStatus | None
     field: FieldStatus | None
     counted_before: Mapping[str, Mapping[str, int]]
     """Per device, the requests and replies that its emulator had counted before the run; `clients_before` per bus and client."""
     clients_before: Mapping[str, Mapping[str, Mapping[str, int]]]
     mapping: Mapping[Endpoint, Endpoint]
-    """Where the endpoints of the plant lead in the prototype."""
+    """The endpoint that replaces each endpoint of the plant in the prototype."""
     published: Mapping[str, Any]
     """How many published values were checked against those that the devices held, and the first wrong ones."""
     wrong_messages: Sequence[str] = ()
@@ -164,7 +164,7 @@ def _exchanges(run: RunFacts) -> dict[str, Any]:
         row: dict[str, Any] = {
             "gateway": {
                 "requests": counters.get(f"{prefix}requests", 0),
-                # For a client, an exception is a reply. The SDO counters do not separate them.
+                # A client counts an exception as a reply. The SDO counters do not separate the two.
                 "replies": counters.get(f"{prefix}replies", 0) + counters.get("sdo_aborts" if can else "exceptions", 0),
             },
             "timeouts": counters.get(f"{prefix}timeouts", 0),

@@ -15,7 +15,7 @@ POLL_S = 0.02
 
 
 class ChildFailed(FieldtwinError):
-    """A child process ended by itself. Its exit code becomes that of this process."""
+    """Raised when a child process has ended unexpectedly. This process ends with the exit code of the child."""
 
     def __init__(self, name: str, code: int, said: str, log: Path) -> None:
         self.child_exit_code = code
@@ -53,7 +53,7 @@ class Child:
 
     @property
     def returncode(self) -> int | None:
-        """The exit code of the process after its end, negative for a signal; None while the process runs."""
+        """Return the exit code of the process after its end, negative for a signal; None while the process runs."""
         return self._process.poll()
 
     def failure(self) -> ChildFailed | None:

@@ -30,16 +30,18 @@ class FieldContact:
         self.far = far
         self.links: list[LinkChild] = []
         self.life = ""
-        """The identity of its process: a restarted field simulator has a different one."""
+        """The identity of the simulator's process: a restarted field simulator has a different one."""
         self.listening: dict[str, str] = {}
         self.far_said: dict[str, str] = {}
         """The endpoints of buses and remote modems, as the field simulator reports them."""
         self.remarks: list[str] = []
         """Differences from a node's data sheet, each with the device's name."""
         self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
-        """By bus and client: the counts of the field simulator before this run connected."""
+        """The counts for each bus and client before this run connected."""
         self.counted_before: dict[str, dict[str, int]] = {}
-        """By device: its counters before this run connected, because the field simulator may have served other runs before."""
+        """The counters of each device before this run connected, because the field simulator may have served other runs
+        before.
+        """
 
     async def aclose(self) -> None:
         await self.client.aclose()
@@ -53,7 +55,7 @@ async def contact_local(client: ControlClient, system: System, run_dir: Path) ->
 
 
 async def connect_control(host_port: str, token: str) -> tuple[ControlClient, str]:
-    """Connect to the control channel at ``HOST`` or ``HOST:PORT``; the client and the host's name."""
+    """Connect to the control channel at ``HOST`` or ``HOST:PORT``. Return the client and the host's name."""
     host, colon, port = host_port.rpartition(":")
     if not colon:
         host, port = host_port, str(DEFAULT_CONTROL_PORT)
@@ -98,7 +100,8 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
         raise
     for name, bus in system.buses.items():
         if name not in status.listening:
-            contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file has `plant` for this bus
+            # the prototype file has `plant` for this bus, whose devices are real
+            contact.mapping[bus.endpoint] = bus.endpoint
     return contact
 
 
@@ -114,7 +117,7 @@ def check_same(system: System, status: FieldStatus) -> None:
 
 
 def reachable(listening: Endpoint, host: str) -> Endpoint:
-    """Return the endpoint as seen from here: a wildcard address becomes the host of the field simulator.
+    """Return the endpoint as this host can reach it: a wildcard address is replaced by the host of the field simulator.
 
     The host stays a name: a restarted field simulator (for example a container) may have a different address.
     """

@@ -18,11 +18,11 @@ from fieldtwin.twin.site.system import System
 
 DEFAULT_HOST = "field"
 MOST_LOOKED_AT = 200
-"""Run directories."""
+"""Largest number of run directories that are examined."""
 
 
 async def find_field(system: System, run_dir: Path, environ: Mapping[str, str] = os.environ) -> tuple[str, Path | None]:
-    """Return ``HOST`` and no path, or an empty host and the path of a Unix socket.
+    """Return the address of the field simulator: either a host and no path, or an empty host and the path of a Unix socket.
 
     Raises `UsageError` if there are several.
     """
@@ -59,7 +59,7 @@ async def _is_of(path: Path, system: System) -> bool:
     try:
         client = await ControlClient.connect_unix(path)
     except FieldtwinError:
-        return False  # its process was killed
+        return False  # the socket was left by a process that was killed
     try:
         return (await client.ask("get", FieldStatus)).system_hash == system.hash
     except FieldtwinError:

@@ -20,7 +20,7 @@ from fieldtwin.twin.site.system import System
 
 FIRST_S, LIMIT_S = 0.25, 4.0
 CONNECT_S = 4.0
-"""Time limit of an attempt in seconds: a host that is down does not answer, and TCP would try for minutes."""
+"""Time limit of an attempt in seconds: a host that is down does not answer, and without a limit TCP would try for minutes."""
 
 
 class FieldReturn:
@@ -49,7 +49,7 @@ class FieldReturn:
         self._reason = ""
         self.losses = 0
         self.news = ""
-        """The latest return, for a person."""
+        """A sentence for the user about the latest return."""
         self.moved = ""
         """The reason why the gateway cannot reach the returned simulator, if any."""
 

@@ -12,11 +12,13 @@ from fieldtwin.run.processes.children import START_TIMEOUT_S, spawn
 from fieldtwin.twin.plant.child import command
 
 LINGER_S = 2.0
-"""Time in seconds that the line remains after this process was killed: the gateway writes its safe values over it."""
+"""Time in seconds for which the serial line stays open after this process was killed, so that the gateway can write its safe
+values over it.
+"""
 
 
 class LinkChild:
-    """Makes the port `link` and carries it to `target`. `ready` waits until the port is there."""
+    """A child process that creates the port `link` and carries its bytes to `target`. `ready` waits until the port exists."""
 
     def __init__(self, link: Path, target: Endpoint, log: Path) -> None:
         self._link = link

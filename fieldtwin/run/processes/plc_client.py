@@ -42,7 +42,9 @@ def _accepts(path: Path) -> bool:
 
 
 def choose(instance: str) -> Path:
-    """Return the PLC socket of an instance, or of the only one without a name. Raises `UsageError`, `Unreachable`."""
+    """Return the PLC socket of the instance `name`, or that of the only running instance if the name is empty. Raises
+    `UsageError`, `Unreachable`.
+    """
     if not instance:
         found = running_instances()
         if len(found) > 1:
@@ -59,7 +61,7 @@ def choose(instance: str) -> Path:
 
 
 def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
-    """Connect, ask, and close."""
+    """Connect to the PLC of an instance, run `ask` with the connection, close it, and return the answer."""
 
     async def main() -> T:
         client = await ControlClient.connect_unix(choose(instance))
@@ -72,7 +74,7 @@ def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
 
 
 async def step_and_wait(call: Callable[..., Awaitable[Any]], count: int, by: str) -> dict[str, int]:
-    """Let a paused PLC execute `count` steps; return the scans of each task once all are done, or it is no longer paused."""
+    """Let a paused PLC execute `count` steps; return the scans of each task when all steps are done, or when the PLC runs again."""
     scans: dict[str, int] = (await call("step", count=count, by=by))["scans"]
     while True:
         now = await call("get", brief=True)
@@ -108,7 +110,9 @@ def programs(system: System) -> dict[str, Program]:
 
 
 def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:
-    """Return the chosen program and the result of `has` for it. Raises `UsageError` unless exactly one program has one."""
+    """Return the name of the chosen program, and what `has` finds in it. Without a `name`, the only program in which `has`
+    finds something is chosen. Raises `UsageError` unless exactly one program qualifies.
+    """
     found = {n: thing for n, p in programs(system).items() if (thing := has(p)) is not None}
     if name and name not in system.plc.programs:
         raise UsageError(f"no program {name!r}", expected=", ".join(system.plc.programs))

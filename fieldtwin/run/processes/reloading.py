@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.run.processes.plc_client import choose
 
 PATIENCE_S = 120.0
-"""Time limit in seconds: a device has its new configuration after the next read of its group, which may be slow."""
+"""Time limit in seconds. A device takes its new configuration after the next read of its group, which may be slow."""
 
 
 @dataclass(frozen=True)

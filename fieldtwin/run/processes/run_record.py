@@ -28,10 +28,10 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The system file."""
     prototype: bool
     allow_writes: bool
-    """Whether the run may write to its devices: always in a prototype."""
+    """Whether the run may write to its devices, which is always true in a prototype."""
     started_utc_ns: int
     started_ns: int
-    """The same instant on the monotonic clock."""
+    """The start of the run on the monotonic clock."""
     pid: int
     capture: str = ""
     """The file with the traffic of all buses (`--capture`), empty if it is not recorded."""

@@ -39,7 +39,7 @@ class SeenStates:
     """The states that the programs of a run passed through."""
 
     sequences: Mapping[str, Sequence[str]]
-    """Per program with named states, its states in order; `transitions` with the time in s since the first check."""
+    """The states of each program with named states, in order; `transitions` also has the time in s since the first check."""
     transitions: Mapping[str, Sequence[tuple[float, str]]]
     relays: Collection[str]
     """The programs that follow the topside controller's commands."""
@@ -58,7 +58,7 @@ class StateWatch:
 
     @contextmanager
     def attached(self, layout: ImageLayout, path: Path) -> Iterator[None]:
-        """Read from the image file within this context."""
+        """Read states from the image file within this context."""
         self.knows(layout)
         with attached(layout, path) as image:
             self._reader = image.reader(OUTPUTS)
@@ -68,7 +68,7 @@ class StateWatch:
                 self._reader = None
 
     def knows(self, layout: ImageLayout) -> None:
-        """Use the names of each program's states in this process image."""
+        """Learn the names of each program's states from this process image."""
         self._words = state_words(layout, self._programs)
 
     @property
@@ -82,7 +82,7 @@ class StateWatch:
         return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]
 
     def look(self, now_ns: int) -> None:
-        """Note every program's state."""
+        """Record the present state of every program."""
         if self._reader is None:
             return
         snapshot = self._reader.snapshot()

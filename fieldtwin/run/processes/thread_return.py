@@ -16,15 +16,15 @@ from fieldtwin.run.processes.children import Child
 
 FIRST_S, LIMIT_S = 0.5, 60.0
 LASTED_S = 60.0
-"""Run time in seconds after which a death does not delay the restart."""
+"""If a child ran for this time in seconds, it is restarted without a delay."""
 LOOK_S = 0.1
 
 
 class ThreadReturn:
     """A watcher of `child`.
 
-    `start` makes a new one, `came` is called with its control channel; `failed` is called with the reason why one did
-    not start. `deaths` counts them. After `run` has ended, `end` ends the current child.
+    `start` creates a new child, `came` is called with its control channel, and `failed` with the reason why a child did not
+    start. `deaths` counts the children that died. After `run` has ended, `end` ends the current child.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class ThreadReturn:
         self._failed = failed
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Restart the child whenever it dies, until cancelled."""
         now = asyncio.get_running_loop().time
         backoff, began_s = Backoff(FIRST_S, LIMIT_S), now()
         while True:

@@ -28,12 +28,14 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.twin.site.system import System
 
 TICK_NS = 20 * NS_PER_MS
-"""Period in seconds of the checks of an exchange in progress."""
+"""Period in ns of the checks of an exchange in progress."""
 IDLE_S = 60.0
 KEPT_RESPONSES = 1000
 DEFAULT_SCRIPT = (1, 2, 0, -1)
 SCRIPT_TIMES = (0.1, 0.35, 0.65, 0.82)
-"""The times of a script's commands, as parts of the run: enough for each state to be seen, and for the last to arrive."""
+"""The times of a script's commands, as fractions of the run. They leave time for each state to be seen and for the last
+command to arrive.
+"""
 
 
 @dataclass(frozen=True)

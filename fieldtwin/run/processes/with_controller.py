@@ -35,7 +35,7 @@ STANDARD_ERROR = 2
 
 
 class ControllerEnded(FieldtwinError):
-    """The user's control program ended during the test."""
+    """Raised when the user's control program ended during the test."""
 
 
 class WithController(AsyncResource):
@@ -88,7 +88,7 @@ class WithController(AsyncResource):
                 stdin=subprocess.DEVNULL,
                 stdout=STANDARD_ERROR,
                 start_new_session=True,
-                preexec_fn=partial(end_with_parent, os.getpid()),  # it ends with a killed parent
+                preexec_fn=partial(end_with_parent, os.getpid()),  # the child process ends when its parent is killed
             )
         except OSError as e:
             raise UsageError(f"cannot start {self._argv[0]!r}: {e.strerror or e}") from e
@@ -124,5 +124,6 @@ class WithController(AsyncResource):
 
 
 def _remove(home: Path, kind: type[BaseException] | None, error: BaseException | None, at: object) -> None:
-    if kind is None or not issubclass(kind, ChildFailed):  # else its log contains the reason
+    # otherwise the log of the field simulator contains the reason
+    if kind is None or not issubclass(kind, ChildFailed):
         shutil.rmtree(home, ignore_errors=True)

@@ -36,7 +36,9 @@ FIELD_LINGER_S = 0.5
 END_WITHIN_S = 5.0
 """Time in seconds in which the program has to end after SIGTERM to this process, before it is killed."""
 OURS = ("RUN", "PROFILES", "TOKEN", "TRACEBACK", "JSON", "SYSTEM", "CONTROL", "FIELD")
-"""Environment variables of fieldtwin that have another meaning. A bus with one of these names gets only the longer variables."""
+"""Variables that fieldtwin already uses for a different purpose. A bus whose short variable would have one of these names gets
+only the longer variables.
+"""
 
 Tell = Callable[[dict[str, str]], None]
 
@@ -54,10 +56,12 @@ def environment(contact: FieldContact, system: System, control: Path) -> dict[st
 
 
 def environment_from(status: FieldStatus, system: System, host: str, control: Path) -> dict[str, str]:
-    """Return the same from the answer of a field simulator on `host` to `get`. Ports that cannot be reached are omitted."""
+    """Return these variables from the answer of a field simulator on `host` to `get`. Ports that cannot be reached are
+    omitted.
+    """
     env: dict[str, str] = {}
     for bus, url in status.listening.items():
-        with suppress(UsageError):  # a virtual serial port on another host
+        with suppress(UsageError):  # a virtual serial port on another host cannot be reached
             endpoint = mapped_endpoint(system.buses[bus].endpoint, reachable(Endpoint.parse(url), host))
             env |= _of_endpoint(_word(bus), endpoint)
     return env | _of_system(system, control)
@@ -131,7 +135,7 @@ async def run_with(
                 tell_struck,
             )
         finally:
-            if not instance:  # no other process knows its name
+            if not instance:  # the folder is removed, because no other process knows its name
                 shutil.rmtree(home.dir, ignore_errors=True)
 
 

@@ -84,7 +84,7 @@ def _ends_quietly() -> None:
 @contextmanager
 def _sigint_held_back() -> Iterator[None]:
     """Block SIGINT in this thread and in processes started in the block. Here it is delivered after the block."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
+    if not hasattr(signal, "pthread_sigmask"):  # Windows has no signal masks
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -52,7 +52,7 @@ class QuestionForm(SiteModel):
 
 
 class RuleForm(SiteModel):
-    """The command for a finding."""
+    """A rule: the command that follows from a finding."""
 
     when: Finding
     of: str = Field(default="", description="a tag or a program; empty: every tag and program")
@@ -63,7 +63,7 @@ class RuleForm(SiteModel):
 
 
 class RulesForm(SiteModel):
-    """A planner as rules; the first that fits decides."""
+    """A planner that consists of rules; the first rule that fits decides."""
 
     limits: dict[TagName, Range] = Field(
         default={}, description="tag -> [lowest, highest], instead of the range in its profile"

@@ -38,7 +38,7 @@ from fieldtwin.twin.thread.thread import schema_of, to_receivers
 STEP_MS = 50
 ABOUT_THE_PLANT = (Kind.VALUE, Kind.STATE, Kind.PAYLOAD)
 STALE_AFTER_MS = 30_000
-"""Three times the period in which a plant repeats unchanged values."""
+"""A tag is stale after this time in ms: three times the period in which a plant repeats unchanged values."""
 
 
 def limits_of(system: System) -> dict[str, Limits]:

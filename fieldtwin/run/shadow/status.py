@@ -13,7 +13,7 @@ from fieldtwin.twin.model.mape.decisions import Decision
 from fieldtwin.twin.thread.status import ThreadStatus
 
 MOST_DECISIONS = 200
-"""The newest decisions that a status contains."""
+"""Largest number of decisions that a status contains: the newest ones."""
 
 
 class VariableStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,7 +53,7 @@ class TwinStatus(msgspec.Struct, frozen=True, kw_only=True):
     """``shadow`` or ``twin``."""
     system: str
     place: str
-    """Where it receives the plant's thread."""
+    """The address at which it receives the plant's thread."""
     now_ms: int
     origins: list[str]
     """The logs that it has received since it started."""

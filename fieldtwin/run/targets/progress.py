@@ -38,13 +38,13 @@ class Progress:
         self._steps = 0
         self._names: set[str] = set()
         self._last: dict[str, tuple[int, dict[str, Any]]] = {}
-        """By name: the time and the value of its latest line."""
+        """The time and the value in the latest line of each name."""
         self._held: dict[str, TraceEvent] = {}
-        """By name: a change that followed the latest line too soon to be written."""
+        """The latest change of each name that followed its line too soon to be written."""
         self._values = 0
 
     def begin(self, scenario: Scenario, target: str, trace: Trace) -> None:
-        """Write what the scenario consists of, and follow the trace of its run."""
+        """Write the parts of the scenario, and begin to follow the trace of its run."""
         steps = [
             {"number": str(n), "text": f"{word}: {said(getattr(step, word))}"}
             for n, step in enumerate(scenario.form.steps, 1)

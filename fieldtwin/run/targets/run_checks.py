@@ -23,7 +23,7 @@ TITLE = "the checks of a run in virtual time"
 
 
 class RunJudge:
-    """The checker of a run: `attach`, then `watch` as a task, and `finish` at the end of the scenario."""
+    """The checks of one scenario's run. Call `attach`, run `watch` as a task, and call `finish` at the end of the scenario."""
 
     def __init__(self, scenario: Scenario, group: SystemGroup, by_chance: tuple[dict[str, Any], ...] = ()) -> None:
         """Prepare the checks. `by_chance`: random faults, in addition to those of the steps."""

@@ -47,8 +47,8 @@ class ScenarioTarget:
 
     `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the system's name,
     `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the remote end of a plant.
-    `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local`
-    the interface of emulated CAN buses (`socketcan/vcan0`); empty: that of the prototype file. `controller`: on `local`
+    `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local` the
+    interface of emulated CAN buses (`socketcan/vcan0`); empty: the interface in the prototype file. `controller`: on `local`
     the user's program and its arguments, which replaces fieldtwin's gateway and PLC.
     """
 
@@ -73,7 +73,7 @@ def run_scenario(
 ) -> ScenarioResult:
     """Run the scenario, and repeat it at most `retries` times while it is INCONCLUSIVE; the first other verdict counts.
 
-    In virtual time there is one attempt only, because all would be equal.
+    In virtual time there is one attempt only, because all attempts would be equal.
     """
     earlier: list[str] = []
     while True:
@@ -127,12 +127,12 @@ def _attempt(
         reproduce=reproduce(scenario, *_words(target)) + _with_words(target),
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
-        trace_hash="",  # no two runs on a clock have the same
+        trace_hash="",  # two runs in real time never have the same trace
     )
 
 
 def _of_a_group(kind: str, target: ScenarioTarget) -> str:
-    """Return the reason for which the target cannot run a scenario of several systems; empty if it can."""
+    """Return the reason why the target cannot run a scenario of several systems; empty if it can."""
     if target.name != "local":
         return f"a {kind} is a prototype, and the target {target.name} is none: each of its systems is a plant"
     if target.can:
@@ -153,7 +153,7 @@ def _of_a_plant(scenario: Scenario, target: ScenarioTarget) -> str:
 
 
 def _words(target: ScenarioTarget) -> list[str]:
-    """Return the target as command-line options, without a token."""
+    """Return the command-line options that select the target, without a token."""
     words = ["--target", target.name]
     said = {
         "--seed": "" if target.seed is None else str(target.seed),
@@ -168,7 +168,7 @@ def _words(target: ScenarioTarget) -> list[str]:
 
 
 def _with_words(target: ScenarioTarget) -> str:
-    """Return the end of the command line for a user's controller."""
+    """Return the part of the command line that names the user's controller; empty without one."""
     return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
 
 
@@ -211,7 +211,8 @@ async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> Scen
             own = session.instance.dir
 
             def tidy(kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-                if kind is None or not issubclass(kind, FieldtwinError):  # else its logs contain the reason
+                # otherwise the logs of the system contain the reason
+                if kind is None or not issubclass(kind, FieldtwinError):
                     shutil.rmtree(own, ignore_errors=True)
 
             stack.push(tidy)

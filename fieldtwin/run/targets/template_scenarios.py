@@ -22,8 +22,8 @@ def agree_to_scenario(
 ) -> None:
     """Ask about the system of the scenario, or its several systems, in `path`, and its probes, if they are inside a template.
 
-    `plant`: the run has no prototype; `virtual`: it opens no endpoint. A file that cannot be read is left to its next
-    reader. Raises `NotAllowed`.
+    `plant`: the run has no prototype; `virtual`: it opens no endpoint. A file that cannot be read is skipped here, because the
+    next reader reports the error. Raises `NotAllowed`.
     """
     profiles = tuple(profiles)
     try:

@@ -1,4 +1,6 @@
-"""A scenario on the target `virtual`: a prototype in virtual time, in this thread, sealed off while it runs."""
+"""A scenario on the target `virtual`: a prototype in virtual time, in this thread, without access to clocks, sockets and
+threads while it runs.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def run_virtual(
     by_chance: ByChance | None = None,
     progress: Progress | None = None,
 ) -> ScenarioResult:
-    """Run it. `seed` before the scenario's own and the prototype file's. `by_chance`: random faults of a campaign."""
+    """Run the scenario. `seed` takes precedence over the scenario's own seed and the prototype file's. `by_chance`: random
+    faults of a campaign.
+    """
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
     judge = (

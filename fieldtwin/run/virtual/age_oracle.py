@@ -29,7 +29,7 @@ class _Held:
         self.raws.append(raw)
 
     def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
-        """Return whether the value was `raw` at any time in the interval, both ends included.
+        """Return whether the device held `raw` at any time in the interval, both ends included.
 
         A value that was replaced at `from_ns` counts as held at that instant.
         """
@@ -44,7 +44,7 @@ class _Held:
 
 
 class AgeOracle:
-    """The check: report `published` and `held` values in order of time; then call `judge`."""
+    """The check of one system. The caller reports `published` and `held` values in order of time, and then calls `judge`."""
 
     def __init__(self) -> None:
         self.checked = 0

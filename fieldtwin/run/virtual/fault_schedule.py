@@ -1,6 +1,6 @@
 """Faults that a seed chooses: kind, target, begin and end.
 
-The last part of a run has none, so that recovery can be observed.
+The last part of a run has no fault, so that recovery can be observed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-par
 
 @dataclass(frozen=True, slots=True)
 class RandomFaults:
-    """The choices of a seed.
+    """The choice of random faults.
 
     `mean_s`: mean seconds between two faults. `kinds`: names of faults; empty: all that a gateway can detect, without
     faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault affects that register or object
@@ -79,7 +79,9 @@ class RandomFaults:
             )
 
     def under(self, prefix: str) -> RandomFaults:
-        """Return the same for one system of a group, whose names begin with `prefix` (empty: a system alone)."""
+        """Return the part of this choice that concerns one system of a group, whose names begin with `prefix` (empty: a system
+        alone).
+        """
         aims = tuple(aim.removeprefix(prefix) for aim in self.aims if aim.startswith(prefix))
         return RandomFaults(self.mean_s, self.kinds, aims or (("",) if self.aims else ()))
 
@@ -110,7 +112,8 @@ def _fitting(system: System, wanted: RandomFaults, device: str, tag: str) -> Ite
     for name, kind in FAULTS.items():
         if name in NOT_BY_CHANCE or (wanted.kinds and name not in wanted.kinds):
             continue
-        if kind.kind is InjectionPoint.VALUE:  # the device reports a wrong value: only on request
+        # with this fault the device reports a wrong value, so it is chosen only on request
+        if kind.kind is InjectionPoint.VALUE:
             if wanted.kinds and (_struck(system, name, device) if not tag else tag in _struck(system, name, device)):
                 yield name
         elif _is_seen(name, endpoint) and _can_aim(system, name, device, tag):
@@ -143,7 +146,7 @@ def random_schedule(
 ) -> tuple[dict[str, Any], ...]:
     """Return faults in the form of a fault file; the same for the same systems, seed, duration and choice.
 
-    Each system's faults are drawn with its own seed. Then follow those of what the systems share.
+    Each system's faults are drawn with its own seed. The faults of the shared resources follow.
     """
     last_s = duration_s - min(CALM_S, duration_s / 2)
     found = [fault for member in group.members.values() for fault in _of_member(member, seed, last_s, wanted)]

@@ -40,7 +40,7 @@ class VirtualSystems(Protocol):
         """The name of a sender of commands that the systems share; empty if they share no sender."""
 
     def results(self) -> dict[str, Any]:
-        """Return the part of the summary that is about what the systems share."""
+        """Return the part of the summary that is about the resources that the systems share."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """A run of a group on this host. `duration_s` 0: until stopped; `commands` None: the kind's own script."""
+    """A run of a group on this host. `duration_s` 0: until stopped; `commands` None: the usual commands of the kind."""
 
     group: SystemGroup
     duration_s: float = 0.0
@@ -70,7 +70,7 @@ class VirtualKind(Protocol):
     """The functions with which a group runs in virtual time."""
 
     def scripted(self, group: SystemGroup, commands: tuple[int, ...] | None, duration_s: float) -> list[Scripted]:
-        """Return the commands of a run. None stands for the usual script of such a group."""
+        """Return the commands of a run. None stands for the usual commands of such a group."""
 
     def virtual(
         self,
@@ -82,7 +82,9 @@ class VirtualKind(Protocol):
         commands: Sequence[Scripted] | None,
         probes: Sequence[ScenarioProbe] = (),
     ) -> AbstractAsyncContextManager[VirtualSystems]:
-        """Return the running systems; `folder` takes what they write. `commands` None: a scenario sends its own."""
+        """Return the running systems, which write their files into `folder`. `commands` is None in a scenario, which sends its
+        own commands.
+        """
 
     def summary(
         self,
@@ -107,7 +109,7 @@ class GroupKind(VirtualKind, Protocol):
     def drawing(self, group: SystemGroup) -> Drawing: ...
 
     def introduce(self, group: SystemGroup) -> None:
-        """Print the systems and what they share on stderr, at the start of a run."""
+        """Print the systems and their shared resources on stderr, at the start of a run."""
 
     def print_summary(self, summary: dict[str, Any]) -> None:
         """Print a summary on stdout, with the verdict."""

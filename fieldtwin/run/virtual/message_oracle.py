@@ -23,7 +23,7 @@ class MessageOracle:
         self._arrived: Consumer[DATA] | None = None
 
     def watch(self, emitter: Producer[DATA]) -> None:
-        """Note every message that the driver with this `emitter` takes for a new one."""
+        """Record every message that the driver with this `emitter` treats as new."""
         self._arrived = Consumer(emitter.event, MOST_KEPT)
         emitter.subscribe(self._arrived)
 

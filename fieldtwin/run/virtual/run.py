@@ -1,7 +1,7 @@
 """A run in virtual time, of one system or of several that run together: ``fieldtwin simulate SYSTEM --seed 7 --for 24h``.
 
 Everything happens in this thread, without access to clocks, sockets and threads; between two pieces of the run that
-access is allowed, to report progress. Everything that is the same from run to run is traced and hashed.
+access is allowed, to report progress. Every event that is the same in each run with the same seed is traced and hashed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PIECE_S = 10.0
 """Virtual seconds between two progress reports, and between two checks."""
 MAX_ERRORS = 100
 MOST_REASON = 2000
-"""Characters of the errors in the description of a trace."""
+"""Maximum number of characters of the errors in the description of a trace."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class VirtualOptions:
 
     `faults`, and those of the file `fault_file`, are injected in addition to those of `random_faults`, which the seed
     chooses; `trace` is a file for every
-    event. `commands`: the sample periods in seconds that are commanded; None: the usual script. `prototype_file`,
+    event. `commands`: the sample periods in seconds that are commanded; None: the usual commands. `prototype_file`,
     `recordings` and `speed` are for one system.
     """
 
@@ -93,7 +93,7 @@ class VirtualRun:
         self._kind = virtual_kind(self.group)
         self.seed = self.group.seed if options.seed is None else options.seed
         self.given_faults = options.faults
-        """The injected faults without those that the seed chose."""
+        """The injected faults, without the faults that the seed chose."""
         if options.fault_file is not None:
             self.given_faults += load_faults(options.fault_file, self.group.check_fault)
         self.faults = self.given_faults
@@ -118,7 +118,7 @@ class VirtualRun:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Return the texts of the files that the run depends on, or their hashes; a changed file changes them."""
+        """Return the texts of the files that the run depends on, or their hashes; a changed file changes the result."""
         own = (self.group.path.read_text(encoding="utf-8"),) if self.group.kind else ()
         members = self.group.members.values()
         return *own, *(text for m in members for text in (m.system.hash, m.prototype.path.read_text(encoding="utf-8")))

@@ -45,7 +45,7 @@ CAN_WIRE_NS = 10 * NS_PER_MS
 """The time that a frame may need on a CAN bus: several attempts, after other frames."""
 STALE_CHECK_NS = 100 * NS_PER_MS
 """Minimum time between two checks for values that are still good although they exceed their maximum age."""
-_GOOD = Quality.GOOD  # an Enum's members are slow to look up
+_GOOD = Quality.GOOD  # module constants, because looking up members of an Enum is slow
 
 
 class SystemCheck:
@@ -92,7 +92,7 @@ class SystemCheck:
         return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
 
     def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
-        """Judge the invariants of the system file from now on, as long as `nursery` is open."""
+        """Judge the invariants of the system file from now on, as long as the tasks of `nursery` run."""
         self.invariants = self._stated
         if self._stated:
             nursery.start(self._stated.run(bench, TICK_S), "invariants")
@@ -144,7 +144,7 @@ class SystemCheck:
         }
         check_ages = self._age_check(bench)
         asked_of: dict[str, deque[int] | None] = {}
-        """By tag: the times of requests on its bus; None for a message that a node sends by itself."""
+        """The times of requests on the bus of each tag; None for a message that a node sends by itself."""
 
         def put(name: str, value: TagValue) -> None:
             check_ages()
@@ -168,7 +168,8 @@ class SystemCheck:
         return put
 
     def _age_check(self, bench: VirtualBench) -> Callable[[], None]:
-        """Return a function that reports to the check which values the gateway still considers good, whether new or not.
+        """Return a function that reports to `AgeOracle` which values the gateway still considers good, including those that
+        were not published again.
 
         The device must have held such a value within the value's maximum age, plus the time of one exchange. The
         function does so at most every `STALE_CHECK_NS`.
@@ -219,7 +220,7 @@ class SystemCheck:
         self.field_status = bench.run.field.status()
 
     def summary(self, errors: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the summary of the system, as of a run on this computer; `errors` are those of the run."""
+        """Return the summary of the system, in the form of a run in real time; `errors` are those of the run."""
         invariants, topside = self.invariants, self.topside
         facts = RunFacts(
             prototype=True,

@@ -55,7 +55,7 @@ def begin_description(
 
 
 def described_checks(checks: Iterable[CheckResult]) -> list[CheckAbout]:
-    """Return the results of checks as parts of a description."""
+    """Return the results of checks in the form in which a description contains them."""
     return [
         CheckAbout(
             number=c.number, text=c.text, verdict=c.verdict.value, t_ns=c.t_ns, since_ns=c.since_ns, expected=c.expected,

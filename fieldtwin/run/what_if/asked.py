@@ -46,7 +46,7 @@ def objection(asked: QuestionMessage) -> str:
 
 
 def told(outcome: PlanOutcome) -> str:
-    """Return why a plan must not be followed: its fork failed, or the first requirement that does not hold."""
+    """Return why a plan must not be executed: the failure of its fork, or the first requirement that does not hold."""
     if outcome.error:
         return f"the prototype failed: {outcome.error}"
     for requirement in outcome.requirements:

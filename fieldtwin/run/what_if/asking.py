@@ -26,7 +26,7 @@ from fieldtwin.twin.site.system import System
 
 TIMEOUT_S = 60.0
 TOLD_WITHIN_S = 12.0
-"""Time after its start when a twin knows every value: a plant repeats unchanged values every ten seconds."""
+"""Time in seconds within which a new twin has received every value: a plant repeats unchanged values every ten seconds."""
 LOOK_MS = 100
 MOST_KEPT = 1 << 16
 """Bytes of the process's output that are kept."""
@@ -61,7 +61,9 @@ class ForkSubject:
 
 
 class Asking:
-    """A `WhatIf`. `run` belongs in the twin's nursery. The receiver of the events must pass them to `known`."""
+    """The `WhatIf` of a twin, which asks separate processes. The twin runs `run` as one of its tasks, and passes each received
+    event to `known`.
+    """
 
     def __init__(
         self,
@@ -175,7 +177,7 @@ async def _talk_with(process: asyncio.subprocess.Process, question: bytes) -> tu
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stderr is not None
-    with suppress(ConnectionError):  # it died: its exit code tells more
+    with suppress(ConnectionError):  # the process died, and its exit code tells more
         process.stdin.write(question)
         await process.stdin.drain()
     process.stdin.close()

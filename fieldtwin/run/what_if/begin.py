@@ -15,7 +15,7 @@ from fieldtwin.twin.prototype.virtual import VirtualPrototype
 
 
 def retain_for(state: KnownState, run_dir: Path) -> None:
-    """Copy retained variables to where the fork's PLC finds them."""
+    """Copy retained variables to the file from which the fork's PLC reads them."""
     if state.retained is not None:
         shutil.copyfile(state.retained, run_dir / "retain")
 
@@ -48,7 +48,7 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
 
 def _command(run: VirtualPrototype, period_s: Number) -> None:
-    """Inject this command as if the transmitter had received it, if the plant has a transmitter and obeys its commands."""
+    """Inject the command as if the transmitter had received it, if the plant has a transmitter and obeys its commands."""
     if len(run.gateway.pumps) == 1 and isinstance(period_s, int):
         run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
 

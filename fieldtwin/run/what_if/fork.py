@@ -202,7 +202,7 @@ class _ForkRun:
         if self._over:
             return
         value = self._named(change.tag, change.after)
-        assert self._run is not None  # it was made before any variable changed
+        assert self._run is not None  # this observation was recorded before any variable changed
         self.outcome.saw_variable(change.tag, value, self._run.loop.now_ns)
         if change.tag in self._words:
             seen = self.outcome.states.setdefault(change.tag.removesuffix(".state"), [])
@@ -213,7 +213,7 @@ class _ForkRun:
         return self._words[tag].get(value, value) if tag in self._words else value
 
     def _judge(self, requirement: Requirement, expression: Expression) -> None:
-        # An unknown one is not met either.
+        # A requirement whose value is unknown is not met either.
         if requirement.broken_s is None and expression.truth(self._look) is not True:
             requirement.broken_s = self._now_s()
             requirement.seen = "; ".join(
@@ -242,7 +242,7 @@ class _ForkRun:
         seen = tags.current(name, now_ns)
         match function:
             case "quality" if seen.value is None:
-                return None  # it has not turned bad: it never had a value
+                return None  # the quality has not turned bad, because the tag never had a value
             case "quality":
                 return Quality(seen.quality).name.lower()
             case "reason":
@@ -255,4 +255,4 @@ class _ForkRun:
 
 
 Progress = Callable[[PlanOutcome], None]
-"""Called with each outcome as soon as it is available."""
+"""A function that is called with each outcome as soon as it is available."""

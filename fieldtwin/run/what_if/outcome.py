@@ -53,7 +53,7 @@ class VariableOutcome:
 
     @property
     def mean(self) -> float | None:
-        """The mean over time; None if there was never a number."""
+        """Return the mean over time; None if there was never a number."""
         if self._spent_ns:
             return self._weighed / self._spent_ns
         return self.lowest if self.lowest <= self.highest else None

@@ -1,4 +1,4 @@
-"""Plans: the commands and faults in a fork, and the requirements on it. One from the command line, or several in a file."""
+"""Plans: the commands and faults in a fork, and the requirements on it. The command line gives one plan, a file gives several."""
 
 from __future__ import annotations
 

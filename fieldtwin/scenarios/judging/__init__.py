@@ -1,1 +1,1 @@
-"""Run a scenario on a bench and judge it."""
+"""Runs a scenario on a bench and determines its verdict."""

@@ -43,7 +43,7 @@ class ExpectationInput:
 
 
 async def judge_tag(expect: Expect, watched: ExpectationInput) -> Said:
-    """Check value, quality, likeness and rate of a tag now."""
+    """Check value, quality and rate of a tag now, and whether its value equals the value that its device held."""
     assert expect.tag is not None
     reading = watched.bench.reading(expect.tag)
     if expect.updates_per_s is not None:
@@ -68,7 +68,8 @@ def is_secret(system: System, name: str) -> bool:
 
 async def _judge_value(expect: Expect, watched: ExpectationInput, reading: TagReading) -> Said:
     assert expect.tag is not None
-    if expect.quality is not None and reading.value is None:  # it has not turned bad: it never had a value
+    # the quality has not turned bad, because the tag never had a value
+    if expect.quality is not None and reading.value is None:
         return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
     if expect.quality is not None and reading.quality != expect.quality:
         return f"{expect.tag} {expect.quality}", f"{reading.quality} ({reading.reason})"
@@ -167,7 +168,7 @@ def bounds_text(bounds: BoundsForm) -> str:
 
 
 def said(part: Any) -> str:
-    """Return the text of a part of a scenario file, as the file writes it."""
+    """Return a part of a scenario file as text, in the notation of the file."""
     if hasattr(part, "model_dump"):
         part = part.model_dump(exclude_none=True, exclude_defaults=True, by_alias=True)
     if isinstance(part, dict):

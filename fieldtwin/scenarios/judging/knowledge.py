@@ -33,7 +33,7 @@ class Knowledge:
         self._bench = bench
         self._sent_s = float("-inf")  # no command was sent yet
         self._last: dict[str, TraceEvent] = {}
-        """By tag or variable: the latest event about it."""
+        """The latest event about each tag or variable."""
         self._valued: set[str] = set()
         """Tags and variables that have had a value."""
 
@@ -68,12 +68,12 @@ class Knowledge:
         return all(self._bench.reading(name) is not None for name in expression.names)
 
     def of_expression(self, expression: Expression) -> str:
-        """Return in words the current values of all names in the expression."""
+        """Return the current values of all names in the expression as text."""
         late = [f"scans up to {self._bench.late_ms():.3g} ms late"] if expression.asks_lateness else []
         return "; ".join([*late, *([self.of(expression.names)] if expression.names else [])])
 
     def of(self, names: Iterable[str]) -> str:
-        """Return in words the current values of tags and variables. Other names are left out."""
+        """Return the current values of tags and variables as text. Other names are left out."""
         known = [name for name in dict.fromkeys(names) if name in self._known]
         return "; ".join(f"{name}: {self._in_words(name)}" for name in known)
 

@@ -1,9 +1,9 @@
 """How a late host affects a deadline.
 
 Outside virtual time, the system under test and the test runner share a host. The runner measures by how much its own
-sleeps ended too late: only the host can cause that, and it is subtracted. A reaction that is later than that, but within the
-whole observed lateness (slow answers, late scans), proves nothing, because the host or the system may be the cause. An even
-later reaction has failed.
+sleeps ended too late: only the host can cause that, and it is subtracted. A reaction that is later than the deadline after
+this subtraction, but within the whole observed lateness (slow answers, late scans), proves nothing, because the host or the
+system may be the cause. An even later reaction fails the check.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ BUDGET = 2.0
 INCONCLUSIVE.
 """
 LOOK_S = 0.03
-"""The interval in seconds after which a reaction is seen at the latest, because checks look periodically."""
+"""The longest time in seconds between a reaction and the check that sees it, because the runner checks periodically."""
 
 
 @dataclass(frozen=True)

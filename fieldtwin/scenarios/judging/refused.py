@@ -20,7 +20,9 @@ MOST_TOLD = 10
 
 
 class RefusedOutputs:
-    """The check of one scenario: it takes the trace's events, and `look` returns what breaks it now."""
+    """The check of one scenario. `hear` takes the events of the trace, and `look` returns the first refusal that breaks the
+    check.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -28,7 +30,7 @@ class RefusedOutputs:
         self._disturbed = False
         """Whether the scenario has injected a fault: from then on a device may refuse."""
         self._seen: Counter[str] = Counter()
-        """Refusals by tag, of those that could break the check."""
+        """The refusals of each tag that could break the check."""
         self._broken: Violation | None = None
         self._others: dict[str, str] = {}
         """The first refusal of each tag and cause that does not break the check."""

@@ -74,7 +74,9 @@ class _RuleBroken(Exception):
 
 
 def _wanted(what: str, within_s: float) -> str:
-    """Return what a step waits for, in words: ``ctd.pressure > 3 within 2 s``, or ``... now`` if it may take no time."""
+    """Return the condition for which a step waits, as text: ``ctd.pressure > 3 within 2 s``, or ``... now`` if it may take no
+    time.
+    """
     return f"{what} within {within_s:g} s" if within_s else f"{what} now"
 
 
@@ -188,7 +190,8 @@ class ScenarioRunner:
     async def _judged(self) -> tuple[Verdict, str]:
         """Run the steps, then the whole-run rules to their end; return the verdict and its reason."""
         try:
-            for fault in self._by_chance.faults if self._by_chance is not None else ():  # each contains its own time
+            # each of these results contains its own time
+            for fault in self._by_chance.faults if self._by_chance is not None else ():
                 await self.bench.inject({**fault, "optional": True})
             for n, step in enumerate(self.scenario.form.steps):
                 result = await self._step(n, step)
@@ -417,7 +420,9 @@ class ScenarioRunner:
         self._looked_all_the_time(end_s - during_s, during_s)
 
     def _looked_all_the_time(self, since_s: float, during_s: float) -> None:
-        """A lasting condition must have been checked all the time: raise if this host was late meanwhile."""
+        """Raise `_Broken` if this host was late while a lasting condition had to be checked: the condition may have been false
+        for a while.
+        """
         late_s = self.bench.host_late_s(since_s)
         if during_s and late_s > LATE_SHARE * during_s:
             raise _Broken(
@@ -428,7 +433,7 @@ class ScenarioRunner:
 
     @staticmethod
     def _bound(expression: Expression, limit_s: float = 0.0) -> float:
-        """Return the shortest time that a check is about."""
+        """Return the shortest time limit of a check."""
         return min([t for t in (limit_s, *expression.times_s) if t > 0], default=0.0)
 
     # -- time, and what holds all the time --------------------------------------------------------------------------------
@@ -494,7 +499,7 @@ class ScenarioRunner:
         return verdict, reason
 
     def _judges(self) -> bool:
-        """Return whether anything in the scenario could have failed."""
+        """Return whether the scenario contains a check that can fail."""
         form = self.scenario.form
         if self._invariants:
             return True

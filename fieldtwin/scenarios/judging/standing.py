@@ -1,7 +1,7 @@
 """The rules of a scenario for the whole run: `always`, `never`, and that every part of the system runs.
 
-These rules are checked at each check of the runner. A rule whose value is unknown is neither kept nor broken: a rule that was
-never known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.
+These rules are checked at each check of the runner. A rule whose value is unknown is neither fulfilled nor broken: a rule that
+was never known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Standing:
         self._expressions += [always_rule(stated) for stated in invariants.stated]
 
     def saw(self, exchange: DecodedExchange) -> None:
-        """Take an exchange that was seen on a device's bus."""
+        """Record an exchange that was seen on a device's bus."""
         for rule in self._wires:
             rule.watched.append(exchange)
 
@@ -83,10 +83,10 @@ class AlwaysRule:
     wanted: bool
     where: str
     since_s: float | None = None
-    """Time from which it was judged."""
+    """Time (s) from which the rule was checked."""
     looks: int = 0
     unknown_s: float | None = None
-    """The time at which it became unknown for the first time after it was known."""
+    """The time (s) at which the expression became unknown for the first time after it was known."""
     unknown_looks: int = 0
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
@@ -138,7 +138,7 @@ class AlwaysRule:
 
 
 def always_rule(stated: Stated) -> AlwaysRule:
-    """Return the rule of an invariant of the system file."""
+    """Return the rule for an invariant of the system file."""
     return AlwaysRule(stated.number, stated.expression, stated.wanted, stated.where)
 
 
@@ -151,7 +151,7 @@ class _NeverOnWire:
     unless: Expression | None
     where: str
     watched: deque[DecodedExchange] = field(default_factory=deque)
-    """Exchanges seen since the last look."""
+    """The exchanges seen since the last check."""
     _excused: bool = False
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
@@ -207,7 +207,9 @@ class _Running:
         return Violation(self.number, text, stopped.what, (), stopped.bound_s, now_s, stopped.where)
 
     def result(self, now_ns: int) -> CheckResult | None:
-        """Return None if the scenario has no `stopped:` and everything ran. A program that never started did not run."""
+        """Return the result of the rule; None if the scenario has no `stopped:` and every part ran. A program that never
+        started did not run.
+        """
         waits = self._bench.not_started()
         if waits and "plc" not in self._may_stop:
             text = f"{_NAMES['plc']} runs"

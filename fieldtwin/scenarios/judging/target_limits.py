@@ -16,8 +16,8 @@ NO_FRESH_START = (
 
 
 def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Impact) -> str:
-    """Return why a target lacks a capability for the scenario, or why its impact level is not permitted; empty if all
-    is well.
+    """Return why a target lacks a capability for the scenario, or why its impact level is not permitted; empty if the scenario
+    may run.
     """
     lacking = [need.value for need in scenario.needs if need not in can]
     if lacking:

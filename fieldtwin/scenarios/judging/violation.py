@@ -21,4 +21,4 @@ class Violation:
     where: str = ""
     asks_lateness: bool = False
     nobody_knows: bool = False
-    """Whether the host was so late that it cannot be decided if the rule is broken."""
+    """Whether the host was so late that the runner cannot decide whether the rule is broken."""

@@ -26,7 +26,7 @@ from fieldtwin.scenarios.language.invariants import Followed, Invariants
 from fieldtwin.scenarios.language.words import Cycle, Rate
 
 SAMPLES = 500
-"""Number of samples that a rate remembers; it is the resolution of its windows."""
+"""Number of samples that the rule of a rate stores for one window; it determines how finely the window moves."""
 
 
 class WholeRun:
@@ -103,7 +103,7 @@ class WholeRun:
         return reading.updates if reading is not None else 0
 
     def results(self, now_ns: int) -> Iterator[CheckResult]:
-        """Yield a result for each rule, in the order of the file. A rule that judged nothing is INCONCLUSIVE."""
+        """Yield a result for each rule, in the order of the file. A rule that never checked anything is INCONCLUSIVE."""
         rules: list[WithinRule | _Rate | _Cycle] = [*self.withins, *self._rates, *self._cycles]
         for rule in rules:
             got, known = rule.summary()
@@ -124,7 +124,7 @@ def _condition(scenario: Scenario, form: Rate | Cycle, word: str, n: int) -> Exp
 
 
 def within_rule(followed: Followed) -> WithinRule:
-    """Return the rule of an invariant of the system file."""
+    """Return the rule for an invariant of the system file."""
     return WithinRule(followed.number, followed.where, followed.after, followed.then, followed.limit_s, invariant=True)
 
 
@@ -292,14 +292,14 @@ class _Cycle:
     def hear(self, event: TraceEvent) -> None:
         if event.where != self.form.changes_of or event.kind not in (TraceKind.TAG, TraceKind.STATE):
             return
-        # From the first read on, only the read values count, not commanded ones.
+        # After the first read, only values that were read count; commanded values do not.
         if event.kind is TraceKind.TAG and not self._read:
             self._read, self._value, self._last_s = True, None, None
             self._between.clear()
         elif event.kind is TraceKind.STATE and self._read:
             return
         value = event.data.get("value")
-        if value is None or value != value:  # unknown: a gap, not a change
+        if value is None or value != value:  # an unknown value is a gap, not a change
             self._value = self._last_s = None
             return
         if value == self._value:

@@ -88,7 +88,7 @@ class Expression:
 
     @property
     def is_constant(self) -> bool:
-        """Whether it contains no tag or variable, and therefore never changes."""
+        """Return whether the expression contains no tag or variable, and therefore never changes."""
         return not any(isinstance(node, ast.Name | ast.Attribute | ast.Call) for node in ast.walk(self._tree))
 
     def _check(self, node: ast.expr) -> None:
@@ -191,7 +191,7 @@ def _truth(value: Any) -> bool | None:
 
 
 def _joined(parts: Iterable[bool | None], stop_at: bool) -> bool | None:
-    """Return Kleene's `or` (`stop_at` True) or `and` (False) of `parts`."""
+    """Return `or` (`stop_at` True) or `and` (False) of `parts` in Kleene's three-valued logic."""
     unknown = False
     for part in parts:
         if part is stop_at:

@@ -40,7 +40,7 @@ _TOGETHER = {
     "rate": ("wire", "access", "function", "register", "value", "requests_per_s", "during"),
     "that": ("that", "within", "during"),
 }
-"""The permitted keys of an expectation, by its subject."""
+"""The permitted keys of an expectation for each subject (`tag`, `wire`, `that`)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Scenario:
     known: tuple[str, ...] = ()
     """The names that expressions may contain."""
     own: tuple[str, ...] = ()
-    """Those of `known` that belong to the system."""
+    """The names in `known` that belong to the system, without those of probes."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """The possible words of each name whose value is a word: the states of programs."""
     probes: tuple[ScenarioProbe, ...] = ()

@@ -31,7 +31,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class Followed:
-    """The rule that `then` becomes true within `limit_s` of each time that `after` becomes true."""
+    """The invariant that `then` becomes true within `limit_s` of each time that `after` becomes true."""
 
     number: str
     where: str

@@ -79,7 +79,9 @@ class ScenarioProbe:
 
 
 def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> ScenarioProbe:
-    """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of what the system serves."""
+    """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of the servers of the system's
+    gateway.
+    """
     loc: tuple[Key, ...] = ("probes", name)
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise file.error(loc, "a probe's name", expected="small letters, digits and _", got=name)

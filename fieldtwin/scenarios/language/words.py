@@ -24,7 +24,7 @@ class SendStep(_Form):
 
 
 class Set(_Form):
-    """The step `set`: a device holds a value for DEVICE.TAG; null ends that."""
+    """The step `set`: a device holds a value for DEVICE.TAG; null restores the device's own value."""
 
     tag: str
     value: Number | bool | str | None

@@ -21,9 +21,9 @@ from fieldtwin.scenarios.regression.run_history import RunHistory, ValueChange
 from fieldtwin.twin.site.system import System
 
 BRIEF_NS = 200_000_000
-"""A shorter state is not expected: a check could come too late."""
+"""The scenario does not expect states that last shorter than this (ns), because a check could come too late."""
 RESTLESS = 3
-"""A tag that changes more often between two stimuli is compared with the device's register, not with a value."""
+"""A tag that changes more often than this between two stimuli is compared with the device's register, not with a value."""
 MOST_STEPS = 5_000
 AHEAD_NS = 200_000_000
 """Time before the next stimulus at which tags are compared."""
@@ -142,7 +142,7 @@ def _steps(system: System, history: RunHistory, wanted: ScenarioOptions, stimuli
 
 
 def _seen(history: RunHistory, wanted: ScenarioOptions, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:
-    """Return the expected values of programs that lasted long enough to be observed."""
+    """Return an expectation for each value of a program's variable that lasted long enough to be observed."""
     for name, changes in history.states.items():
         for n, change in enumerate(changes):
             until_ns = changes[n + 1].t_ns if n + 1 < len(changes) else history.end_ns
@@ -168,7 +168,7 @@ def _looks(system: System, history: RunHistory, wanted: ScenarioOptions, begin_n
             continue
         if now is not None and isinstance(now.value, int | float) and not isinstance(now.value, bool):
             if "." in name and name.partition(".")[0] in system.devices:
-                continue  # an output that a device holds is a tag as well
+                continue  # an output that a device holds is also a tag, which is checked as such
             slack = _slack(changes, history)
             about = f"{name} == {_literal(now.value)}"
             if slack:

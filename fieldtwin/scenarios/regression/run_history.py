@@ -31,7 +31,7 @@ class ValueChange:
     quality: str = ""
 
     def says(self) -> tuple[Any, str]:
-        """Return the part that is compared: a bad value counts as no value."""
+        """Return the part of a change that is compared: its value, or no value if the quality is bad."""
         return (None if self.quality == "bad" else self.value), self.quality
 
     def __str__(self) -> str:

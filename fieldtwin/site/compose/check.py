@@ -23,13 +23,13 @@ _VARIABLE = re.compile(r"FIELDTWIN_([A-Z]+(?:_[A-Z]+)?)_\w+")
 
 
 class CommandLines(Protocol):
-    """Knows the commands of fieldtwin."""
+    """The interface to the commands of fieldtwin and their options."""
 
     def wrong_words(self, words: Sequence[str], /) -> Iterable[WrongWord]:
-        """Return the wrong words of a command line."""
+        """Return the words of a command line that are wrong."""
 
     def variables_of(self, command: str, /) -> Sequence[str]:
-        """Return the environment variables of a command; an unknown command has none."""
+        """Return the environment variables that set a command's options; an unknown command has none."""
 
 
 class ComposeCheck:
@@ -145,7 +145,9 @@ class ComposeCheck:
                 )
 
     def _health_errors(self, service: Service, system: System) -> Iterator[FileInvalid]:
-        """Yield sockets of the health check that this service never makes, so that it would never be healthy."""
+        """Yield an error for each socket in the health check that the service never creates, so that the service would never
+        be healthy.
+        """
         command = service.words[0]
         given = service.option("instance")
         instance = given[1] if given else system.name + _INSTANCE_SUFFIX.get(command, "")
@@ -160,7 +162,7 @@ class ComposeCheck:
                 yield self._file.error((*service.at, "healthcheck", "test", index), message, expected=expected)
 
     def _port_errors(self, service: Service, system: System, words: Sequence[str]) -> Iterator[FileInvalid]:
-        """Yield published ports at which nothing listens in the container."""
+        """Yield an error for each published port at which no process in the container listens."""
         if service.words[0] not in ("run", "emulate") or any("${" in word for word in words):
             return
         listening = {int(port) for word in [*words, *service.environment.values()] for port in _PORT.findall(word)}
@@ -208,7 +210,7 @@ class ComposeCheck:
 
 
 def _commands_of(name: str) -> list[str]:
-    """Return the commands that the middle of a variable's name may begin with, the longest first."""
+    """Return the commands that the part of a variable's name after ``FIELDTWIN_`` may stand for, the longest name first."""
     first, _, rest = name.lower().partition("_")
     return [f"{first}-{rest}", first] if rest else [first]
 

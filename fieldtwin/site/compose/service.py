@@ -20,7 +20,7 @@ _IMAGE = re.compile(r"(?:.*/)?fieldtwin(?:[:@].*)?")
 
 @dataclass(frozen=True)
 class WrongWord:
-    """A wrong word of a command line, by its index."""
+    """A wrong word of a command line: its index and the error."""
 
     index: int
     message: str
@@ -45,7 +45,9 @@ class Service:
         return ("services", self.name)
 
     def word(self, index: int) -> tuple[Key, ...]:
-        """Return the place of a word of the command. A command that is one text has one place."""
+        """Return the position of a word of the command in the file. A command written as one text has one position for all
+        words.
+        """
         return (*self.at, "command") if self.one_word else (*self.at, "command", index)
 
     def option(self, name: str) -> tuple[int, str] | None:

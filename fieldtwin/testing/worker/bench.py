@@ -29,7 +29,7 @@ from fieldtwin.twin.site.system import System
 
 
 class WorkerBench:
-    """The field simulator of a system. Raises the errors of opening one, and those of its emulators."""
+    """The field simulator of a system. Opening it raises the errors of a field simulator and of its emulators."""
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
         self.system = system
@@ -103,7 +103,7 @@ class WorkerBench:
         }
 
     def alive(self) -> None:
-        """Raise the error with which an emulator has failed, if any."""
+        """Raise the error of an emulator that has failed, if any."""
         failure = self._nursery.failure()
         if failure is not None:
             raise failure
@@ -111,7 +111,7 @@ class WorkerBench:
             self.plc.alive()
 
     def set(self, device: str, tag: str, value: Any) -> None:
-        """Make `device` hold `value` for `tag`; None: return to its own value."""
+        """Make `device` hold `value` for `tag`; with None it returns to its own value."""
         self._tag(device, tag)
         self.field.faults.set_value(device, tag, value)
 
@@ -145,7 +145,7 @@ class WorkerBench:
 
 
 def _as_held(tag: Tag, value: float) -> float | int | bool:
-    """Return `value` as the tag's type holds it, in engineering units: rounded to the nearest step of an integer."""
+    """Return the value that the device can hold for `value`, in engineering units: an integer type rounds to its nearest step."""
     if tag.type == "bool":
         return bool(value)
     if tag.type.startswith("float") or math.isnan(value) or tag.scale_by is not None:

@@ -34,11 +34,11 @@ MOST = 1_000
 
 
 class Host:
-    """``await Host().serve()`` until our input ends."""
+    """``await Host().serve()`` until the standard input ends."""
 
     def __init__(self, *, trust: bool = False) -> None:
         self._trust = trust
-        """Foreign templates may run: the user allowed it when the tests were started."""
+        """Whether templates from other sources may run; the user allows it when the tests are started."""
         self._clock = WallClock()
         self._benches: dict[int, WorkerBench] = {}
         self._programs: dict[int, SteppedProgram] = {}
@@ -66,7 +66,7 @@ class Host:
         return 0
 
     async def aclose(self) -> None:
-        """End everything that was not ended."""
+        """End every bench and program that is still open."""
         while self._benches:
             _, bench = self._benches.popitem()
             await bench.aclose()
@@ -224,7 +224,7 @@ class Host:
         return {"id": number, "values": program.values()}
 
     def _of_system(self, name: str, program: str, folders: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
-        """Return the source of a system's program, and its folders."""
+        """Return the source of a program of a system, and the folders in which it is searched."""
         own = next((path for folder in folders if (path := Path(folder) / name).is_file()), None)
         system = load_system(str(own or name))
         if program not in system.plc.programs:

@@ -82,7 +82,7 @@ def _usual(profile: DeviceProfile) -> str:
 
 
 def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
-    """Return the plant's endpoint, and the endpoint on which the emulator listens."""
+    """Return the endpoint of the plant and the endpoint at which the emulator listens."""
     kind = on.partition(":")[0]
     if kind not in KINDS:
         raise UsageError(f"a wire {on!r}", expected=", ".join(KINDS) + ", or can:INTERFACE/CHANNEL")

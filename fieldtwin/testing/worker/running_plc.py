@@ -68,7 +68,7 @@ class PlcProcesses:
             system=str(system.path.resolve()),
             run_dir=str(folder),
             allow_writes=True,
-            mapping=mapping_to_json(mapping),  # only these: endpoints that are not emulated are not opened
+            mapping=mapping_to_json(mapping),  # the gateway opens only these endpoints, and none that is not emulated
             profiles=profiles,
             resolved=write_resolved(folder / "system.pickle", system),
         )

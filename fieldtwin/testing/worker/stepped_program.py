@@ -1,7 +1,6 @@
 """A PLC program that a test steps: inputs in, scans of a constant cycle, outputs out. No task, no image, no wall clock.
 
-The program is the one of any system, in Python, Structured Text or a PLCopen export; the test decides how much time
-passes.
+The program may be that of any system, in Python, Structured Text or a PLCopen export; the test decides how much time passes.
 """
 
 from __future__ import annotations

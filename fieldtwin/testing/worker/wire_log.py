@@ -46,12 +46,12 @@ class WireLog:
         """The number of the latest exchange, counted from 1."""
 
     def on_bytes(self, bus: str, end: object, reply: bool, data: bytes) -> None:
-        """Add a chunk on a line or socket; `end` identifies the connection."""
+        """Add bytes from a serial line or socket; `end` identifies the connection."""
         way = "received" if reply else "sent"
         self._feed(bus, end, {"dir": way, "bytes": data.hex()})
 
     def on_frame(self, bus: str, frame: CanFrame) -> None:
-        """Add a frame on a CAN bus, from any sender."""
+        """Add a frame of any sender on a CAN bus."""
         data: dict[str, Any] = {"dir": "received", "id": frame.can_id, "bytes": frame.data.hex()}
         data |= {key: True for key, on in (("ext", frame.extended), ("rtr", frame.remote), ("err", frame.error)) if on}
         self._feed(bus, None, data)
@@ -96,7 +96,7 @@ class WireLog:
 
     @property
     def now_s(self) -> float:
-        """Seconds since the log began."""
+        """Return the seconds since the log began."""
         return (self._clock.monotonic_ns() - self._start_ns) / 1e9
 
 

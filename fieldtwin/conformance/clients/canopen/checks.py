@@ -90,7 +90,7 @@ waits_for_each = owes(_waits_for_each)
 
 
 def takes_the_switch(seen: Observation) -> Finding:
-    """Check as `accepts`, if the client allows the change from a block upload to an ordinary one.
+    """Apply the check `accepts` if the client allows the change from a block upload to an ordinary one.
 
     A client that sends a protocol switch threshold of 0 forbids it (7.2.4.3.13). It may refuse each such reply; only a
     wrong value would be a failure.
@@ -118,7 +118,7 @@ def _one_a_block(seen: Observation) -> Finding | None:
 
 BLOCK_ACKNOWLEDGED = 0xA2
 _OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
-"""First bytes of frames that are not segments of a block upload."""
+"""First bytes of the node's frames that are not segments of a block upload: an initiate, an end and an abort."""
 one_a_block = owes(_one_a_block)
 
 

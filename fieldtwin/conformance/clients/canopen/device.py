@@ -10,7 +10,7 @@ from fieldtwin.emulators.canopen.sdo.server import SdoServer
 
 TIMEOUT_NS = 2_000_000_000
 LONG_BYTES = 1000
-"""The data of a block upload, the word repeated: two sub-blocks."""
+"""Number of bytes of a block upload, which repeat the word. They need two sub-blocks."""
 BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x00, 0x7F, 0x05, 0x04
 _STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
 _RESETS = frozenset({0x81, 0x82})

@@ -79,7 +79,7 @@ class HostileNode:
         self._case = None
 
     async def serve(self, connection: CanConnection) -> None:
-        """Serve until the bus is gone."""
+        """Serve until the bus is lost."""
         self._connection = connection
         async with Nursery() as nursery:
             self._nursery = nursery
@@ -145,7 +145,7 @@ class HostileNode:
         if case is None or memory is None or not (case.misses or case.early):
             return False
         if memory.get("deaf") and segment[0] & 0x7F != 1:
-            return True  # the rest of a sub-block that was acknowledged early
+            return True  # this segment belongs to the rest of a sub-block that was acknowledged early
         memory["deaf"] = 0
         memory["segments"] = memory.get("segments", 0) + 1
         return memory["segments"] == case.misses
@@ -230,7 +230,7 @@ class HostileNode:
                 left -= 1
                 self.pending -= 1
         except ConnectionLost:
-            pass  # the bus is gone: `serve` reports it
+            pass  # the bus is lost, which `serve` reports
         finally:
             self.pending -= left
 

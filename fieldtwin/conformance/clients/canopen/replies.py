@@ -66,7 +66,9 @@ def wrong_crc(scene: SdoRequestContext) -> list[SayFrame]:
 
 
 def loses(at: int) -> SdoReplyFunction:
-    """Block upload: a segment of each first try of a sub-block is lost; `at` as of a list."""
+    """Block upload: lose one segment once. A positive index `at` loses it from a full sub-block, a negative one from a shorter
+    last one.
+    """
 
     def play(scene: SdoRequestContext) -> list[SayFrame]:
         frames = [scene.reply(data) for data in scene.true]
@@ -143,7 +145,7 @@ def extended(scene: SdoRequestContext) -> list[SayFrame]:
 
 
 def honest(scene: SdoRequestContext) -> list[SayFrame]:
-    """Reply correctly. The fault is elsewhere: in frames that the node ignores or does not send."""
+    """Reply correctly. The case consists of frames that the node ignores or does not send."""
     return [scene.reply(data) for data in scene.true]
 
 
@@ -223,12 +225,12 @@ def short_pdo(scene: SdoRequestContext) -> list[SayFrame]:
 
 
 def pdo_outside(scene: SdoRequestContext) -> list[SayFrame]:
-    """Report PRE-OPERATIONAL, and send process data nevertheless."""
+    """Report PRE-OPERATIONAL, and send process data (a PDO) nevertheless."""
     pdo = (scene.poison * 8)[:8]
     return [scene.frame(HEARTBEAT, bytes((PRE_OPERATIONAL,))), scene.frame(TPDO1, pdo), *scene.honest()]
 
 
 def emcy_partly_over(scene: SdoRequestContext) -> list[SayFrame]:
-    """Send two errors, and report one of them as cleared: the error register still shows an error."""
+    """Send two EMCY errors, and report one of them as cleared: the error register still shows an error."""
     told = (b"\x10\x81\x11", b"\x00\x50\x19", b"\x00\x00\x11")
     return [*(scene.frame(EMCY, data.ljust(8, b"\0")) for data in told), *scene.honest()]

@@ -55,7 +55,7 @@ class HonestDevice:
         return self._unit.respond(pdu, now_ns) or b""
 
     def answer_with(self, word: int, pdu: bytes, now_ns: int) -> bytes:
-        """Return the answer that the device would give if all cells held `word`. Not for writes."""
+        """Return the answer to a read that the device would give if all cells held `word`."""
         kept, written = self._bank.word, self._bank.written
         self._bank.word, self._bank.written = word, {}
         try:
@@ -87,7 +87,7 @@ class RtuWire:
 
 
 class AsciiWire:
-    """The same for an ASCII line."""
+    """A splitter of the requests on an ASCII line, and a builder of frames for it."""
 
     framing = "ascii"
 
@@ -114,7 +114,7 @@ def in_ascii(adu: bytes) -> bytes:
 
 
 class MbapWire:
-    """The same for TCP."""
+    """A splitter of the requests on Modbus TCP, and a builder of ADUs for it."""
 
     framing = "tcp"
 

@@ -1,6 +1,6 @@
 """The endpoint of a Modbus client under test: it replies correctly until a case begins.
 
-It records everything without a verdict. It handles connections and time, and does not know specific cases.
+It records everything without a verdict. It handles connections and time, and does not depend on specific cases.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class HostileServer:
         return round(self._loop.time() * NS_PER_S)
 
     def hold(self, word: Word) -> int:
-        """Make all cells hold that word from now on; return its number."""
+        """Make all registers and bits hold that word from now on; return its number."""
         self.device.word = self.first_word if word is Word.FIRST else self.second_word
         return self.device.word
 

@@ -8,7 +8,7 @@ from fieldtwin.conformance.clients.modbus.setup import Move, ReplyFunction, Requ
 from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 
 SPLIT_S = 0.016
-"""The latency timer of a usual USB adapter."""
+"""Time in seconds between the two halves of a split frame: the latency timer of a common USB adapter."""
 OURS_AFTER_S = (0.020, 0.040, 0.010, 0.030)
 """Delays in seconds of this unit's reply after that of another unit."""
 LATER = 0.5
@@ -137,7 +137,7 @@ def hole(scene: RequestContext) -> list[Move]:
 
 
 def garbage(scene: RequestContext) -> list[Move]:
-    """Send the bytes that a receiver sees at twice the baud rate: every bit doubled, with framing errors."""
+    """Send the bytes that a receiver at twice the baud rate sees: every bit is doubled, and framing errors occur."""
     frame = scene.frame(scene.false)
     out = bytearray()
     for byte in frame:

@@ -1,4 +1,4 @@
-"""The virtual port that a client under test opens. A case can unplug it, restore it under its name, and hold it."""
+"""The virtual port that a client under test opens. A case can remove it, restore it under its name, and hold it exclusively."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The inputs of a reply function: the request, true and false answers to it, and moves. Pure."""
+"""The inputs and results of a reply function: the request, correct and false answers to it, and the moves of the device. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fieldtwin.conformance.core.case import TRAIL_S, Basis, ClientCase, Elsewher
 
 @dataclass(frozen=True, slots=True)
 class Say:
-    """Send `data`, `after_s` seconds after the request."""
+    """The move: send `data`, `after_s` seconds after the request."""
 
     data: bytes
     after_s: float = 0.0
@@ -21,7 +21,7 @@ class Say:
 
 @dataclass(frozen=True, slots=True)
 class HangUp:
-    """Close the connection, by a reset if the transport has one."""
+    """The move: close the connection, by a reset if the transport has one."""
 
     after_s: float = 0.0
     reset: bool = False
@@ -29,14 +29,16 @@ class HangUp:
 
 @dataclass(frozen=True, slots=True)
 class Deaf:
-    """Leave the connection open, and send nothing on it any more."""
+    """The move: leave the connection open, and send nothing on it any more."""
 
     after_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Unplug:
-    """Remove the port for `out_s` seconds and restore it under its name; then another process holds it for `held_s`."""
+    """The move: remove the port for `out_s` seconds and restore it under its name; then a different process holds it for
+    `held_s` seconds.
+    """
 
     out_s: float
     held_s: float = 0.0
@@ -124,6 +126,6 @@ class ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]
 
     def on_tcp(self, basis: Basis, clause: str) -> ModbusCase:
-        """Return the case with another basis and source on Modbus TCP."""
+        """Return the case with a different basis and source on Modbus TCP."""
         there = Elsewhere("tcp", "TCP", basis, clause)
         return replace(self, about=replace(self.about, elsewhere=(there,)))

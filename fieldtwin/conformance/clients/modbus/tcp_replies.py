@@ -55,5 +55,5 @@ def half_open(scene: RequestContext) -> list[Move]:
 
 
 def closed_while_unused(scene: RequestContext) -> list[Move]:
-    """Answer, and then close the connection while the client is idle."""
+    """Answer the request, and then close the connection while the client is idle."""
     return [scene.good(), HangUp(0.050)]

@@ -88,9 +88,9 @@ class NodeConnection:
         self.impact = Impact.READ
         self.traits = frozenset({"can"})
         self.device_type = b""
-        """The node's answer for 1000h without faults: an object that every node has (7.5.2.1)."""
+        """The value of 1000h that the node gave before the first case. Every node has this object (7.5.2.1)."""
         self.long: Key | None = None
-        """An object that takes more than one segment."""
+        """An object whose upload needs more than one segment."""
         self.state: int | None = None
         self.clock = clock
         self._connection = connection
@@ -151,7 +151,7 @@ class NodeConnection:
             return list(self._pending)
 
     async def pause(self) -> None:
-        """Give the node time to execute a command."""
+        """Wait, so that the node has time to execute a command."""
         await asyncio.sleep(max(0.05, self._spacing_s))
 
     def forget(self) -> None:
@@ -165,7 +165,7 @@ class NodeConnection:
     # -- SDO ---------------------------------------------------------------------------------------------------------
 
     async def tell(self, data: bytes, *, at_once: bool = False) -> None:
-        """Send an SDO frame to the server; short ones unchanged."""
+        """Send an SDO frame to the server without padding, even if it is shorter than 8 bytes."""
         await self.send(CanFrame(SDO_REQUEST + self.node, data), at_once=at_once)
 
     async def ask(self, data: bytes, within_s: float | None = None) -> SdoReply:
@@ -188,7 +188,7 @@ class NodeConnection:
         reply = await self.ask(b"\x40" + mux(*key))
         if reply.specifier != 2 or reply.data[1:4] != mux(*key):
             return reply
-        if reply.data[0] & 2:  # expedited
+        if reply.data[0] & 2:  # the transfer is expedited
             unused = reply.data[0] >> 2 & 3 if reply.data[0] & 1 else 0
             return reply.data[4 : 8 - unused]
         value, toggle = b"", 0
@@ -225,7 +225,7 @@ class NodeConnection:
         await self.send(CanFrame(NMT, bytes((command, self.node))))
 
     async def boots(self) -> bool:
-        """Return whether a boot-up message comes."""
+        """Wait for a boot-up message, and return whether it arrived."""
         loop = asyncio.get_running_loop()
         end = loop.time() + self.boot_s
         while (left := end - loop.time()) > 0:

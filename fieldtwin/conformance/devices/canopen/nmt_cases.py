@@ -55,17 +55,17 @@ async def _reset(wire: NodeConnection, command: int) -> Finding:
 
 
 async def reset_node(wire: NodeConnection) -> Finding:
-    """CO-032: reset node: boot-up, PRE-OPERATIONAL."""
+    """CO-032: send "reset node". The node must send its boot-up message and enter PRE-OPERATIONAL."""
     return await _reset(wire, RESET_NODE)
 
 
 async def reset_communication(wire: NodeConnection) -> Finding:
-    """CO-032: reset communication: boot-up, PRE-OPERATIONAL."""
+    """CO-032: send "reset communication". The node must send its boot-up message and enter PRE-OPERATIONAL."""
     return await _reset(wire, RESET_COMMUNICATION)
 
 
 async def reset_in_a_transfer(wire: NodeConnection) -> Finding:
-    """CO-027: a reset in the middle of an upload: boot-up, and the transfer is over."""
+    """CO-027: reset the node in the middle of an upload. It must send its boot-up message and forget the transfer."""
     async with _restored(wire):
         await begin_upload(wire, await long_object(wire))
         wire.forget()
@@ -79,7 +79,7 @@ async def reset_in_a_transfer(wire: NodeConnection) -> Finding:
 
 
 async def stopped(wire: NodeConnection) -> Finding:
-    """CO-028: no SDO in STOPPED."""
+    """CO-028: send an SDO request in STOPPED. The node must not answer."""
     async with _restored(wire):
         await wire.command(STOP)
         await wire.pause()
@@ -102,7 +102,7 @@ async def odd_commands(wire: NodeConnection) -> Finding:
 
 
 async def guarding(wire: NodeConnection) -> Finding:
-    """CO-040: two guard requests: answered, the toggle bit alternates."""
+    """CO-040: send two guard requests. The node must answer both, and alternate the toggle bit."""
     toggles = []
     for _ in range(2):
         wire.forget()
@@ -117,7 +117,7 @@ async def guarding(wire: NodeConnection) -> Finding:
 
 
 async def silent_outside(wire: NodeConnection) -> Finding:
-    """CO-044: no PDO outside OPERATIONAL."""
+    """CO-044: observe the node outside OPERATIONAL. It must not send a PDO."""
     async with _restored(wire):
         await wire.command(ENTER_PRE_OPERATIONAL)
         await wire.pause()
@@ -127,7 +127,7 @@ async def silent_outside(wire: NodeConnection) -> Finding:
 
 
 async def fastscan(wire: NodeConnection) -> Finding:
-    """CO-057: a node that has a node ID does not answer a fastscan."""
+    """CO-057: send a fastscan, which a node that has a node ID must not answer."""
     wire.forget()
     await wire.send(CanFrame(LSS_REQUEST, b"\x51\0\0\0\0\x80\0\0"))
     if await wire.hear(LSS_REPLY) is not None:

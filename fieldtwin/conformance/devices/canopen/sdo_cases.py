@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.canopen.sdo.block import crc16
 
 TOGGLE, UNKNOWN, BLOCK_SIZE = 0x0503_0000, 0x0504_0001, 0x0504_0002
 UNLIKELY = (0x5FFE, 0x5F0D, 0x2FFD, 0x1FFE)
-"""Indices that very few devices have."""
+"""Indices of objects that very few devices have."""
 MOST_BLOCKS = 200
 COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
 """Records and arrays whose sub 00 states their number of subindices."""
@@ -52,12 +52,12 @@ async def client_aborts(wire: NodeConnection) -> Finding:
 
 
 async def segment_alone(wire: NodeConnection) -> Finding:
-    """CO-003: an upload segment without an initiate."""
+    """CO-003: request an upload segment without an initiate."""
     return await must_abort(wire, b"\x60", UNKNOWN)
 
 
 async def unknown_specifier(wire: NodeConnection) -> Finding:
-    """CO-004: command specifier 7."""
+    """CO-004: send a request with command specifier 7, which is not defined."""
     return await must_abort(wire, b"\xe0", UNKNOWN)
 
 
@@ -87,7 +87,7 @@ async def write_only(wire: NodeConnection) -> Finding:
 
 
 async def missing_index(wire: NodeConnection) -> Finding:
-    """CO-008: an index that is not there."""
+    """CO-008: upload an object whose index does not exist."""
     for index in UNLIKELY:
         if wire.dictionary is not None and wire.dictionary.get(index) is not None:
             continue
@@ -100,7 +100,7 @@ async def missing_index(wire: NodeConnection) -> Finding:
 
 
 async def subindex_of_a_var(wire: NodeConnection) -> Finding:
-    """CO-008: 1000h is a VAR: it has no subindex 01."""
+    """CO-008: upload subindex 01 of 1000h, which does not exist because 1000h is a VAR."""
     return await must_abort(wire, b"\x40" + mux(0x1000, 1), 0x0609_0011)
 
 
@@ -114,7 +114,7 @@ async def subindex_beyond(wire: NodeConnection) -> Finding:
 
 
 async def empty_history(wire: NodeConnection) -> Finding:
-    """CO-012: the first entry of an error history that is empty."""
+    """CO-012: upload the first entry of an empty error history."""
     count = await wire.upload((0x1003, 0))
     if isinstance(count, SdoReply):
         raise NotHere(f"it has no error history, 1003h: {count}")
@@ -134,7 +134,7 @@ async def short_request(wire: NodeConnection) -> Finding:
 
 
 async def extended_identifier(wire: NodeConnection) -> Finding:
-    """CO-060: an upload request with a 29-bit identifier of the same number."""
+    """CO-060: send an upload request with a 29-bit identifier of the same number."""
     wire.forget()
     await wire.send(CanFrame(SDO_REQUEST + wire.node, (b"\x40" + mux(0x1000)).ljust(8, b"\0"), extended=True))
     reply = await wire.reply()
@@ -187,12 +187,12 @@ async def _block_size(wire: NodeConnection, size: int) -> Finding:
 
 
 async def block_size_0(wire: NodeConnection) -> Finding:
-    """CO-014: blocks of 0 segments."""
+    """CO-014: request an upload in blocks of 0 segments."""
     return await _block_size(wire, 0)
 
 
 async def block_size_128(wire: NodeConnection) -> Finding:
-    """CO-014: blocks of 128 segments."""
+    """CO-014: request an upload in blocks of 128 segments."""
     return await _block_size(wire, 128)
 
 
@@ -248,7 +248,7 @@ async def _block_end(wire: NodeConnection, value: bytes, begun: SdoReply) -> tup
 
 
 async def segment_lost(wire: NodeConnection) -> Finding:
-    """CO-016: the last segment of a sub-block is not acknowledged."""
+    """CO-016: acknowledge a sub-block without its last segment, which the node must send again."""
     key = await long_object(wire)
     await _must_have_blocks(wire, key)
     usual = await present(wire, key)
@@ -263,7 +263,7 @@ async def segment_lost(wire: NodeConnection) -> Finding:
 
 
 async def right_after_the_end(wire: NodeConnection) -> Finding:
-    """CO-019: a request right after the end of a block upload."""
+    """CO-019: send a request right after the end of a block upload."""
     key = await _any_object(wire)
     await _must_have_blocks(wire, key)
     _, wrong = await _block_upload(wire, key, 127, lose=False)

@@ -26,7 +26,7 @@ NUMBERS = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}
 LISTEN_S = 0.5
 """Time in seconds of listening before anything is sent: a heartbeat states the node's state."""
 MOST_LONG = 20
-"""Objects of the EDS that are tried for more than one segment."""
+"""Largest number of objects of the EDS that are read to find one with more than one segment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class CanopenOptions:
 
 
 class _OfTheNode(Transcript):
-    """The frames of the node: a bus has others."""
+    """A filter that passes the frames of the node, because other nodes also send on the bus."""
 
     def __init__(self, clock: Clock, node: int) -> None:
         super().__init__(clock)
@@ -100,7 +100,7 @@ async def check_canopen(
 async def learn(wire: NodeConnection) -> dict[str, str]:
     """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
     found: bytes | SdoReply = SdoReply()
-    for _ in range(2):  # a single loss may be a lost frame
+    for _ in range(2):  # a single missing answer may be caused by a lost frame
         found = await wire.upload((0x1000, 0))
         if isinstance(found, bytes):
             break

@@ -16,7 +16,7 @@ from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.sdo.block import crc16
 
 UNKNOWN, CRC, READ_ONLY = 0x0504_0001, 0x0504_0004, 0x0601_0002
-# CiA 301, 7.2.4.3.17 has a general code beside each pair, and does not say which of them a server must choose.
+# CiA 301, 7.2.4.3.17 has a general code in addition to each pair, and does not state which of them a server must choose.
 WRONG_LENGTH, WRONG_VALUE = 0x0607_0010, 0x0609_0030
 TOO_LONG, TOO_SHORT = (0x0607_0012, WRONG_LENGTH), (0x0607_0013, WRONG_LENGTH)
 TOO_HIGH, TOO_LOW = (0x0609_0031, WRONG_VALUE), (0x0609_0032, WRONG_VALUE)
@@ -80,7 +80,7 @@ async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
 
 
 def _instead(key: Key, value: bytes | SdoReply) -> str:
-    """Return the reason why a case cannot use a given object."""
+    """Return the reason why a case cannot use an object that the user gave."""
     if isinstance(value, SdoReply):
         return f"{shown(key)} could not be read ({value})"
     return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
@@ -90,22 +90,22 @@ def _instead(key: Key, value: bytes | SdoReply) -> str:
 
 
 async def read_only_expedited(wire: NodeConnection) -> Finding:
-    """CO-006: 1000h, written with its own value."""
+    """CO-006: write to the read-only object 1000h its own value."""
     return await must_abort(wire, b"\x23" + mux(0x1000) + wire.device_type.ljust(4, b"\0"), READ_ONLY)
 
 
 async def read_only_segmented(wire: NodeConnection) -> Finding:
-    """CO-006: a download in segments to 1000h: refused at initiate, before any data."""
+    """CO-006: download in segments to 1000h. The node must refuse the initiate, before any data."""
     return await must_abort(wire, b"\x21" + mux(0x1000) + b"\x14\0\0\0", READ_ONLY)
 
 
 async def segment_alone(wire: NodeConnection) -> Finding:
-    """CO-003: a download segment without an initiate."""
+    """CO-003: send a download segment without an initiate."""
     return await must_abort(wire, b"\x00abcdefg", UNKNOWN)
 
 
 async def history_set(wire: NodeConnection) -> Finding:
-    """CO-011: 1003h:00 can only be cleared."""
+    """CO-011: write a value other than 0 to 1003h:00, which can only be cleared."""
     if isinstance(there := await wire.upload((0x1003, 0)), SdoReply):
         raise NotHere(f"it has no error history, 1003h: {there}")
     return await must_abort(wire, b"\x2f" + mux(0x1003) + b"\x01", 0x0609_0030, 0x0800_0000)
@@ -122,7 +122,7 @@ async def store_signature(wire: NodeConnection) -> Finding:
 
 
 async def too_long(wire: NodeConnection) -> Finding:
-    """CO-009: one byte more than the object has. The node may refuse the announced size, or the complete data."""
+    """CO-009: download one byte more than the object has. The node may refuse the announced size, or the complete data."""
     key, before = await _number(wire)
     more = before + b"\0"
     async with _borrowed(wire, key):
@@ -133,7 +133,7 @@ async def too_long(wire: NodeConnection) -> Finding:
 
 
 async def too_short(wire: NodeConnection) -> Finding:
-    """CO-009: one byte less, expedited."""
+    """CO-009: download one byte less than the object has, expedited."""
     key, before = await _number(wire)
     if len(before) < 2:
         raise NotHere(f"{shown(key)} has one byte")
@@ -159,12 +159,12 @@ async def _limit(wire: NodeConnection, *, above: bool) -> Finding:
 
 
 async def above_limit(wire: NodeConnection) -> Finding:
-    """CO-010: one more than the EDS allows."""
+    """CO-010: download a value one above the upper limit in the EDS."""
     return await _limit(wire, above=True)
 
 
 async def below_limit(wire: NodeConnection) -> Finding:
-    """CO-010: one less than the EDS allows."""
+    """CO-010: download a value one below the lower limit in the EDS."""
     return await _limit(wire, above=False)
 
 
@@ -182,17 +182,17 @@ async def _announced(wire: NodeConnection, more: int, codes: tuple[int, ...]) ->
 
 
 async def more_than_announced(wire: NodeConnection) -> Finding:
-    """CO-013: a byte more than was announced."""
+    """CO-013: download a byte more than was announced."""
     return await _announced(wire, 1, TOO_LONG)
 
 
 async def less_than_announced(wire: NodeConnection) -> Finding:
-    """CO-013: a byte less than was announced."""
+    """CO-013: download a byte less than was announced."""
     return await _announced(wire, -1, TOO_SHORT)
 
 
 async def without_size(wire: NodeConnection) -> Finding:
-    """CO-029: expedited, without the size bit: the object's own length counts."""
+    """CO-029: download expedited, without the size bit: the object's own length applies."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
         reply = await wire.ask(b"\x22" + mux(*key) + before)
@@ -200,7 +200,7 @@ async def without_size(wire: NodeConnection) -> Finding:
 
 
 async def toggle_repeated(wire: NodeConnection) -> Finding:
-    """CO-001: the toggle bit stays the same in the second segment of a download."""
+    """CO-001: send the second segment of a download with the same toggle bit as the first."""
     key, before = await _text(wire)
     async with _borrowed(wire, key):
         reply = await wire.ask(b"\x21" + mux(*key) + len(before).to_bytes(4, "little"))
@@ -281,7 +281,7 @@ async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
 
 
 async def one_reply_a_block(wire: NodeConnection) -> Finding:
-    """CO-020: a sub-block is acknowledged exactly once."""
+    """CO-020: download in blocks. The node must acknowledge each sub-block exactly once."""
     return await _whole_block(wire, lose=False)
 
 
@@ -297,7 +297,7 @@ BEATS = 4
 
 
 async def heartbeat_changed(wire: NodeConnection) -> Finding:
-    """CO-041: change 1017h: the new period applies at once."""
+    """CO-041: change 1017h. The new heartbeat period must apply at once."""
     key = (0x1017, 0)
     if key not in wire.may_write:
         raise NotHere("changes the heartbeat: --write 1017:00")

@@ -22,7 +22,7 @@ READ, WRITE, DISRUPT = Impact.READ, Impact.WRITE, Impact.DISRUPT
 LINE = ("rtu-line",)
 ASCII = ("ascii-line",)
 FRAMED = ("rtu-line", "rtu-stream")
-"""RTU frames, on a line or through TCP: cases that need no pauses."""
+"""The transports with RTU frames, for cases that need no pauses: a serial line, and RTU over TCP."""
 ANY_LINE = ("rtu-line", "ascii-line", "rtu-stream")
 TCP = ("mbap-stream",)
 STREAM = ("mbap-stream", "rtu-stream")

@@ -1,4 +1,4 @@
-"""Checks that many Modbus cases share: the right refusal, silence, and the recovery afterwards."""
+"""Checks that many Modbus cases share: the correct refusal, silence, and the recovery afterwards."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ MOST_HEARD = 8192
 CALM_S = 0.8
 """After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
 PATIENCE = 3
-"""Number of timeouts after which a missing answer counts as silence: a slow device is not faulty."""
+"""Number of timeouts after which a missing answer counts as silence. It is larger than 1, because a slow device is not faulty."""
 FIRST_TRANSACTION = 0x0100
 """First transaction ID of each case: the same case always sends the same bytes, whatever ran before."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
@@ -37,7 +37,7 @@ Open = Callable[[], Awaitable[ByteConnection]]
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """The received data: whole replies, other bytes, and whether the device closed the connection."""
+    """The data that was received: whole replies, other bytes, and whether the device closed the connection."""
 
     answers: tuple[ReceivedReply, ...]
     rest: bytes = b""
@@ -203,7 +203,8 @@ class DeviceConnection:
         heard = await self.hear(within_s=self.timeout_s * (PATIENCE if due else 1))
         if self.framing in ("mbap", "udp"):
             late = [a for a in heard.answers if a.transaction != number]
-            if late and len(late) == len(heard.answers):  # a reply to an earlier request: ours may follow
+            # this is the reply to an earlier request; the reply to the present request may follow
+            if late and len(late) == len(heard.answers):
                 more = await self.hear()
                 ours = tuple(a for a in more.answers if a.transaction == number)
                 return Received(ours or heard.answers, heard.rest + more.rest, more.closed)

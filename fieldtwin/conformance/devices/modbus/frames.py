@@ -15,7 +15,9 @@ from fieldtwin.gateway.protocols.modbus.frames.shapes import MAX_FRAME, frame_le
 
 NO_TRANSACTION = -1
 _STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]
-"""Table of the check sum per byte, which allows garbage to be searched once from each of its bytes."""
+"""The table of the check sum for each byte value. With it the search for a reply in garbage, which starts at each byte, is
+fast.
+"""
 _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
 
 

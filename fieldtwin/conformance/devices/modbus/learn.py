@@ -15,7 +15,7 @@ TABLE = {number: name for name, number in FUNCTION.items()}
 STARTS = (0, 1, 100, 1000, 40000)
 """Addresses at which register maps usually begin."""
 ORDER = (0x03, 0x04, 0x01, 0x02)
-"""The tables, the most telling first."""
+"""The tables in the order in which they are tried: first those that reveal most about a device."""
 
 
 def read_of(function: int, address: int, count: int) -> bytes:
@@ -70,7 +70,7 @@ async def _table(
             answer = (await wire.ask(pdu)).first
             if answer is None or answer.unit != wire.unit or answer.refusal in GATEWAY_SAYS_NO:
                 silent += 1
-                if silent == 2:  # a single loss may be a lost frame
+                if silent == 2:  # a single missing answer may be caused by a lost frame
                     return refusal
                 continue
             if values_of(answer, function, count) is not None:
@@ -78,7 +78,7 @@ async def _table(
                 return None
             refusal = pdu, answer.pdu
             wire.refused[function] = answer.refusal
-            if answer.refusal == 0x01:  # it has no such table
+            if answer.refusal == 0x01:  # the device does not have this table
                 return refusal
     return refusal
 

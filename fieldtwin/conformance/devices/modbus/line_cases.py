@@ -39,7 +39,7 @@ async def half_then_whole(wire: DeviceConnection) -> Finding:
 
 
 async def gap_inside(wire: DeviceConnection) -> Finding:
-    """MB-005: a pause of 2.5 characters or 2 ms inside a frame."""
+    """MB-005: send a frame with a pause of 2.5 characters or 2 ms inside."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:4], wire.good)
     await wire.pause(max(6.5 * wire.char_s, 0.002))  # four characters are still in transmission
@@ -54,7 +54,7 @@ async def gap_inside(wire: DeviceConnection) -> Finding:
 
 
 async def no_gap(wire: DeviceConnection) -> Finding:
-    """MB-007: two requests without a pause between them."""
+    """MB-007: send two requests without a pause between them."""
     frame = wire.frame(wire.good)
     await wire.say(frame + frame, wire.good)
     heard = await wire.hear(2)
@@ -96,12 +96,12 @@ async def _with_noise(wire: DeviceConnection, before: bytes, after: bytes) -> Fi
 
 
 async def leading_zero(wire: DeviceConnection) -> Finding:
-    """MB-008: 00 00 before the frame."""
+    """MB-008: send 00 00 before the frame."""
     return await _with_noise(wire, b"\x00\x00", b"")
 
 
 async def leading_ones(wire: DeviceConnection) -> Finding:
-    """MB-008: FF FF before the frame."""
+    """MB-008: send FF FF before the frame."""
     return await _with_noise(wire, b"\xff\xff", b"")
 
 
@@ -111,7 +111,7 @@ async def trailing_zeros(wire: DeviceConnection) -> Finding:
 
 
 async def broadcast_read(wire: DeviceConnection) -> Finding:
-    """MB-027: a read to unit 0."""
+    """MB-027: send a read to unit 0, the broadcast address. No device may answer."""
     await wire.say(wire.frame(wire.good, 0), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
@@ -130,7 +130,7 @@ def _neighbours(wire: DeviceConnection) -> list[int]:
 
 
 async def other_unit(wire: DeviceConnection) -> Finding:
-    """MB-029: requests to other units. Three units that give the same answer are one device."""
+    """MB-029: send requests to other units. Three units that give the same answer are one device."""
     said = []
     for unit in _neighbours(wire):
         heard = await wire.ask(wire.good, unit, due=False)
@@ -203,7 +203,7 @@ async def two_clients(wire: DeviceConnection) -> Finding:
 
 
 async def bad_lrc(wire: DeviceConnection) -> Finding:
-    """MB-070: a wrong check sum."""
+    """MB-070: send a request with a wrong check sum (LRC)."""
     body = bytes((wire.unit,)) + wire.good
     await wire.say(ascii_frame(body, lrc(body) ^ 0xFF), wire.good)
     return await silent_then_good(wire, await wire.hear())
@@ -218,7 +218,7 @@ async def second_colon(wire: DeviceConnection) -> Finding:
 
 
 async def gap_over_a_second(wire: DeviceConnection) -> Finding:
-    """MB-070: 1.5 s between two characters."""
+    """MB-070: send a frame with a pause of 1.5 s between two characters."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7], wire.good)
     await wire.pause(1.5)
@@ -227,7 +227,7 @@ async def gap_over_a_second(wire: DeviceConnection) -> Finding:
 
 
 async def gap_under_a_second(wire: DeviceConnection) -> Finding:
-    """MB-070: half a second between two characters."""
+    """MB-070: send a frame with a pause of half a second between two characters."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7], wire.good)
     await wire.pause(0.5)
@@ -237,7 +237,7 @@ async def gap_under_a_second(wire: DeviceConnection) -> Finding:
 
 
 async def noise_before_colon(wire: DeviceConnection) -> Finding:
-    """MB-070: noise before the colon."""
+    """MB-070: send noise before the colon of a frame."""
     return await _among(wire, b"\x00\xffQ1", b"")
 
 
@@ -255,7 +255,7 @@ def longest(wire: DeviceConnection) -> bytes:
 
 
 async def frame_of_256(wire: DeviceConnection) -> Finding:
-    """MB-050: the longest frame, by the echo of FC 08."""
+    """MB-050: send the longest permitted frame; FC 08 must echo it."""
     short = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if short.first is None or short.first.pdu != b"\x08\x00\x00\x5a\x5a":
         raise NotHere(f"it has no echo (function 08): {short}")
@@ -265,7 +265,7 @@ async def frame_of_256(wire: DeviceConnection) -> Finding:
 
 
 async def frame_of_257(wire: DeviceConnection) -> Finding:
-    """MB-050: a frame that is too long."""
+    """MB-050: send a frame of 257 bytes, which is one byte too long."""
     body = bytes((wire.unit,)) + longest(wire) + b"\x5a"
     await wire.say(with_crc(body), longest(wire))
     await wire.pause(LONG_PAUSE_S)

@@ -13,21 +13,23 @@ from fieldtwin.conformance.devices.modbus.frames import short
 from fieldtwin.conformance.devices.modbus.learn import ORDER, read_of, values_of
 
 MOST_FRAMES = 32
-"""Frames of an identification: 255 objects fit into fewer, and one that never ends is bounded."""
+"""Largest number of frames of one identification: 255 objects fit into fewer. The limit ends an identification that would
+never end.
+"""
 
 
 async def unknown_function(wire: DeviceConnection) -> Finding:
-    """MB-033: function 64h, with two bytes."""
+    """MB-033: send the undefined function 64h, with two bytes."""
     return await must_refuse(wire, b"\x64\x00\x01", 0x01)
 
 
 async def unknown_bare_function(wire: DeviceConnection) -> Finding:
-    """MB-033: function 41h, without data."""
+    """MB-033: send the undefined function 41h, without data."""
     return await must_refuse(wire, b"\x41", 0x01)
 
 
 async def after_unknown(wire: DeviceConnection) -> Finding:
-    """MB-034: a good request right after one with an unknown function."""
+    """MB-034: send a good request right after one with an unknown function."""
     await wire.ask(b"\x64\x00\x01")
     after = await wire.still_good()
     return failed(f"the request afterwards: {after}") if after else passed()
@@ -51,38 +53,40 @@ async def high_function(wire: DeviceConnection) -> Finding:
 
 
 async def no_register(wire: DeviceConnection) -> Finding:
-    """MB-036: count 0."""
+    """MB-036: read 0 registers."""
     function, address, _ = first_table(wire, ORDER)
     return await must_refuse(wire, read_of(function, address, 0), 0x03, may_lack=False)
 
 
 async def many_registers(wire: DeviceConnection) -> Finding:
-    """MB-036: 126 registers."""
+    """MB-036: read 126 registers, one more than allowed."""
     function, address, _ = first_table(wire, (0x03, 0x04))
     return await must_refuse(wire, read_of(function, min(address, 0xFFFF - 125), 126), 0x03, may_lack=False)
 
 
 async def many_bits(wire: DeviceConnection) -> Finding:
-    """MB-036: 2001 bits."""
+    """MB-036: read 2001 bits, one more than allowed."""
     function, address, _ = first_table(wire, (0x01, 0x02))
     return await must_refuse(wire, read_of(function, min(address, 0xFFFF - 2000), 2001), 0x03, may_lack=False)
 
 
 async def beyond_the_table(wire: DeviceConnection) -> Finding:
-    """MB-037: two cells from FFFFh on."""
+    """MB-037: read two cells from FFFFh on, of which the second does not exist."""
     function, _, _ = first_table(wire, ORDER)
     return await must_refuse(wire, read_of(function, 0xFFFF, 2), 0x02, may_lack=False)
 
 
 async def both_wrong(wire: DeviceConnection) -> Finding:
-    """MB-038: too many cells from FFFFh on. AP 6 checks the count first (exception 03); 02 names the other error."""
+    """MB-038: read too many cells from FFFFh on, so that both count and address are invalid. AP 6 checks the count first
+    (exception 03); exception 02, for the address, is also accepted.
+    """
     function, _, _ = first_table(wire, ORDER)
     count = 126 if function in (0x03, 0x04) else 2001
     return await must_refuse(wire, read_of(function, 0xFFFF, count), 0x03, 0x02, may_lack=False)
 
 
 async def padding(wire: DeviceConnection) -> Finding:
-    """MB-049: check the bits after the last requested one."""
+    """MB-049: check that the bits after the last requested one are 0."""
     function, address, count = first_table(wire, (0x01, 0x02))
     heard = await wire.ask(read_of(function, address, count))
     data = values_of(heard.first, function, count)
@@ -148,7 +152,7 @@ async def _objects(wire: DeviceConnection, code: int) -> tuple[dict[int, bytes],
 
 
 async def identification(wire: DeviceConnection) -> Finding:
-    """MB-045: the basic objects, all of them."""
+    """MB-045: read the basic objects. The device must have all of them."""
     objects, wrong = await _objects(wire, 0x01)
     if wrong:
         return failed(wrong)
@@ -167,7 +171,7 @@ async def regular_identification(wire: DeviceConnection) -> Finding:
 
 
 async def unknown_object(wire: DeviceConnection) -> Finding:
-    """MB-045: one object that is not there."""
+    """MB-045: read one object that does not exist."""
     first = await wire.ask(b"\x2b\x0e\x04\x00")
     if first.first is None or first.first.refusal:
         raise NotHere(f"it does not answer for single objects: {first}")
@@ -196,7 +200,7 @@ def text_of(raw: bytes) -> str:
 
 
 async def counters(wire: DeviceConnection) -> Finding:
-    """MB-047: the counter of requests increases by the number of requests sent."""
+    """MB-047: check that the device's counter of requests increases by the number of requests sent."""
     before = await _counter(wire, 0x0E)
     for _ in range(3):
         if after := await wire.still_good():
@@ -216,7 +220,7 @@ async def _counter(wire: DeviceConnection, which: int) -> int:
 
 
 async def listen_only(wire: DeviceConnection) -> Finding:
-    """MB-046: switch to listen only mode, until a restart."""
+    """MB-046: switch the device to listen-only mode, and end the mode by a restart."""
     echo = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if echo.first is None or echo.first.refusal:
         raise NotHere(f"it has no function 08: {echo}")

@@ -18,7 +18,7 @@ def _adu(wire: DeviceConnection, transaction: int, protocol: int = 0, length: in
 
 
 async def byte_by_byte(wire: DeviceConnection) -> Finding:
-    """MB-051: a segment a byte."""
+    """MB-051: send a request with each byte in its own segment."""
     frame = wire.frame(wire.good)
     for at in range(len(frame)):
         await wire.say(frame[at : at + 1], wire.good, at_once=at > 0)
@@ -28,7 +28,7 @@ async def byte_by_byte(wire: DeviceConnection) -> Finding:
 
 
 async def several_at_once(wire: DeviceConnection) -> Finding:
-    """MB-052: three ADUs in one segment: each is answered or refused with 06, in order."""
+    """MB-052: send three ADUs in one segment. The device must answer each or refuse it with exception 06, in order."""
     numbers = [wire.next_transaction() for _ in range(3)]
     await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
     heard = await wire.hear(3)
@@ -61,7 +61,7 @@ async def more_than_allowed(wire: DeviceConnection) -> Finding:
 
 
 async def other_protocol(wire: DeviceConnection) -> Finding:
-    """MB-054: an ADU with protocol id 1, then a good one."""
+    """MB-054: send an ADU with protocol ID 1, then a good one."""
     odd, ours = wire.next_transaction(), wire.next_transaction()
     await wire.say(_adu(wire, odd, protocol=1), wire.good)
     await wire.say(_adu(wire, ours), wire.good)
@@ -102,7 +102,7 @@ async def length_zero(wire: DeviceConnection) -> Finding:
 
 
 async def length_one(wire: DeviceConnection) -> Finding:
-    """MB-055: length 1, the unit id alone."""
+    """MB-055: send length 1, followed by the unit ID alone."""
     return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\x01" + bytes((wire.unit,)))
 
 
@@ -112,7 +112,7 @@ async def length_ffff(wire: DeviceConnection) -> Finding:
 
 
 async def transaction_zero(wire: DeviceConnection) -> Finding:
-    """MB-056: transaction id 0 is echoed."""
+    """MB-056: send transaction ID 0, which the device must echo."""
     await wire.say(_adu(wire, 0), wire.good)
     heard = await wire.hear()
     good = answers_good(wire, heard, 1) and heard.answers[0].transaction == 0
@@ -120,7 +120,7 @@ async def transaction_zero(wire: DeviceConnection) -> Finding:
 
 
 async def transaction_twice(wire: DeviceConnection) -> Finding:
-    """MB-056: two requests with one id, one after the other's answer."""
+    """MB-056: send two requests with the same transaction ID, the second after the answer to the first."""
     number = wire.next_transaction()
     for _ in range(2):
         await wire.say(_adu(wire, number), wire.good)
@@ -135,7 +135,7 @@ def _told(answer: ReceivedReply | None) -> str:
 
 
 async def _as_itself(wire: DeviceConnection, unit: int) -> Finding:
-    """Check that a device without a gateway answers requests to `unit`, and repeats that unit ID (TG 4.4.1.2)."""
+    """Check that a device that is not behind a gateway answers requests to `unit`, and repeats that unit ID (TG 4.4.1.2)."""
     if wire.unit == unit:
         raise NotHere(f"all other test cases use unit {unit}")
     heard = await wire.ask(wire.good, unit)
@@ -151,12 +151,12 @@ async def _as_itself(wire: DeviceConnection, unit: int) -> Finding:
 
 
 async def unit_255(wire: DeviceConnection) -> Finding:
-    """MB-057: unit 255."""
+    """MB-057: send a request to unit 255."""
     return await _as_itself(wire, 255)
 
 
 async def unit_0(wire: DeviceConnection) -> Finding:
-    """MB-057: unit 0."""
+    """MB-057: send a request to unit 0."""
     return await _as_itself(wire, 0)
 
 
@@ -169,7 +169,7 @@ async def half_and_gone(wire: DeviceConnection) -> Finding:
 
 
 async def many_connections(wire: DeviceConnection) -> Finding:
-    """MB-065: open 20 idle connections: one more is still served."""
+    """MB-065: open 20 idle connections. The device must still serve one more."""
     held = []
     try:
         for _ in range(20):

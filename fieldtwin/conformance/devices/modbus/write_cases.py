@@ -50,7 +50,7 @@ async def _borrowed(wire: DeviceConnection, table: str) -> AsyncIterator[tuple[i
 
 
 async def _unchanged(wire: DeviceConnection, table: str, address: int, before: bytes, finding: Finding) -> Finding:
-    """Return the finding, or a worse one if the cell changed."""
+    """Return `finding`, or a failure if the cell changed."""
     now = await _read(wire, table, address)
     if now != before:
         said = f"; {finding.reason}" if finding.reason else ""
@@ -59,12 +59,12 @@ async def _unchanged(wire: DeviceConnection, table: str, address: int, before: b
 
 
 def _other(before: bytes) -> bytes:
-    """Return a register's value that differs by one bit."""
+    """Return a register value that differs from this one by one bit."""
     return before[:1] + bytes((before[1] ^ 1,))
 
 
 async def write_none(wire: DeviceConnection) -> Finding:
-    """MB-036: FC 16 with count 0."""
+    """MB-036: send FC 16 with count 0."""
     async with _borrowed(wire, "holding") as (address, _):
         return await must_refuse(wire, b"\x10" + address.to_bytes(2) + b"\0\0\0", 0x03)
 
@@ -82,17 +82,17 @@ async def _odd_coil(wire: DeviceConnection, value: bytes) -> Finding:
 
 
 async def coil_0001(wire: DeviceConnection) -> Finding:
-    """MB-039: FC 05 with value 0001h."""
+    """MB-039: send FC 05 with value 0001h."""
     return await _odd_coil(wire, b"\x00\x01")
 
 
 async def coil_ff01(wire: DeviceConnection) -> Finding:
-    """MB-039: FC 05 with value FF01h."""
+    """MB-039: send FC 05 with value FF01h."""
     return await _odd_coil(wire, b"\xff\x01")
 
 
 async def registers_mismatch(wire: DeviceConnection) -> Finding:
-    """MB-040: FC 16, one register, byte count 4."""
+    """MB-040: send FC 16 for one register with byte count 4."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + b"\0\x01\x04" + _other(before) + b"\0\0"
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
@@ -106,31 +106,31 @@ async def _length_mismatch(wire: DeviceConnection, byte_count: int, more: bytes)
 
 
 async def count_below_length(wire: DeviceConnection) -> Finding:
-    """MB-040: FC 16, one register, byte count 2, four bytes of data."""
+    """MB-040: send FC 16 for one register with byte count 2 and four bytes of data."""
     return await _length_mismatch(wire, 2, b"\0\0")
 
 
 async def count_above_length(wire: DeviceConnection) -> Finding:
-    """MB-040: FC 16, one register, byte count 4, two bytes of data."""
+    """MB-040: send FC 16 for one register with byte count 4 and two bytes of data."""
     return await _length_mismatch(wire, 4, b"")
 
 
 async def count_of_none(wire: DeviceConnection) -> Finding:
-    """MB-040: FC 16, no register, byte count 0, two bytes of data, as libmodbus's unit-test-client sends it."""
+    """MB-040: send FC 16 for no register with byte count 0 and two bytes of data, as libmodbus's unit-test-client does."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + b"\0\0\0" + _other(before)
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
 async def coils_mismatch(wire: DeviceConnection) -> Finding:
-    """MB-040: FC 15, one coil, byte count 2."""
+    """MB-040: send FC 15 for one coil with byte count 2."""
     async with _borrowed(wire, "coil") as (address, before):
         pdu = b"\x0f" + address.to_bytes(2) + b"\0\x01\x02" + bytes(((before[0] & 1) ^ 1, 0))
         return await _unchanged(wire, "coil", address, before, await must_refuse(wire, pdu, 0x03))
 
 
 async def partly_outside(wire: DeviceConnection) -> Finding:
-    """MB-041: send FC 16 that ends one register after the map."""
+    """MB-041: send FC 16 for registers of which the last one is beyond the end of the map."""
     if "holding" not in wire.may_write:
         raise NotHere("no address to write was given: --write holding:ADDRESS+COUNT")
     address, count = wire.may_write["holding"]
@@ -172,7 +172,7 @@ async def refused_as_a_whole(wire: DeviceConnection) -> Finding:
 
 
 async def mask(wire: DeviceConnection) -> Finding:
-    """MB-043: AP's own example: 12h, and F2h, or 25h, is 17h."""
+    """MB-043: mask-write a register with the example of AP: 12h, AND mask F2h, OR mask 25h gives 17h."""
     async with _borrowed(wire, "holding") as (address, _):
         at = address.to_bytes(2)
         first = await wire.ask(b"\x06" + at + b"\x00\x12")
@@ -194,7 +194,7 @@ async def mask(wire: DeviceConnection) -> Finding:
 
 
 async def broadcast_write(wire: DeviceConnection) -> Finding:
-    """MB-026: FC 06 to unit 0: done, and not answered."""
+    """MB-026: send FC 06 to unit 0. The device must execute it and must not answer."""
     async with _borrowed(wire, "holding") as (address, before):
         new = _other(before)
         pdu = _write("holding", address, new)

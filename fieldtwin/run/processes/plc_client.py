@@ -74,7 +74,7 @@ def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
 
 
 async def step_and_wait(call: Callable[..., Awaitable[Any]], count: int, by: str) -> dict[str, int]:
-    """Let a paused PLC execute `count` steps; return the scans of each task when all steps are done, or when the PLC runs again."""
+    """Let a paused PLC execute `count` steps; return the scans of each task when all steps are done or it runs again."""
     scans: dict[str, int] = (await call("step", count=count, by=by))["scans"]
     while True:
         now = await call("get", brief=True)

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import RECORDING
 
 BESIDE = 32
-"""Bytes that an exchange needs in addition to its reply."""
+"""The memory in bytes that an exchange needs in addition to its reply."""
 
 _WORDS: dict[bytes, RECORDING] = {}
 """One shared object for each content of a cell that was ever requested: at most 65,536."""
@@ -97,7 +97,7 @@ class OutcomeColumn:
 
 
 class _View(Sequence[Recorded], ABC):
-    """Recorded items that are created on access, by position."""
+    """A sequence of recorded items that are created on access, by position."""
 
     @overload
     def __getitem__(self, i: int) -> Recorded: ...
@@ -139,7 +139,7 @@ class Merged:
         self._places: Sequence[int] = ()
 
     def at(self, i: int) -> tuple[int, int]:
-        """Return the column number of the normal reply number `i`, and its position in that column."""
+        """Return the number of the column that holds the normal reply `i`, and the position of the reply in that column."""
         which = self._which
         if which is None:
             which = self._sort()

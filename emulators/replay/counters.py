@@ -31,7 +31,9 @@ class CounterSpan:
 
 
 class _Counter:
-    """One counter. Its values are assembled while the recording is learned, and then read register by register."""
+    """One counter. Its values are assembled from registers while the recording is learned. Later they are read register by
+    register.
+    """
 
     def __init__(self, span: CounterSpan) -> None:
         if not 1 <= span.count <= 4:
@@ -85,7 +87,7 @@ class RecordingCounters:
         return True
 
     def knows(self, unit: int, cell: Cell) -> bool:
-        """Return whether the register belongs to a counter of which a whole value was recorded."""
+        """Return whether the register belongs to a counter of which at least one whole value was recorded."""
         found = self._by_cell.get((unit, cell))
         return found is not None and (found[0].shown is not None or self._context.left(found[0].command) > 0)
 

@@ -25,14 +25,14 @@ from fieldtwin.gateway.core.values import COMMAND, RECORDING
 TABLE_CODES: dict[Table, int] = {"coil": 0, "discrete": 1, "holding": 3, "input": 4}
 _SHAPE_CODE = 0xFF
 CELL_KEY = 4
-"""Bytes of a cell's key; the key of a shape is longer, or has a different second byte."""
+"""The number of bytes of a cell's key. The key of a shape is longer, or has a different second byte."""
 MAX_BYTES = 512_000_000
 """Memory limit for the replies to recorded reads; beyond it the older half is dropped and counted."""
 
 
 @dataclass(slots=True)
 class ReplayCounters:
-    """Counters of a replay. All except `misfits` count answers; `misfits` counts recorded replies that fit no request."""
+    """Counters of a replay. `misfits` counts recorded replies that do not fit their request; all other counters count answers."""
 
     answered: int = 0
     exceptions: int = 0

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 MAX_VALUES = 1_000_000
-"""Most changes of objects that are kept; later ones are counted in `dropped`."""
+"""The largest number of changes of objects that are kept; `dropped` counts the later ones."""
 
 _PDO_PARAMETERS = range(0x1400, 0x1C00)
 _SDO_SERVERS = range(RESPONSE + 1, RESPONSE + 128)
@@ -64,7 +64,7 @@ def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> Recor
     objects = RecordedObjects(log.frames(), dictionary, then, log.at_end, log.speed)
     if not objects.initial:
         raise UsageError(f"the log has no object of node {then} that is in its data sheet", where=str(log.path))
-    if then != node_id:  # identifiers derived from the node ID follow the present one
+    if then != node_id:  # identifiers that contain the node ID get the ID of the emulated node
         own = {entry.key for entry in dictionary.entries() if entry.node_relative}
         objects.initial = {key: raw for key, raw in objects.initial.items() if key not in own}
     return objects
@@ -165,7 +165,7 @@ class RecordedObjects:
             self._transfer = None
 
     def _response(self, data: bytes) -> None:
-        """Process a response of the node. A download is noted when the node has acknowledged all of its bytes."""
+        """Process an SDO response of the node. A download is recorded when the node has acknowledged all of its bytes."""
         if self._transfer is None:
             return
         command, (key, download, raw) = data[0] >> 5, self._transfer
@@ -218,7 +218,7 @@ class RecordedObjects:
         if key not in self._written and key[0] not in _NEVER_INITIAL:
             self.initial.setdefault(key, raw)
         if key[0] in _PDO_PARAMETERS:
-            self._data.put(*key, raw)  # TPDOs have the new value from now on
+            self._data.put(*key, raw)  # the TPDOs of the node carry the new value from now on
         values = self._values.setdefault(key, [])
         if values and values[-1] == raw:
             return

@@ -200,9 +200,7 @@ class ExchangeReplay:
                     unit.write(request, request.values)
                 return ReplayedReply(reply, outcome.latency_s)
             if not self._knows_all(unit_id, unit, request):
-                return ReplayedReply(
-                    reply, outcome.latency_s
-                )  # only part of a counter was recorded: return what there is
+                return ReplayedReply(reply, outcome.latency_s)  # only part of a counter was recorded: return that part
             return ReplayedReply(self._read(unit_id, unit, request), outcome.latency_s)
         if request is None or pdu[0] not in unit.functions:
             known = pdu[0] in unit.functions
@@ -340,7 +338,7 @@ class ExchangeReplay:
 
     @staticmethod
     def _choose(unit: LearntUnit, key: bytes, situations: list[int]) -> int:
-        """Return the recorded situation to use, which is cached until the next write."""
+        """Return the recorded situation that is most similar to the present one. The result is cached until the next write."""
         if key not in unit.alike:
             unit.alike[key] = unit.situations.most_alike(situations)
         return unit.alike[key]

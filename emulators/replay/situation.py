@@ -16,7 +16,8 @@ Cell = tuple[Table, int]
 Written = tuple[Cell, int]
 
 MAX_SITUATIONS = 1024
-"""Distinct situations of one unit that are kept apart; further ones are merged into the last of these, counted as `folded`.
+"""The number of situations of one unit that are distinguished. Further situations are treated as the last of these, and
+counted as `folded`.
 """
 
 

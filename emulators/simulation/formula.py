@@ -20,10 +20,10 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 Values = Mapping[str, float]
 Compute = Callable[[Values], float]
-"""Returns the value of a formula for the values of its names."""
+"""A function that returns the value of a formula for the values of its names."""
 
 TIME, STEP = "t", "dt"
-"""Seconds since the simulation began; seconds since the previous step."""
+"""Names in formulas: the seconds since the simulation began, and the seconds since the previous step."""
 
 
 def _ramp(t: float, start: float, end: float, over_s: float) -> float:

@@ -16,14 +16,15 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 MAX_STEPS = 100_000
-"""Most steps taken at one access after a long time without one. Older steps are skipped and counted."""
+"""The largest number of steps that one access takes after a long time without an access. Older steps are skipped and counted."""
 
 Step = Callable[[float, float, Mapping[str, float]], Mapping[str, float]]
-"""``step(t_s, dt_s, values)``: returns the new values for the previous ones."""
+"""``step(t_s, dt_s, values)``: a function that returns the new values for the previous ones."""
 
 
 class Simulation:
-    """Values by name from `start_ns` on, with a step every `step_ns`; the first step is at `start_ns` itself, with dt 0.
+    """A running simulation: values by name from `start_ns` on, with a step every `step_ns`. The first step is at `start_ns`
+    itself, with dt 0.
 
     `start` are the values before the first step, NaN if only the step determines them. `inputs` are the names that `put` may set;
     they are 0 at first. Values are constant between two steps.

@@ -1,4 +1,4 @@
-"""`fieldtwin.gateway.core.clock.Clock` on a virtual loop."""
+"""The clock of a virtual loop (`fieldtwin.gateway.core.clock.Clock`)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ EPOCH_UTC_NS = 1_767_225_600 * NS_PER_S
 
 
 class VirtualClock:
-    """Monotonic time is the loop's; UTC starts at `EPOCH_UTC_NS` and advances with it."""
+    """A clock whose monotonic time is that of the loop. UTC starts at `EPOCH_UTC_NS` and advances with the loop."""
 
     def __init__(self, loop: VirtualLoop, epoch_utc_ns: int = EPOCH_UTC_NS) -> None:
         self._loop = loop
         self.monotonic_ns: Callable[[], int] = partial(attrgetter("now_ns"), loop)
-        """Returns the loop's time. It is not a method, because it is called 5 to 45 times per scan, and a method takes longer."""
+        """A function that returns the loop's time. It is not a method, because it is called 5 to 45 times per scan, and a
+        method takes longer.
+        """
         self._offset_ns = epoch_utc_ns - loop.now_ns
 
     def utc_ns(self) -> int:

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 PATIENCE_S = 1.0
-"""Processor time that a callback may still take after a signal came. An endless loop takes more."""
+"""The processor time in seconds that a callback may still take after a signal came. An endless loop takes more."""
 
 Handler = Callable[[int, FrameType | None], object]
 
@@ -50,7 +50,7 @@ class Interrupts:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
             signal.signal(signal.SIGVTALRM, self._alarm_before)
         if exc_info[0] is None:
-            self.deliver()  # the signal came with the last callback
+            self.deliver()  # the signal came during the last callback
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         if self._waiting is not None:

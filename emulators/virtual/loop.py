@@ -29,18 +29,18 @@ T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 START_NS = 1_000 * NS_PER_S
-"""Start of monotonic time: not 0, which means "never" in many places."""
+"""The start of monotonic time. It is not 0, because 0 means "never" in many places."""
 STUCK_AFTER = 1_000_000
-"""Callbacks at one instant before the loop reports that time does not advance."""
+"""The number of callbacks at one instant after which the loop reports that time does not advance."""
 ENDING_INSTANTS = 10_000
-"""Instants within which a task must end after its loop is closed."""
+"""The number of instants within which a task must end after its loop is closed."""
 _WAITING_SHOWN = 20
 _COMPACT_AFTER = 1_000
-"""Timers that are set before the loop searches for timers that are no longer needed."""
+"""The number of new timers after which the loop removes timers that are no longer needed."""
 
 
 class Escape(Bug):
-    """Code under virtual time used a thread, a socket, a process or a wall clock."""
+    """Code that runs in virtual time used a thread, a socket, a process or a wall clock."""
 
 
 class Deadlock(Bug):
@@ -58,12 +58,14 @@ def _way_out(name: str) -> Callable[..., NoReturn]:
 
 
 class VirtualLoop(asyncio.AbstractEventLoop):
-    """A virtual event loop; `now_ns` is its time. Not thread-safe: a call from a different thread raises `Escape`."""
+    """An event loop in virtual time; `now_ns` is its time. It is not thread-safe: a call from a different thread raises
+    `Escape`.
+    """
 
     def __init__(self, start_ns: int = START_NS) -> None:
         self.now_ns = start_ns
         self.callbacks = 0
-        """Number of callbacks that have run."""
+        """The number of callbacks that have run."""
         self._ready: deque[asyncio.Handle] = deque()
         self._timers: list[tuple[int, int, asyncio.TimerHandle | asyncio.Future[None]]] = []
         self._sequence = 0
@@ -158,7 +160,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return None
 
     get_debug: Any = bool
-    """Returns False without a Python call, because each new future and handle calls it."""
+    """A function that returns False without a call of Python code, because each new future and handle calls it."""
 
     def set_debug(self, enabled: bool) -> None:
         """Do nothing: asyncio's debug mode measures with the wall clock."""
@@ -167,7 +169,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run until `future` is done. Raises `Deadlock` if it never will be."""
-        main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)  # type: ignore[arg-type]  # a generator too
+        # type: ignore[arg-type]  # `future` may also be a generator
+        main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)
         main.add_done_callback(self._on_done)
         try:
             self.run_forever()
@@ -348,7 +351,9 @@ def _is_over(due: asyncio.TimerHandle | asyncio.Future[None]) -> bool:
 
 
 def culprit() -> str:
-    """Return the code that caused a call: the innermost frame outside of this package and the standard library, and its task."""
+    """Describe the code that caused a call: the innermost frame outside of this package and the standard library, and its
+    task.
+    """
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and _is_plumbing(frame):
         frame = frame.f_back

@@ -63,7 +63,7 @@ class MemoryWire:
         self.loop.call_at_ns(pacer.send(now_ns, len(data)), receiver.arrived, data)
 
     def ended(self, direction: Direction) -> None:
-        """Close the writer's side of `direction`. The peer is notified after the bytes in transit."""
+        """Close the end that writes in `direction`. The peer is notified after the bytes in transit have arrived."""
         receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
         lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
         if pacer is None:

@@ -24,7 +24,9 @@ _CLOCKS = (
     *("process_time", "process_time_ns", "thread_time", "thread_time_ns", "clock_gettime", "clock_gettime_ns"),
 )
 _NOW_BY_DEFAULT = {"localtime": 1, "gmtime": 1, "ctime": 1, "asctime": 1, "strftime": 2}
-"""Functions that take a time or use the present one: the number of arguments with which the time is given."""
+"""Functions that take a time, or use the present time without that argument. For each: the number of arguments if the time is
+given.
+"""
 _LOGGING = "logging"
 """A log record is stamped with the wall clock; nothing in a run depends on it."""
 _EVENTS = {
@@ -32,7 +34,7 @@ _EVENTS = {
     "socket.connect": "a connection",
     "socket.bind": "a socket",
     "_thread.start_new_thread": "a thread",
-    "_thread.start_joinable_thread": "a thread",  # these two from Python 3.12 and 3.13 on
+    "_thread.start_joinable_thread": "a thread",  # Python has these two events since 3.12 and 3.13
     "subprocess.Popen": "a process",
     "os.fork": "a process",
     "os.posix_spawn": "a process",
@@ -42,7 +44,7 @@ _sealed: set[int] = set()
 """Identities of the threads in which a virtual run is in progress."""
 _hooked = False
 _guards: list[tuple[Any, str, Any, Any]] = []
-"""As returned by `_made`; created once."""
+"""The result of `_made`, which is created once."""
 
 
 def _audit(event: str, args: tuple[Any, ...]) -> None:

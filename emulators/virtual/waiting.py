@@ -13,14 +13,14 @@ from types import FrameType
 from typing import Any
 
 _NAMED = 4
-"""How many of the tasks that a task waits for are named."""
+"""The largest number of tasks that are named, if a task waits for several tasks."""
 _STATE = re.compile(r"\[(?:locked|unlocked|set|unset)[^\]]*\]|\bmaxsize=.*(?=>)")
 """The part of the repr of a lock, an event, a condition or a queue that shows its state."""
 
 
 def waits_at(task: asyncio.Task[Any], is_plumbing: Callable[[FrameType], bool]) -> str:
-    """Return text such as ``Reader.turn (reader.py:40) for Queue.get maxsize=8``: the innermost user line and what it
-    awaits.
+    """Return a text such as ``Reader.turn (reader.py:40) for Queue.get maxsize=8``: the innermost line of user code, and the
+    call that it awaits.
     """
     chain = _chain(task.get_coro())
     if not chain:

@@ -22,9 +22,11 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 QUEUE = 4
-"""How many packets may wait in a modem to be sent; the modem accepts no more."""
+"""The number of packets that may wait in a modem to be sent. The modem refuses further packets."""
 HEARD = 64
-"""How many received packets may wait until they are taken; the oldest are dropped and counted."""
+"""The number of received packets that may wait in a modem until they are taken. If more arrive, the oldest are dropped and
+counted.
+"""
 PAUSE_NS = 200 * NS_PER_MS
 """The longest additional random wait of a modem that could not transmit."""
 
@@ -87,14 +89,14 @@ class _Modem:
         self.random = random
         self.counters = ModemCounters()
         self.to_say: deque[tuple[int, bytes]] = deque()
-        """Waiting packets, each with the earliest time of its transmission."""
+        """Packets that wait to be sent, each with the earliest time of its transmission."""
         self.heard: deque[bytes] = deque()
         self.hearing: list[Reception] = []
         """Packets that are arriving at this modem or will arrive later."""
         self.speaks_until_ns = 0
         self.spoke_from_ns = 0
         self.due_ns: int | None = None
-        """When it next tries to transmit."""
+        """The time at which the modem next tries to transmit."""
 
 
 class AcousticMedium:
@@ -113,13 +115,15 @@ class AcousticMedium:
         self.water = water
         self.spoils = spoils
         self.on_say: Callable[[], None] | None = None
-        """Called when a modem has a packet to send, because `next_ns` may have changed."""
+        """A function that is called when a modem has a packet to send, because `next_ns` may have changed."""
         self._modems = {
             name: _Modem(number, at_m, Random(f"{seed} {name}"))
             for number, (name, at_m) in enumerate(places.items(), 1)
         }
         self._events: list[tuple[int, int, _Modem, Reception | None]] = []
-        """Time, a sequence number, modem, and the reception that ends; None: the modem tries to transmit."""
+        """A heap of events: the time, a sequence number, the modem, and the reception that ends, or None if the modem tries to
+        transmit.
+        """
         self._number = 0
 
     @property
@@ -169,7 +173,7 @@ class AcousticMedium:
     # -- transmitting ---------------------------------------------------------------------------------------------------
 
     def _try(self, modem: _Modem, t_ns: int) -> None:
-        """Schedule the modem's next attempt at `t_ns`, or later if its next packet may not be sent then.
+        """Schedule the modem's next attempt to transmit at `t_ns`, or later if its next packet may not be sent then.
 
         A modem has at most one pending attempt."""
         if modem.to_say:
@@ -188,7 +192,7 @@ class AcousticMedium:
         modem.counters.said += 1
         ends_ns = t_ns + self.water.airtime_ns(payload)
         modem.spoke_from_ns, modem.speaks_until_ns = t_ns, ends_ns
-        for reception in modem.hearing:  # packets that arrive while it transmits
+        for reception in modem.hearing:  # packets that arrive while the modem transmits are lost
             if reception.begins_ns < ends_ns:
                 reception.spoilt = reception.spoilt or "speaking"
         for other in self._modems.values():

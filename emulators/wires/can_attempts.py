@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 _ACTIVE = CanErrorState.ACTIVE
 
 MAX_NOTICES = 4096
-"""Notices and errors kept until the caller takes them; the oldest are dropped."""
+"""The number of notices and errors that are kept until the caller takes them. The oldest are dropped."""
 
 
 class Attempts:
@@ -54,9 +54,9 @@ class Attempts:
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
         self.faults: deque[CanErrorFrame] = deque(maxlen=MAX_NOTICES)
         self._others: dict[int, tuple[int, ...]] = {}
-        """Receivers of the frames of each node, while no node joins, leaves or is in bus-off."""
+        """By node: the receivers of its frames. Computed again when a node joins, leaves, or is in bus-off."""
         self._joined_ns = 0
-        """When the newest node joined."""
+        """The time at which the newest node joined."""
 
     def join(self, number: int, node: Node) -> None:
         """Add a node from `node.joined_ns` on; nodes are added in order of time."""
@@ -70,11 +70,11 @@ class Attempts:
         self._others.clear()
 
     def duration_ns(self, bits: int) -> int:
-        """Return how long `bits` bits take: 0 if frames are instant."""
+        """Return the duration of `bits` bits in ns: 0 if frames are instant."""
         return 0 if self.instant else (bits * NS_PER_S + self.bitrate // 2) // self.bitrate
 
     def frame_ns(self, frame: CanFrame, bits: int) -> int:
-        """Return how long the first `bits` of `frame` take, with those of its data phase at the data bit rate."""
+        """Return the duration in ns of the first `bits` of `frame`, with those of its data phase at the data bit rate."""
         if not frame.brs or self.instant:
             return self.duration_ns(bits)
         first, end = data_phase(frame)
@@ -82,8 +82,8 @@ class Attempts:
         return self.duration_ns(bits - fast) + (fast * NS_PER_S + self.data_bitrate // 2) // self.data_bitrate
 
     def busy(self, frame: CanFrame, bits: int, rest: int) -> tuple[int, int]:
-        """Return how long the first `bits` of `frame` and `rest` further bits take, and that time in bits at the nominal bit
-        rate.
+        """Return the duration in ns of the first `bits` of `frame` and `rest` further bits, and this duration in bits at the
+        nominal bit rate.
 
         The bits after a frame, or after an error in it, are always sent at the nominal bit rate.
         """
@@ -174,7 +174,9 @@ class Attempts:
     def _spoilt(
         self, what: Disturbance, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> bool:
-        """Return whether the disturbance destroyed the frame; otherwise some error-passive receivers did not receive it."""
+        """Apply a disturbance, and return whether it destroyed the frame. If not, some error-passive receivers did not receive
+        the frame.
+        """
         victims = what.seen_by & set(receivers)
         at_sender = not what.seen_by or bool(what.seen_by & set(senders))
         if not at_sender and not any(self.nodes[n].flags_are_dominant for n in victims):
@@ -190,7 +192,7 @@ class Attempts:
     def _unacknowledged(self, frame: CanFrame, start: Start, senders: Sequence[int]) -> None:
         self._fail(can_verdict.unacknowledged(frame), frame, start, senders, [])
         for number in senders:
-            if self.nodes[number].left:  # its process has ended: do not retry for it
+            if self.nodes[number].left:  # the process of this node has ended: do not repeat its frame
                 self.nodes[number].queue.clear()
                 self.stop_waiting(number)
                 self.forget_if_done(number)
@@ -220,7 +222,8 @@ class Attempts:
         )
 
     def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:
-        length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)  # already known for a single sender
+        # already determined if there is a single sender
+        length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)
         took_ns, bits = self.busy(frame, length, INTERFRAME_BITS)
         end_ns = start.end_ns if len(start.rivals) == 1 else start.start_ns + self.frame_ns(frame, length)
         self._pass(start.start_ns, took_ns)
@@ -253,7 +256,7 @@ class Attempts:
             self.notices.append(Notice(at_ns, number, before, faults.state, faults.tec, faults.rec))
 
     def _pass(self, start_ns: int, took_ns: int) -> None:
-        """Record that an attempt occupied the bus for `took_ns`. Nodes in bus-off count the recessive sequences."""
+        """Record that an attempt occupied the bus for `took_ns`, in which nodes in bus-off count the recessive sequences."""
         if self.off:
             idle_bits = 0 if self.instant else (start_ns - self.free_ns) * self.bitrate // NS_PER_S
             self.off.attempt_passed(idle_bits)

@@ -114,7 +114,7 @@ class CanBus:
         if sender.listen_only:
             raise UsageError("a listen-only node cannot send", got=str(frame))
         if len(sender.queue) >= self.queue_frames:
-            self._run(now_ns)  # frames that have ended by now free their places
+            self._run(now_ns)  # frames that have ended by now leave their places in the queues
             if len(sender.queue) >= self.queue_frames:
                 sender.refused += counted
                 return False
@@ -246,7 +246,7 @@ class CanBus:
     # -- bus-off, and attempts that change nothing ----------------------------------------------------------------
 
     def _recovery_ns(self) -> int | None:
-        """Return when the next node leaves bus-off, if no node sends until then."""
+        """Return the time (ns) at which the next node leaves bus-off if no node sends until then."""
         if not self._wire.off:
             return None
         return self._wire.free_ns + self._wire.duration_ns(self._wire.off.bits_to_recovery())
@@ -261,7 +261,9 @@ class CanBus:
             self._next = None
 
     def _idles(self, start: Start) -> bool:
-        """Return whether the attempt changes nothing: a lone error-passive node retries without acknowledgement."""
+        """Return whether the attempt changes nothing, because a lone error-passive node repeats a frame that no node
+        acknowledges.
+        """
         if self.monitored or self.instant or self._wire.rules or len(start.rivals) != 1 or len(self._wire.waiting) != 1:
             return False
         lone = self._wire.nodes[start.rivals[0]]

@@ -51,4 +51,4 @@ class CanErrorFrame:
     bits: int
     senders: tuple[int, ...]
     counters: tuple[tuple[int, int, int], ...]
-    """Node, TEC and REC of all participants, after the error."""
+    """The node number, TEC and REC of each participant after the error."""

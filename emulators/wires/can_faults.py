@@ -19,11 +19,11 @@ RECOVERY_SEQUENCES, RECOVERY_BITS = 128, 11
 """A node in bus-off recovers after 128 occurrences of 11 recessive bits."""
 
 SUSPEND_BITS = 8
-"""The additional wait of an error-passive node after it was the transmitter, beyond the interframe space."""
+"""The bits that an error-passive node waits after it has transmitted, in addition to the interframe space."""
 
 _REC_MAX = 255
 _REC_AFTER_PASSIVE = 119
-"""A correctly received frame sets a passive receiver's counter to 119 to 127."""
+"""The receive error counter of an error-passive receiver after a correctly received frame: the standard permits 119 to 127."""
 
 
 class Confinement:

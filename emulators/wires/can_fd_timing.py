@@ -16,7 +16,9 @@ from functools import lru_cache
 from fieldtwin.gateway.core.canframe import CanFrame
 
 CRC17, CRC21 = (17, 0x1685B), (21, 0x102899)
-"""Length and polynomial without its highest term; frames with up to 16 bytes of data use the first."""
+"""The check sums of CAN FD: length in bits, and polynomial without its highest term. Frames with up to 16 bytes of data use
+the first.
+"""
 _LENGTH_CODES = {12: 9, 16: 10, 20: 11, 24: 12, 32: 13, 48: 14, 64: 15}
 _STUFF_AFTER, _FIXED_EVERY = 5, 4
 
@@ -64,7 +66,7 @@ def _bits(can_id: int, data: bytes, extended: bool, brs: bool, esi: bool) -> str
 def _stuff(bits: str) -> tuple[str, int]:
     """Return `bits` with stuff bits, and the number of stuff bits.
 
-    The last bit is never followed by one, because a fixed one follows.
+    No stuff bit follows the last bit, because a fixed stuff bit follows it.
     """
     out: list[str] = []
     run_of, run, count = "", 0, 0

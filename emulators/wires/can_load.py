@@ -33,10 +33,10 @@ class BusLoad:
         self._by_id: dict[int, int] = {}
         self._one_s_bits = bitrate * _SLOTS * _SLOT_NS / NS_PER_S
         self._slots: deque[tuple[int, dict[tuple[int, tuple[int, ...]], int]]] = deque(maxlen=_SLOTS)
-        """For the last slots with traffic: the slot's number, and bits by identifier and senders."""
+        """The last slots with traffic: for each, its number and its bits by identifier and senders."""
         self._number = -1
         self._slot: dict[tuple[int, tuple[int, ...]], int] = {}
-        """The newest slot."""
+        """The counts of the newest slot."""
 
     @property
     def frames(self) -> int:

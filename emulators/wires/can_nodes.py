@@ -97,7 +97,7 @@ class BusOffNodes(dict[int, int]):
             self[number] = max(0, self[number] - idle_bits // RECOVERY_BITS - 1)
 
     def bits_to_recovery(self) -> int:
-        """Return the bits of idle bus until the first node recovers."""
+        """Return the number of bits for which the bus must be idle until the first node recovers."""
         return min(self.values()) * RECOVERY_BITS
 
     def take_recovered(self) -> int:

@@ -18,16 +18,18 @@ from fieldtwin.emulators.wires.can_fd_timing import fd_bits
 from fieldtwin.gateway.core.canframe import CanFrame
 
 CRC15_POLYNOMIAL = 0x4599
-"""x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, without its highest term."""
+"""The generator polynomial of the CRC, x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, without its highest term."""
 
 END_BITS = 10
-"""CRC delimiter, acknowledge slot and delimiter, and the 7 bits of end of frame: never stuffed."""
+"""The bits after the CRC, which are never stuffed: CRC delimiter, acknowledge slot and delimiter, and the 7 bits of end of
+frame.
+"""
 
 INTERFRAME_BITS = 3
-"""Intermission: the bus is busy for these bits after the end of a frame, then every node may start."""
+"""The bits of intermission after the end of a frame. Then every node may start to send."""
 
 ERROR_FLAG_BITS, ERROR_DELIMITER_BITS = 6, 8
-"""An error frame: flags of six equal bits that overlap to at most twelve, then eight recessive bits."""
+"""The parts of an error frame: flags of six equal bits that overlap to at most twelve bits, then eight recessive bits."""
 
 _STUFF_AFTER = 5
 

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 
 FAST_BAUDRATE = 19200
 T1_5_FAST_NS, T3_5_FAST_NS = 750_000, 1_750_000
-"""Above 19200 baud the gaps no longer shrink with the character time: fixed by SL 2.5.1.1."""
+"""The gaps above 19200 baud, where SL 2.5.1.1 gives fixed times instead of character times."""
 
 
 class SerialPacer:
@@ -25,9 +25,9 @@ class SerialPacer:
         self._char = (
             settings.bits_per_char * NS_PER_S,
             settings.baudrate,
-        )  # as a fraction, so that nothing is rounded twice
+        )  # as a fraction, so that a result is rounded only once
         self.busy_until_ns = 0
-        """When the last character that was sent has arrived; 0 if none was sent."""
+        """The time at which the last character that was sent arrives; 0 if none was sent."""
 
     @property
     def t1_5_ns(self) -> int:
@@ -40,7 +40,7 @@ class SerialPacer:
         return T3_5_FAST_NS if self.settings.baudrate > FAST_BAUDRATE else self._half_chars_ns(7)
 
     def duration_ns(self, nbytes: int) -> int:
-        """Return how long `nbytes` characters take without gaps."""
+        """Return the duration of `nbytes` characters without gaps, in ns."""
         numerator, denominator = self._char
         return -(-nbytes * numerator // denominator)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.emulators.endpoints.faulty.streams import FaultyEnd
-from fieldtwin.emulators.endpoints.link_ends import TcpDoor, TcpEnd, TtyEnd
+from fieldtwin.emulators.endpoints.link_ends import TcpAcceptor, TcpEnd, TtyEnd
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, TCPConnection
@@ -145,10 +145,10 @@ class _DialPlug(_Plug):
 
 class _DoorPlug(_Plug):
     stays = False
-    door: TcpDoor | None = None
+    door: TcpAcceptor | None = None
 
     async def prepare(self) -> None:
-        self.door = await TcpDoor.open(self.endpoint)
+        self.door = await TcpAcceptor.open(self.endpoint)
         self.endpoint = self.door.bound
 
     async def connect(self) -> ByteConnection:

@@ -185,14 +185,14 @@ class Behaviour(NodeService):
         for code in outcome.clears:
             self._emergency.clear_error(code, now_ns)
         self._seen = self._emergency.active
-        told = self._encoded(outcome.states)
-        values = {**played, **self._encoded(outcome.readings), **told}
+        encoded_states = self._encoded(outcome.states)
+        values = {**played, **self._encoded(outcome.readings), **encoded_states}
         if self._distort is not None:
             values = self._distort(values, now_ns)
-            told = {key: values[key] for key in told}
-        events = [key for key, raw in told.items() if self._data.put(*key, raw)]
+            encoded_states = {key: values[key] for key in encoded_states}
+        events = [key for key, raw in encoded_states.items() if self._data.put(*key, raw)]
         for key in events:
-            self._core.note(now_ns, "set", *key, told[key])
+            self._core.note(now_ns, "set", *key, encoded_states[key])
         if events:
             self._changed(events, now_ns)
         return values

@@ -21,7 +21,7 @@ Poke = Callable[[int], list[CanFrame]]
 
 
 @runtime_checkable
-class TakesBack(Protocol):
+class WithdrawsFrames(Protocol):
     """A connection that can withdraw frames which still wait for the bus. A kernel interface cannot do this."""
 
     def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
@@ -47,7 +47,7 @@ async def serve_node(
     """Power the node on and serve it until cancelled. Callables in the queue `pokes` run between events (`node.set_value`...).
 
     Raises `ConnectionLost` if the bus is lost, and the errors of the node. The caller owns the connection, which stays
-    open. Late synchronous TPDOs are withdrawn if the connection supports it (`TakesBack`).
+    open. Late synchronous TPDOs are withdrawn if the connection supports it (`WithdrawsFrames`).
     """
     connection.accept = node.accepts
     shell = _Shell(connection, node, clock)
@@ -154,7 +154,7 @@ class _Shell:
         await self._send_left()
         overdue = self._overdue or self._node.take_overdue()
         self._overdue = ()
-        if overdue and isinstance(self._connection, TakesBack):
+        if overdue and isinstance(self._connection, WithdrawsFrames):
             dropped = self._connection.withdraw(overdue)
             self._left = self._node.dropped(dropped, self._clock.monotonic_ns())
             await self._send_left()

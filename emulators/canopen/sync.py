@@ -32,7 +32,7 @@ class Sync(NodeService):
         self._emergency = emergency
         self._on_sync = on_sync
         self._last_ns: int | None = None
-        self._late_told = False
+        self._late_reported = False
         self._missing_at_ns = self._send_at_ns = NEVER
         self._counter = 1
         self._was_stopped = False
@@ -108,8 +108,8 @@ class Sync(NodeService):
 
     def late(self, now_ns: int) -> None:
         """Report that a synchronous PDO missed the window, once per cycle."""
-        if not self._late_told:
-            self._late_told = True
+        if not self._late_reported:
+            self._late_reported = True
             self._emergency.report(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION)
 
     @property
@@ -160,7 +160,7 @@ class Sync(NodeService):
     def _take(self, counter: int | None, now_ns: int) -> None:
         self._core.counters.syncs += 1
         self._last_ns = now_ns
-        self._late_told = False
+        self._late_reported = False
         watched = self._cycle_ns and not self._generates
         self._missing_at_ns = now_ns + self._cycle_ns * 3 // 2 if watched else NEVER
         self._emergency.clear_error(emcy.COMMUNICATION_ERROR, now_ns, source=_SOURCE)

@@ -49,18 +49,18 @@ class TimeService(NodeService):
     def __init__(self, core: Core, period_ns: int) -> None:
         self._core = core
         self._period_ns = period_ns
-        self._told: tuple[TimeOfDay, int] | None = None
+        self._known: tuple[TimeOfDay, int] | None = None
 
     def now(self, now_ns: int) -> TimeOfDay | None:
         """Return the time of day at `now_ns`."""
-        if self._told is None:
+        if self._known is None:
             return None
-        told, at_ns = self._told
-        return told.later((now_ns - at_ns) // NS_PER_MS)
+        known, at_ns = self._known
+        return known.later((now_ns - at_ns) // NS_PER_MS)
 
     def tell(self, time: TimeOfDay, now_ns: int) -> None:
         """Set the clock."""
-        self._told = (time, now_ns)
+        self._known = (time, now_ns)
         self._core.note(now_ns, "time", COB_ID, 0, time.to_bytes())
         self._schedule(now_ns)
 
@@ -105,5 +105,5 @@ class TimeService(NodeService):
             self._core.send(self._core.data.number(COB_ID) & 0x7FF, time.to_bytes(), now_ns)
 
     def _schedule(self, now_ns: int) -> None:
-        producing = self._period_ns and self._told and self._core.data.number(COB_ID) & _PRODUCES
+        producing = self._period_ns and self._known and self._core.data.number(COB_ID) & _PRODUCES
         self.due_ns = now_ns + self._period_ns if producing else NEVER

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.errors import Desync, EndpointBusy, FieldtwinError, 
 
 ROOM = 2
 """The number of packets that a modem may send to the server before the server accepts the first of them."""
-HEARD = 64
+MAX_RECEIVED = 64
 _LONGEST = 1024
 
 
@@ -55,7 +55,7 @@ class AcousticServer:
         self._server: asyncio.Server | None = None
         self._writers: dict[str, asyncio.StreamWriter] = {}
         self._news = asyncio.Event()
-        medium.on_say = self._news.set
+        medium.on_send = self._news.set
         self._wanted: dict[str, deque[bytes]] = {}
         self._serving: list[asyncio.Task[None]] = []
 
@@ -133,7 +133,7 @@ class AcousticEnd:
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.sent = self.resent = self.delivered = 0
         self._reader, self._writer = reader, writer
-        self._heard: deque[bytes] = deque(maxlen=HEARD)
+        self._heard: deque[bytes] = deque(maxlen=MAX_RECEIVED)
         self._under_way = 0
         self._gone = False
         self._nursery = Nursery()

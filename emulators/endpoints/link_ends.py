@@ -50,8 +50,8 @@ class TcpEnd(ByteConnection):
     `half_closed` is true. `finish` does the same in the other direction.
     """
 
-    def __init__(self, endpoint: Endpoint, door: TcpDoor | None = None) -> None:
-        """Create an unconnected end. Use `dial`, or take an end from a `TcpDoor`, instead."""
+    def __init__(self, endpoint: Endpoint, door: TcpAcceptor | None = None) -> None:
+        """Create an unconnected end. Use `dial`, or take an end from a `TcpAcceptor`, instead."""
         super().__init__(TCPConnection(), endpoint, MAX_PENDING)
         self.wire = _Wire(self, door)
 
@@ -108,9 +108,9 @@ class _Wire(asyncio.BufferedProtocol):
 
     transport: asyncio.Transport
 
-    def __init__(self, end: TcpEnd, door: TcpDoor | None) -> None:
+    def __init__(self, end: TcpEnd, door: TcpAcceptor | None) -> None:
         self._end = end
-        self._door = door
+        self._acceptor = door
         self._buffer = bytearray(CHUNK)
         self.room = asyncio.Event()
         self.room.set()
@@ -127,8 +127,8 @@ class _Wire(asyncio.BufferedProtocol):
         self.transport = transport  # type: ignore[assignment]
         self.transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))
-        if self._door is not None:
-            self._door.knocked(self._end)
+        if self._acceptor is not None:
+            self._acceptor.connected(self._end)
 
     def get_buffer(self, sizehint: int) -> bytearray:
         return self._buffer
@@ -156,7 +156,7 @@ class _Wire(asyncio.BufferedProtocol):
         self.room.set()
 
 
-class TcpDoor:
+class TcpAcceptor:
     """A listener that accepts one peer at a time, because a serial line has one client.
 
     While a peer is connected, further ones are closed immediately and counted in `refused`. A peer that has half-closed
@@ -172,7 +172,7 @@ class TcpDoor:
         self._knock = asyncio.Event()
 
     @classmethod
-    async def open(cls, endpoint: Endpoint) -> TcpDoor:
+    async def open(cls, endpoint: Endpoint) -> TcpAcceptor:
         """Listen; `bound` then has the real port. Raises `EndpointBusy` or `Unreachable`."""
         door = cls(endpoint)
         where = str(endpoint)
@@ -205,7 +205,7 @@ class TcpDoor:
     def _admit(self) -> _Wire:
         return TcpEnd(self.bound, self).wire
 
-    def knocked(self, end: TcpEnd) -> None:
+    def connected(self, end: TcpEnd) -> None:
         """Handle a new connection. Its asyncio protocol calls this method."""
         if any(other is not None and other.wire.open and not other.wire.eof for other in (self._inside, self._next)):
             self.refused += 1

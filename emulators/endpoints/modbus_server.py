@@ -85,7 +85,7 @@ async def serve_mbap(
     """
     try:
         if isinstance(connection, SocketEnd) and on_frame is None and latency_s == 0.0:
-            await connection.answer_at_once(lambda data: _at_once(server, data, clock))
+            await connection.answer_at_once(lambda data: _answer_chunk(server, data, clock))
         while server.desync is None:
             data = await connection.read()
             now_ns = clock.monotonic_ns()
@@ -95,7 +95,7 @@ async def serve_mbap(
     await connection.aclose()
 
 
-def _at_once(server: MbapServer, data: bytes, clock: Clock) -> tuple[bytes, bool]:
+def _answer_chunk(server: MbapServer, data: bytes, clock: Clock) -> tuple[bytes, bool]:
     """Answer a chunk without waiting. Return the replies, and whether the rest of the stream cannot be parsed."""
     return server.answer(data, clock.monotonic_ns()), server.desync is not None
 
@@ -148,7 +148,7 @@ async def _reply(
     on_frame: OnFrame | None,
 ) -> None:
     if on_frame is not None:
-        _tell_heard(exchanges, now_ns, on_frame)
+        _report_requests(exchanges, now_ns, on_frame)
     due_ns = now_ns
     for exchange in exchanges:
         if not exchange.reply:
@@ -174,7 +174,7 @@ async def _reply_on_line(
     character.
     """
     if on_frame is not None:
-        _tell_heard(exchanges, now_ns, on_frame)
+        _report_requests(exchanges, now_ns, on_frame)
     after_s = 0.0
     for exchange in exchanges:
         if exchange.reply:
@@ -184,6 +184,6 @@ async def _reply_on_line(
                 on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)
 
 
-def _tell_heard(exchanges: list[ServedFrame], now_ns: int, on_frame: OnFrame) -> None:
+def _report_requests(exchanges: list[ServedFrame], now_ns: int, on_frame: OnFrame) -> None:
     for exchange in exchanges:  # all of these frames arrived before the first of them was answered
         on_frame(Direction.SENT, now_ns, exchange.heard)

@@ -52,7 +52,10 @@ def check_wire_effect(spec: FaultSpec, framing: Framing, table: Table | None = N
     for key, functions in aimed:
         if functions and possible and not functions & possible:
             raise WrongAim(
-                key, f"fault {kind.name} strikes no frame here", expected=_codes(possible), got=_codes(functions)
+                key,
+                f"fault {kind.name} changes no frame at this target",
+                expected=_codes(possible),
+                got=_codes(functions),
             )
         possible = functions & possible if functions and possible else functions or possible
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from fieldtwin.emulators.faults.fault import Active, DelayedBytes, FaultEffect, Hang, WireFault, passed
+from fieldtwin.emulators.faults.fault import Active, ConnectionEffect, DelayedBytes, FaultEffect, WireFault, passed
 from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection, Framing, understood
 
 
@@ -88,7 +88,7 @@ def _joined(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, act
     if before is None:
         return fault.strike(frame, active.random)
     pieces: list[DelayedBytes] = []
-    hang: Hang | None = before.hang
+    hang: ConnectionEffect | None = before.hang
     for piece in before.pieces:
         if piece.back or not piece.data:
             pieces.append(piece)

@@ -20,7 +20,7 @@ from fieldtwin.emulators.faults.frames import EVERY_FRAMING, FaultFrame, FrameDi
 from fieldtwin.gateway.core.files.profile import Tag
 
 
-class Hang(Enum):
+class ConnectionEffect(Enum):
     """The effect of a fault on a connection."""
 
     CLOSE = "close"
@@ -53,7 +53,7 @@ class FaultEffect:
     """The effect of a fault on a frame: pieces in order, and the effect on the connection after them."""
 
     pieces: tuple[DelayedBytes, ...] = ()
-    hang: Hang | None = None
+    hang: ConnectionEffect | None = None
 
 
 def passed(*data: bytes) -> FaultEffect:
@@ -139,7 +139,7 @@ class WireFault(Fault):
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         """Return the effect on `frame`."""
 
-    def appears(self) -> Hang | None:
+    def appears(self) -> ConnectionEffect | None:
         """Return the effect on connections that are open when the fault is injected."""
         return None
 

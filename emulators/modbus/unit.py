@@ -141,7 +141,7 @@ class ModbusUnit:
         """Answer with exception 06 until `until_ns` of the emulator's time; functions 08, 0B and 0C still work."""
         self._busy_until_ns = until_ns
 
-    def be_busy_behind(self, every: int, for_ns: int) -> None:
+    def be_busy_after(self, every: int, for_ns: int) -> None:
         """Be busy for `for_ns` nanoseconds after every `every` requests that were not refused as busy. If `every` is 0, never."""
         self._busy_every, self._busy_for_ns = every, for_ns
 
@@ -215,7 +215,7 @@ class ModbusUnit:
             if handler is None:
                 raise IllegalFunction(f"function {pdu[0]:02X}h")
             if self._busy_every and pdu[0] not in WHILE_BUSY:
-                self._tire(now_ns)
+                self._count_towards_busy(now_ns)
             response = handler(pdu, now_ns)
         except Refusal as refusal:
             self.counters.exceptions += 1
@@ -225,8 +225,8 @@ class ModbusUnit:
         self.diagnostics.completed(pdu)
         return response
 
-    def _tire(self, now_ns: int) -> None:
-        """Count one more request, and make the unit busy after it if `be_busy_behind` requires this."""
+    def _count_towards_busy(self, now_ns: int) -> None:
+        """Count one more request, and make the unit busy after it if `be_busy_after` requires this."""
         self._answered += 1
         if self._busy_every and self._answered % self._busy_every == 0:
             self._busy_until_ns = max(self._busy_until_ns, now_ns + self._busy_for_ns)

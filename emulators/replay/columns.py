@@ -18,7 +18,7 @@ from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import RECORDING
 
-BESIDE = 32
+EXCHANGE_OVERHEAD_BYTES = 32
 """The memory in bytes that an exchange needs in addition to its reply."""
 
 _WORDS: dict[bytes, RECORDING] = {}

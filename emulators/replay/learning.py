@@ -15,7 +15,7 @@ from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.modbus.functions.registers import STANDARD_FUNCTIONS
 from fieldtwin.emulators.replay import requests
-from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Merged, OutcomeColumn, Outcomes
+from fieldtwin.emulators.replay.columns import EXCHANGE_OVERHEAD_BYTES, CellValues, Merged, OutcomeColumn, Outcomes
 from fieldtwin.emulators.replay.counters import RecordingCounters
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell, Situations
@@ -117,10 +117,10 @@ class Learner:
             if column is not None and unit is not None:
                 if not column.add(order, exchange) and exchange.reply:
                     self._learn_odd(unit, column.request, exchange)
-                size += column.stride + BESIDE
+                size += column.stride + EXCHANGE_OVERHEAD_BYTES
                 if size > MAX_BYTES:
                     self._drop_oldest(order)
-                    size = sum(len(c) * (c.stride + BESIDE) for c in self._columns())
+                    size = sum(len(c) * (c.stride + EXCHANGE_OVERHEAD_BYTES) for c in self._columns())
 
     def _columns(self) -> Iterator[OutcomeColumn]:
         for unit in self.units.values():

@@ -124,7 +124,7 @@ class RecordedObjects:
             return None
         at = self._next.get(key, 0)
         if at >= len(answers) and self._when_used_up is EndOfRecording.ERROR:
-            raise UsedUp(f"nothing is left of what node {self._node_id} held in {key[0]:04X}h:{key[1]:02X}")
+            raise UsedUp(f"the log has no further value of {key[0]:04X}h:{key[1]:02X} of node {self._node_id}")
         if at >= len(answers) and self._when_used_up is EndOfRecording.LOOP:
             at = 0
         self._next[key] = at + 1

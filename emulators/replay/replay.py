@@ -340,5 +340,5 @@ class ExchangeReplay:
     def _choose(unit: LearntUnit, key: bytes, situations: list[int]) -> int:
         """Return the recorded situation that is most similar to the present one. The result is cached until the next write."""
         if key not in unit.alike:
-            unit.alike[key] = unit.situations.most_alike(situations)
+            unit.alike[key] = unit.situations.most_similar(situations)
         return unit.alike[key]

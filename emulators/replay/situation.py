@@ -86,7 +86,7 @@ class Situations:
         """Return the value last written to `cell` in that situation, or None."""
         return self._values[situation].get(cell)
 
-    def most_alike(self, candidates: Sequence[int]) -> int:
+    def most_similar(self, candidates: Sequence[int]) -> int:
         """Return the candidate most similar to the present situation; the earliest if there are several.
 
         The most similar candidate has the most cells with the same value; among equals the most cells that are written at all,

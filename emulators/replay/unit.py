@@ -54,7 +54,7 @@ class ReplayUnit(ModbusUnit):
         self.counters.requests += 1
         self.diagnostics.log.note_received()
         answer = self.recall(pdu)
-        self._tire(now_ns)
+        self._count_towards_busy(now_ns)
         self.latency_s = answer.latency_s
         if answer.reply is None:
             self.counters.unanswered += 1

@@ -134,7 +134,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def _compact(self) -> None:
         """Remove the timers that are no longer needed.
 
-        The next removal is due when about half as many as now remain could be over.
+        The next removal is due after half as many new timers as now remain.
         """
         self._timers = [entry for entry in self._timers if not _is_over(entry[2])]
         heapify(self._timers)
@@ -169,8 +169,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run until `future` is done. Raises `Deadlock` if it never will be."""
-        # type: ignore[arg-type]  # `future` may also be a generator
-        main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)
+        main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)  # type: ignore[arg-type]  # a generator too
         main.add_done_callback(self._on_done)
         try:
             self.run_forever()
@@ -234,9 +233,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _who_waits(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
-        told = [f"{task.get_name()} at {waits_at(task, _is_plumbing)}" for task in tasks[:_WAITING_SHOWN]]
-        more = len(tasks) - len(told)
-        return "; ".join(told) + (f"; and {more} more" if more > 0 else "")
+        shown = [f"{task.get_name()} at {waits_at(task, _is_plumbing)}" for task in tasks[:_WAITING_SHOWN]]
+        more = len(tasks) - len(shown)
+        return "; ".join(shown) + (f"; and {more} more" if more > 0 else "")
 
     def stop(self) -> None:
         self._stopping = self._stopped = True

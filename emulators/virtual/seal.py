@@ -52,11 +52,11 @@ def _audit(event: str, args: tuple[Any, ...]) -> None:
         raise escape(_EVENTS[event])
 
 
-def _guarded(real: Callable[..., Any], told_by: int = 1 << 30) -> Callable[..., Any]:
+def _guarded(real: Callable[..., Any], time_argument: int = 1 << 30) -> Callable[..., Any]:
     name = f"time.{real.__name__}"
 
     def guard(*args: Any) -> Any:
-        if threading.get_ident() in _sealed and (len(args) < told_by or args[told_by - 1] is None):
+        if threading.get_ident() in _sealed and (len(args) < time_argument or args[time_argument - 1] is None):
             _refuse(name)
         return real(*args)
 
@@ -71,8 +71,8 @@ def _refuse(name: str) -> None:
 def _made() -> list[tuple[Any, str, Any, Any]]:
     """Return the attributes to replace: the module, the name in it, the original and its replacement."""
     clocks = [(name, 1 << 30) for name in _CLOCKS] + list(_NOW_BY_DEFAULT.items())
-    made = [(time, name, getattr(time, name), told_by) for name, told_by in clocks if hasattr(time, name)]
-    return [(module, name, real, _guarded(real, told_by)) for module, name, real, told_by in made] + [
+    made = [(time, name, getattr(time, name), time_argument) for name, time_argument in clocks if hasattr(time, name)]
+    return [(module, name, real, _guarded(real, time_argument)) for module, name, real, time_argument in made] + [
         (datetime, kind.__name__, kind, guarded_date(kind, _refuse)) for kind in (datetime.datetime, datetime.date)
     ]
 

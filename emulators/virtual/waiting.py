@@ -27,8 +27,8 @@ def waits_at(task: asyncio.Task[Any], is_plumbing: Callable[[FrameType], bool]) 
         return repr(task.get_coro())
     last_of_ours = max((n for n, one in enumerate(chain) if not is_plumbing(one.cr_frame)), default=len(chain) - 1)
     place = chain[last_of_ours]
-    told = f"{place.__qualname__} ({Path(place.cr_frame.f_code.co_filename).name}:{place.cr_frame.f_lineno})"
-    return f"{told} for {_call(chain[-1]) if chain[-1] is not place else _awaited(task)}"
+    shown = f"{place.__qualname__} ({Path(place.cr_frame.f_code.co_filename).name}:{place.cr_frame.f_lineno})"
+    return f"{shown} for {_call(chain[-1]) if chain[-1] is not place else _awaited(task)}"
 
 
 def _chain(outermost: Any) -> list[Any]:

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 QUEUE = 4
 """The number of packets that may wait in a modem to be sent. The modem refuses further packets."""
-HEARD = 64
+MAX_RECEIVED = 64
 """The number of received packets that may wait in a modem until they are taken. If more arrive, the oldest are dropped and
 counted.
 """
@@ -88,10 +88,10 @@ class _Modem:
         self.at_m = at_m
         self.random = random
         self.counters = ModemCounters()
-        self.to_say: deque[tuple[int, bytes]] = deque()
+        self.to_send: deque[tuple[int, bytes]] = deque()
         """Packets that wait to be sent, each with the earliest time of its transmission."""
         self.heard: deque[bytes] = deque()
-        self.hearing: list[Reception] = []
+        self.receptions: list[Reception] = []
         """Packets that are arriving at this modem or will arrive later."""
         self.speaks_until_ns = 0
         self.spoke_from_ns = 0
@@ -114,7 +114,7 @@ class AcousticMedium:
     ) -> None:
         self.water = water
         self.spoils = spoils
-        self.on_say: Callable[[], None] | None = None
+        self.on_send: Callable[[], None] | None = None
         """A function that is called when a modem has a packet to send, because `next_ns` may have changed."""
         self._modems = {
             name: _Modem(number, at_m, Random(f"{seed} {name}"))
@@ -144,14 +144,14 @@ class AcousticMedium:
         """Queue `payload` at `name`, to be sent `times` times. Return False if the modem's queue is full."""
         self.advance(now_ns)
         modem = self._modem(name)
-        if len(modem.to_say) >= QUEUE:
+        if len(modem.to_send) >= QUEUE:
             return False
         for n in range(times):
-            modem.to_say.append((now_ns + n * every_ns, payload))
+            modem.to_send.append((now_ns + n * every_ns, payload))
         self._try(modem, now_ns)
         self.advance(now_ns)
-        if self.on_say is not None:
-            self.on_say()
+        if self.on_send is not None:
+            self.on_send()
         return True
 
     def take(self, name: str, now_ns: int) -> bytes | None:
@@ -176,23 +176,23 @@ class AcousticMedium:
         """Schedule the modem's next attempt to transmit at `t_ns`, or later if its next packet may not be sent then.
 
         A modem has at most one pending attempt."""
-        if modem.to_say:
-            t_ns = max(t_ns, modem.to_say[0][0])
+        if modem.to_send:
+            t_ns = max(t_ns, modem.to_send[0][0])
             if modem.due_ns is None or t_ns < modem.due_ns:
                 modem.due_ns = t_ns
                 self._at(t_ns, modem, None)
 
     def _speak(self, modem: _Modem, t_ns: int) -> None:
-        hears_until_ns = max((r.ends_ns for r in modem.hearing if r.begins_ns <= t_ns < r.ends_ns), default=t_ns)
+        hears_until_ns = max((r.ends_ns for r in modem.receptions if r.begins_ns <= t_ns < r.ends_ns), default=t_ns)
         busy_until_ns = max(hears_until_ns, modem.speaks_until_ns)
         if busy_until_ns > t_ns:
             self._try(modem, busy_until_ns + modem.random.randrange(PAUSE_NS))
             return
-        _, payload = modem.to_say.popleft()
+        _, payload = modem.to_send.popleft()
         modem.counters.said += 1
         ends_ns = t_ns + self.water.airtime_ns(payload)
         modem.spoke_from_ns, modem.speaks_until_ns = t_ns, ends_ns
-        for reception in modem.hearing:  # packets that arrive while the modem transmits are lost
+        for reception in modem.receptions:  # packets that arrive while the modem transmits are lost
             if reception.begins_ns < ends_ns:
                 reception.spoilt = reception.spoilt or "speaking"
         for other in self._modems.values():
@@ -204,18 +204,18 @@ class AcousticMedium:
     def _sound(self, listener: _Modem, payload: bytes, t_ns: int, way_m: float) -> None:
         begins_ns = t_ns + round(way_m / self.water.sound_m_per_s * NS_PER_S)
         new = Reception(payload, begins_ns, begins_ns + self.water.airtime_ns(payload))
-        for old in listener.hearing:
+        for old in listener.receptions:
             if old.begins_ns < new.ends_ns and new.begins_ns < old.ends_ns:
                 old.spoilt, new.spoilt = old.spoilt or "collision", "collision"
         if listener.spoke_from_ns < new.ends_ns and begins_ns < listener.speaks_until_ns:
             new.spoilt = new.spoilt or "speaking"
-        listener.hearing.append(new)
+        listener.receptions.append(new)
         self._at(new.ends_ns, listener, new)
 
     # -- receiving ------------------------------------------------------------------------------------------------------
 
     def _heard(self, modem: _Modem, reception: Reception, t_ns: int) -> None:
-        modem.hearing.remove(reception)
+        modem.receptions.remove(reception)
         missed = modem.random.random() < self.water.loss
         why = reception.spoilt or ("chance" if missed else "")
         if not why and self.spoils is not None and self.spoils(t_ns, modem.number, reception.payload):
@@ -224,7 +224,7 @@ class AcousticMedium:
             modem.counters.lost[why] += 1
             return
         modem.counters.heard += 1
-        if len(modem.heard) >= HEARD:
+        if len(modem.heard) >= MAX_RECEIVED:
             modem.heard.popleft()
             modem.counters.dropped += 1
         modem.heard.append(reception.payload)

@@ -94,7 +94,7 @@ class Attempts:
 
     def attempt(self, start: Start) -> None:
         """Complete an attempt as a frame or an error. A node that enters bus-off counts from the end of the attempt on."""
-        self._judge(start)
+        self._resolve(start)
         for number in start.rivals:
             node = self.nodes.get(number)
             if node is None or node.faults.state is _ACTIVE:
@@ -104,7 +104,7 @@ class Attempts:
             elif node.faults.state is CanErrorState.PASSIVE:
                 node.hold_ns = self.free_ns + self.duration_ns(SUSPEND_BITS)
 
-    def _judge(self, start: Start) -> None:
+    def _resolve(self, start: Start) -> None:
         frame: CanFrame = start.winner.frame
         senders: Sequence[int] = start.rivals
         if len(senders) > 1:

@@ -45,18 +45,18 @@ class Confinement:
         """Count a frame of this node that was acknowledged without an error."""
         if self.tec:
             self.tec -= 1
-            self._judge()
+            self._update_state()
 
     def received(self) -> None:
         """Count a frame that was received without error."""
         if self.rec:
             self.rec = self.rec - 1 if self.rec < PASSIVE_LIMIT else _REC_AFTER_PASSIVE
-            self._judge()
+            self._update_state()
 
     def send_failed(self) -> None:
         """Count an error during transmission."""
         self.tec += 8
-        self._judge()
+        self._update_state()
 
     def not_acknowledged(self) -> None:
         """Count a missing acknowledgement, but only until the node is error-passive (exception 1 of rule c)."""
@@ -69,14 +69,14 @@ class Confinement:
         `first` says that the node sent its error flag before the others, and saw their flags after its own.
         """
         self.rec = min(self.rec + (9 if first else 1), _REC_MAX)
-        self._judge()
+        self._update_state()
 
     def recover(self) -> None:
         """Return to the bus after bus-off."""
         self.tec = self.rec = 0
         self.state = CanErrorState.ACTIVE
 
-    def _judge(self) -> None:
+    def _update_state(self) -> None:
         worst = max(self.tec, self.rec)
         if self.tec >= BUS_OFF_LIMIT or self.state is CanErrorState.BUS_OFF:
             self.state = CanErrorState.BUS_OFF

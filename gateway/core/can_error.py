@@ -75,7 +75,7 @@ def violation_frame(kind: str, tec: int, rec: int, t_ns: int = 0) -> CanFrame:
     return CanFrame(what | CLASS_BUS_ERROR | CLASS_COUNTERS, bytes(data), error=True, t_ns=t_ns)
 
 
-def told_state(frame: CanFrame) -> CanErrorState | None:
+def reported_state(frame: CanFrame) -> CanErrorState | None:
     """Return the controller state that an error frame reports.
 
     Return None for an overrun, for a violation, and for a frame that is not an error frame.
@@ -94,6 +94,6 @@ def told_state(frame: CanFrame) -> CanErrorState | None:
     return None
 
 
-def tells_overrun(frame: CanFrame) -> bool:
+def reports_overrun(frame: CanFrame) -> bool:
     """Return whether an error frame reports that received frames were lost."""
     return bool(frame.error and frame.can_id & CLASS_CONTROLLER and len(frame.data) > 1 and frame.data[1] & _OVERFLOW)

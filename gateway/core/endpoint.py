@@ -100,7 +100,7 @@ class Endpoint:
             raise UsageError(
                 f"cannot read endpoint {url!r}",
                 expected="one of " + ", ".join(f"{s}:" for s in SCHEMES),
-                hint=_meant(url, scheme if colon else ""),
+                hint=_hint_for(url, scheme if colon else ""),
             )
         rest, _, query = rest.partition("?")
         params = tuple(parse_qsl(query, keep_blank_values=True))
@@ -223,7 +223,7 @@ def _check_params(endpoint: Endpoint) -> None:
         endpoint.silence_s  # noqa: B018
 
 
-def _meant(url: str, scheme: str) -> str:
+def _hint_for(url: str, scheme: str) -> str:
     """Return a hint for a text that is not an endpoint: a device's path without its scheme, or a misspelt scheme."""
     if url.startswith("/dev/"):
         return f"a serial port is rtu:{url}?baudrate=9600&frame=8N1"

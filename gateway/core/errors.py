@@ -231,7 +231,7 @@ class WrongDevice(DeviceRefused):
 # -- error texts of the operating system -------------------------------------------------------------------------------
 
 _NUMBER = re.compile(r"\[Errno (\d+)\]")
-_SAYS_LITTLE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
+_UNINFORMATIVE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
 """Errors for ::1, to which ``localhost`` also resolves, on a host without IPv6. They do not explain a failure."""
 
 
@@ -245,7 +245,7 @@ def os_reason(error: OSError) -> str:
     if not numbers or numbers[0] < 0:  # getaddrinfo has negative error numbers and its own texts
         silent = "no answer" if isinstance(error, TimeoutError) else type(error).__name__
         return error.strerror or str(error) or silent
-    telling = [n for n in numbers if n not in _SAYS_LITTLE]
+    telling = [n for n in numbers if n not in _UNINFORMATIVE]
     if errno.ECONNREFUSED in telling:
         return os.strerror(errno.ECONNREFUSED)
     return os.strerror((telling or numbers)[0])

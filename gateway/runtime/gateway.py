@@ -250,12 +250,12 @@ class Gateway:
                     pump.offer([m.data for m in messages])
             if tag in self.config.log_tags:
                 self.log.append([(tag, m.seq, m.t_ns, m.data) for m in messages])
-        self._judge_plc(now_ns)
+        self._check_plc(now_ns)
         self.outputs.tick(now_ns)
         for pump in self.pumps:
             pump.tick(now_ns, self.exchange.all_consumed(pump.driver.message_tag))
 
-    def _judge_plc(self, now_ns: int) -> None:
+    def _check_plc(self, now_ns: int) -> None:
         """Follow the PLC's commands, unless its heartbeat stopped or it reports that it stopped."""
         if self._stopping:
             return

@@ -14,7 +14,7 @@ from fieldtwin.emulators.endpoints.can.software_end import open_can_end
 from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
 from fieldtwin.gateway.connections.can.soft_bus import SoftBusConnection
 from fieldtwin.gateway.connections.soft_bus import SoftBus
-from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.can_error import CanErrorState, reported_state, reports_overrun
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -50,7 +50,7 @@ def test_every_kind_of_end_gets_errors_of_its_own_controller_only() -> None:
                 server.disturb(rule)
                 await sender.send(CanFrame(0x123))
                 told = [await sender.recv() for _ in range(4)]
-                assert [told_state(f) for f in told] == [WARNING, PASSIVE, BUS_OFF, ACTIVE]
+                assert [reported_state(f) for f in told] == [WARNING, PASSIVE, BUS_OFF, ACTIVE]
                 assert [f.can_id & 0x140 for f in told] == [0, 0, 0x40, 0x100]
                 assert [f.data[6] for f in told] == [96, 128, 255, 0]  # TEC
                 assert [f.t_ns for f in told] == sorted(f.t_ns for f in told)
@@ -101,7 +101,7 @@ def test_a_slow_node_is_informed_once_it_reads() -> None:
             await eventually(lambda: slow.overruns == 5)
             got = [await slow.recv() for _ in range(11)]
             assert [f.can_id for f in got[:10]] == list(range(10))
-            assert tells_overrun(got[10])
+            assert reports_overrun(got[10])
             assert not slow.inbound.data_stream
             assert server.bus_stats()["overruns"] == 5
             for end in (sender, slow):
@@ -115,11 +115,11 @@ def test_alone_on_a_bus_without_listeners() -> None:
         async with bus(monitored=False) as server:
             alone = await open_can_end(server.bound, 0)
             await alone.send(CanFrame(0x705, b"\0"))
-            assert [told_state(await alone.recv()) for _ in range(2)] == [WARNING, PASSIVE]
+            assert [reported_state(await alone.recv()) for _ in range(2)] == [WARNING, PASSIVE]
             await eventually(lambda: server.bus_stats()["nodes"][0]["state"] == "error-passive")
             late = await open_can_end(server.bound, 0)
             assert str(await late.recv()) == "705#00"  # sent until a node acknowledged it
-            assert told_state(await alone.recv()) is WARNING  # 127
+            assert reported_state(await alone.recv()) is WARNING  # 127
             for end in (late, alone):
                 await end.aclose()
 

@@ -205,7 +205,7 @@ class FieldSimulator:
         emulated = self.prototype.devices[config.name]
         made = self._made_device(config, emulated)
         if emulated.form.busy is not None:
-            made.unit.be_busy_behind(emulated.form.busy.every, emulated.form.busy.for_ms * NS_PER_MS)
+            made.unit.be_busy_after(emulated.form.busy.every, emulated.form.busy.for_ms * NS_PER_MS)
         self.faults.on_values(config.name, made.distortions)
         device = self.devices[config.name] = FieldDevice(emulated, made.unit, None)
         device.journal = made.journal

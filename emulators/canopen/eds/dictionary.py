@@ -188,9 +188,14 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
         own = sections.get(f"{index:04x}")
         if own is None:
             continue
-        told = own.count("SubNumber")
-        if told and not own.number("CompactSubObj", 0) and found.kind in (ARRAY, RECORD) and told != len(found.entries):
-            own.note(f"SubNumber of [{own.name}] is {told}, {len(found.entries)} are described", "SubNumber")
+        stated = own.count("SubNumber")
+        if (
+            stated
+            and not own.number("CompactSubObj", 0)
+            and found.kind in (ARRAY, RECORD)
+            and stated != len(found.entries)
+        ):
+            own.note(f"SubNumber of [{own.name}] is {stated}, {len(found.entries)} are described", "SubNumber")
 
 
 def _fill_domains(sections: dict[str, Section], objects: dict[int, DictionaryObject], folder: Path | None) -> None:

@@ -12,7 +12,7 @@ from fieldtwin.emulators.canopen.errors import emcy
 from fieldtwin.emulators.canopen.errors.error_control import ERROR_CONTROL, ErrorReaction
 from fieldtwin.emulators.canopen.sdo.channels import RESPONSE
 from fieldtwin.emulators.canopen.service import Core, NodeService
-from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.can_error import CanErrorState, reported_state, reports_overrun
 from fieldtwin.gateway.core.canframe import CanFrame
 
 OVERRUN, PASSIVE, RECOVERED, COLLISION = 0x8110, 0x8120, 0x8140, 0x8150
@@ -32,11 +32,11 @@ class BusFaults(NodeService):
         """A function that is called with the identifier when a second node sends on an identifier of this node, once until the
         next reset.
         """
-        self._told = False
+        self._reported = False
 
     def reset(self, now_ns: int) -> None:
         """Keep the controller's state at a reset, and report an error that is still present again."""
-        self._told = False
+        self._reported = False
         if self.state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
@@ -72,16 +72,16 @@ class BusFaults(NodeService):
         if frame.can_id not in own:
             return False
         self._raise(COLLISION, now_ns)
-        if self.tell is not None and not self._told:
-            self._told = True
+        if self.tell is not None and not self._reported:
+            self._reported = True
             self.tell(frame.can_id)
         return True
 
     def on_error_frame(self, frame: CanFrame, now_ns: int) -> None:
         """Process an error frame of the node's own controller, from the kernel or the software bus."""
-        if tells_overrun(frame):
+        if reports_overrun(frame):
             self.overrun(now_ns)
-        state = told_state(frame)
+        state = reported_state(frame)
         if state is not None:
             self.changed(state, now_ns)
 

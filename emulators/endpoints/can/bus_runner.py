@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple, Protocol
 
-from fieldtwin.emulators.endpoints.can.overrun import TellsOverrun
+from fieldtwin.emulators.endpoints.can.overrun import ReportsOverrun
 from fieldtwin.emulators.wires.can_bus import CanBus
 from fieldtwin.emulators.wires.can_faults import ErrorRule
 from fieldtwin.gateway.core.can_error import CanErrorState, state_frame, violation_frame
@@ -53,7 +53,7 @@ class BusPort(Protocol):
         ...
 
 
-class _Told(NamedTuple):
+class _ReportedError(NamedTuple):
     """An error frame that a controller passes to its node, with the number of the node."""
 
     t_ns: int
@@ -213,11 +213,11 @@ class BusRunner:
     def _hand_out(self) -> None:
         # The loop may fire a timer one clock resolution early; the end of the frame still counts as reached.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
-        told = self._told() if self._bus.has_news else None
+        frames = self._error_frames() if self._bus.has_news else None
         touched: dict[int, BusPort] = {}
         for delivery in deliveries:
-            while told and told[0].t_ns < delivery.frame.t_ns:
-                self._tell(told.popleft(), touched)
+            while frames and frames[0].t_ns < delivery.frame.t_ns:
+                self._tell(frames.popleft(), touched)
             for node in delivery.receivers:
                 if (port := self._ports.get(node)) is not None:
                     touched[node] = port
@@ -227,35 +227,35 @@ class BusRunner:
                 if (port := self._ports.get(node)) is not None:
                     touched[node] = port
                     port.on_confirmed(delivery.frame)
-        while told:
-            self._tell(told.popleft(), touched)
+        while frames:
+            self._tell(frames.popleft(), touched)
         for port in touched.values():
             port.on_settled()
 
-    def _told(self) -> deque[_Told]:
+    def _error_frames(self) -> deque[_ReportedError]:
         """Return the new error frames of all controllers, in order of time."""
         states = (
-            _Told(
+            _ReportedError(
                 n.t_ns, 1, n.node, state_frame(n.state, n.tec, n.rec, restarted=restarted, t_ns=n.t_ns), violation=False
             )
             for n in self._bus.take_notices()
             for restarted in (n.before is CanErrorState.BUS_OFF,)
         )
-        return deque(heapq.merge(self._violations(), states, key=lambda told: (told.t_ns, told.order)))
+        return deque(heapq.merge(self._violations(), states, key=lambda error: (error.t_ns, error.order)))
 
-    def _violations(self) -> Iterator[_Told]:
+    def _violations(self) -> Iterator[_ReportedError]:
         for fault in self._bus.take_faults():
             for node, tec, rec in fault.counters:
                 frame = violation_frame(fault.kind, tec, rec, fault.t_ns)
-                yield _Told(fault.t_ns, 0, node, frame, violation=True)
+                yield _ReportedError(fault.t_ns, 0, node, frame, violation=True)
 
-    def _tell(self, told: _Told, touched: dict[int, BusPort]) -> None:
-        if (port := self._ports.get(told.node)) is not None:
-            touched[told.node] = port
-            port.on_error(told.frame, violation=told.violation)
+    def _tell(self, error: _ReportedError, touched: dict[int, BusPort]) -> None:
+        if (port := self._ports.get(error.node)) is not None:
+            touched[error.node] = port
+            port.on_error(error.frame, violation=error.violation)
 
 
-class AttachedConnection(TellsOverrun):
+class AttachedConnection(ReportsOverrun):
     """The connection of a node in the same process. `recv` returns the other nodes' frames, stamped with their exact end of
     frame.
 

@@ -10,15 +10,15 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
 
 
-class TellsOverrun(CanConnection):
+class ReportsOverrun(CanConnection):
     """A CAN end that reports lost frames with one error frame, as soon as its receive queue has room again."""
 
-    _untold = 0
+    _unreported = 0
 
     def on_overrun(self, item: CanFrame) -> None:
-        self._untold = item.t_ns or 1
+        self._unreported = item.t_ns or 1
 
     def on_room(self) -> None:
-        if self._untold and self._lost is None:
-            t_ns, self._untold = self._untold, 0
+        if self._unreported and self._lost is None:
+            t_ns, self._unreported = self._unreported, 0
             self.feed(overrun_frame(t_ns))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.can_error import CanErrorState, reported_state, reports_overrun
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
@@ -90,11 +90,11 @@ class SlcanSession:
 
     def controller(self, frame: CanFrame) -> None:
         """Process an error frame: this protocol has none, so it sets status flags until ``F`` reads them."""
-        if tells_overrun(frame):
+        if reports_overrun(frame):
             self._flags |= _OVERRUN | _RX_FULL
-        state = told_state(frame)
+        state = reported_state(frame)
         if state is None:
-            self._flags |= 0 if tells_overrun(frame) else _BUS_ERROR
+            self._flags |= 0 if reports_overrun(frame) else _BUS_ERROR
         else:
             self._state = {
                 CanErrorState.ACTIVE: 0,

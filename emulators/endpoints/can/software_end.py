@@ -22,7 +22,7 @@ from fieldtwin.emulators.endpoints.can.bus_hello import (
     Status,
     unpack_hello,
 )
-from fieldtwin.emulators.endpoints.can.overrun import TellsOverrun
+from fieldtwin.emulators.endpoints.can.overrun import ReportsOverrun
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
@@ -76,7 +76,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
         if answer is None:
             raise Unreachable("the program that answers there is not a software CAN bus", where=str(endpoint))
-        _judge(answer, bitrate, endpoint)
+        _check_answer(answer, bitrate, endpoint)
     except (OSError, EOFError) as e:
         await _hang_up(writer)
         raise Unreachable("the program that listens there is not a software CAN bus", where=str(endpoint)) from e
@@ -89,7 +89,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
     return SoftBusEnd(endpoint, reader, writer, answer.window, offset_ns)
 
 
-def _judge(answer: BusHello, bitrate: int, endpoint: Endpoint) -> None:
+def _check_answer(answer: BusHello, bitrate: int, endpoint: Endpoint) -> None:
     """Raise the error for an answer by which the bus refuses the node."""
     if answer.status == Status.WRONG_BITRATE:
         raise UsageError(
@@ -108,7 +108,7 @@ def _judge(answer: BusHello, bitrate: int, endpoint: Endpoint) -> None:
         )
 
 
-class SoftBusEnd(TellsOverrun):
+class SoftBusEnd(ReportsOverrun):
     """A node on the software bus over TCP: a task reads records, `send` keeps within the bus's transmit window.
 
     Error frames (gateway/core/can_error.py) report changes of its controller's state, and overruns.
@@ -215,7 +215,7 @@ def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
     return KernelCanEnd(endpoint, bus)
 
 
-class KernelCanEnd(TellsOverrun):
+class KernelCanEnd(ReportsOverrun):
     """A node on a kernel interface (usually vcan). Frames are stamped when they are read."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC) -> None:

@@ -34,7 +34,7 @@ class FaultyCan(CanConnection):
         self._tasks: set[asyncio.Task[None]] = set()
         self._closed = False
         inner.accept = self._accepts
-        inner.intercept = self._heard
+        inner.intercept = self._apply_to_request
         faults.listeners.append(self._put_in)
 
     @property
@@ -78,7 +78,7 @@ class FaultyCan(CanConnection):
     def _now_ns(self) -> int:
         return round(self._loop.time() * NS_PER_S)
 
-    def _heard(self, frame: CanFrame) -> bool:
+    def _apply_to_request(self, frame: CanFrame) -> bool:
         pieces = self._struck(FrameDirection.REQUEST, frame)
         if pieces is None:
             return False

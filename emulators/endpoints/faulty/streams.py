@@ -13,7 +13,7 @@ from typing import Any
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
-from fieldtwin.emulators.faults.fault import Active, DelayedBytes, FaultEffect, Hang, WireFault
+from fieldtwin.emulators.faults.fault import Active, ConnectionEffect, DelayedBytes, FaultEffect, WireFault
 from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, FaultFrame, FrameDirection
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -50,7 +50,7 @@ class FaultyEnd(ByteConnection):
         self._waiting = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._flush: asyncio.TimerHandle | None = None
-        inner.intercept = self._heard
+        inner.intercept = self._apply_to_request
         faults.listeners.append(self._put_in)
         for active in faults.active.values():  # faults that were injected before this connection was opened
             self._put_in(active)
@@ -76,14 +76,14 @@ class FaultyEnd(ByteConnection):
         return self.inner.read_pending()
 
     async def write(self, data: bytes) -> None:
-        for piece in self._said(data):
+        for piece in self._apply_to_reply(data):
             await self.inner.write(piece)
             self._show(FrameDirection.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
         """Do the same as `PtyEnd.answer`."""
         assert self._pty is not None
-        for n, piece in enumerate(self._said(data, after_s)):
+        for n, piece in enumerate(self._apply_to_reply(data, after_s)):
             await (self._pty.answer(piece, after_s) if n == 0 else self._pty.write(piece))
             self._show(FrameDirection.REPLY, piece)
 
@@ -114,18 +114,18 @@ class FaultyEnd(ByteConnection):
         if self._faults.watch is not None:
             self._faults.watch(self, way, data)
 
-    def _passes(self, assembler: Assembler) -> bool:
+    def _is_inactive(self, assembler: Assembler) -> bool:
         """Return whether bytes pass unchanged: no fault is active, and no delayed bytes are waiting."""
         return not (self._faults.active or assembler.pending or (self._free_ns and assembler.way in self._free_ns))
 
-    def _heard(self, data: bytes) -> bool:
+    def _apply_to_request(self, data: bytes) -> bool:
         """Handle a chunk from the peer. Return True if a fault was applied to it, so that it must not be passed on unchanged."""
         if self._faults.watch is not None:
             self._show(FrameDirection.REQUEST, data)
         if self._dead:
             return True
         assembler = self._requests
-        if self._passes(assembler):
+        if self._is_inactive(assembler):
             return False
         for frame in assembler.feed(data):
             self._on_request(frame)
@@ -151,12 +151,12 @@ class FaultyEnd(ByteConnection):
         for frame in self._requests.flush():
             self._on_request(frame)
 
-    def _said(self, data: bytes, after_s: float = 0.0) -> list[bytes]:
+    def _apply_to_reply(self, data: bytes, after_s: float = 0.0) -> list[bytes]:
         """Apply the faults to a reply of the emulator. Return the parts to send immediately; the other parts are scheduled."""
         if self._dead:
             return []
         assembler = self._replies
-        if self._passes(assembler):
+        if self._is_inactive(assembler):
             return [data]
         frames = assembler.feed(data)
         if not self._faults.framing.streams:
@@ -252,16 +252,16 @@ class FaultyEnd(ByteConnection):
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
         self._loop.call_later(wait_s, self._appear, active, hang)
 
-    def _appear(self, active: Active, hang: Hang) -> None:
+    def _appear(self, active: Active, hang: ConnectionEffect) -> None:
         if active.id in self._faults.active and in_time(active, self._now_ns()):
             active.struck += 1
             self._hang(hang, [])
 
-    def _hang(self, hang: Hang, last: list[bytes]) -> None:
+    def _hang(self, hang: ConnectionEffect, last: list[bytes]) -> None:
         in_memory = isinstance(self.inner, MemoryEnd) and self.inner.wire.serial
         if self._dead or in_memory or self.inner.type is PROTOCOL.RS232:
             return  # a serial line cannot be closed: the fault itself drops the bytes
-        if hang is Hang.HALF_OPEN:
+        if hang is ConnectionEffect.HALF_OPEN:
             self._dead = True
             return
         for data in last:
@@ -269,11 +269,11 @@ class FaultyEnd(ByteConnection):
         self._dead = True
         self._loop.call_soon(self._end, hang)
 
-    def _end(self, hang: Hang) -> None:
+    def _end(self, hang: ConnectionEffect) -> None:
         if isinstance(self.inner, MemoryEnd):
             self.inner.wire.cut(ConnectionLost("the other side ended the connection", where=str(self.endpoint)))
         elif isinstance(self.inner, SocketEnd):
-            self.inner.evict(reset=hang is Hang.RESET)
+            self.inner.evict(reset=hang is ConnectionEffect.RESET)
         else:
             task = self._loop.create_task(self.inner.aclose(), name="a fault's end of a connection")
             self._tasks.add(task)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import LOST, FaultEffect, Hang, WireFault
+from fieldtwin.emulators.faults.fault import LOST, ConnectionEffect, FaultEffect, WireFault
 from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 
@@ -19,5 +19,5 @@ class Disconnect(WireFault):
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST
 
-    def appears(self) -> Hang:
-        return Hang.CLOSE
+    def appears(self) -> ConnectionEffect:
+        return ConnectionEffect.CLOSE

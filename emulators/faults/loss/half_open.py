@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import FaultEffect, Hang, WireFault
+from fieldtwin.emulators.faults.fault import ConnectionEffect, FaultEffect, WireFault
 from fieldtwin.emulators.faults.frames import FaultFrame
 
 
@@ -13,4 +13,4 @@ class HalfOpen(WireFault):
     summary = "from this frame on, the connection silently carries no data"
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
-        return FaultEffect(hang=Hang.HALF_OPEN)
+        return FaultEffect(hang=ConnectionEffect.HALF_OPEN)

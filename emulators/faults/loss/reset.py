@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import DelayedBytes, FaultEffect, Hang, Parameters, WireFault
+from fieldtwin.emulators.faults.fault import ConnectionEffect, DelayedBytes, FaultEffect, Parameters, WireFault
 from fieldtwin.emulators.faults.frames import FaultFrame
 
 
@@ -20,4 +20,6 @@ class Reset(WireFault):
     form = Form
 
     def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
-        return FaultEffect((DelayedBytes(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)
+        return FaultEffect(
+            (DelayedBytes(frame.data[: self.parameters.at]),) if self.parameters.at else (), ConnectionEffect.RESET
+        )

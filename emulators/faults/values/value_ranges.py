@@ -45,7 +45,7 @@ def check_value(tag: Tag, value: float, name: str, hint: str = "") -> None:
     low, high = found
     margin = 0.0 if tag.type in FLOAT_LIMITS else abs(tag.scale) / 2
     if not low - margin <= value <= high + margin:
-        raise WrongAim("value", f"{name} cannot hold {value:g}", expected=_said(tag, low, high), hint=hint)
+        raise WrongAim("value", f"{name} cannot hold {value:g}", expected=_in_words(tag, low, high), hint=hint)
 
 
 def beyond(tag: Tag, name: str) -> float:
@@ -77,7 +77,7 @@ def beyond(tag: Tag, name: str) -> float:
         raise WrongAim(
             "register",
             f"{name} cannot be out of its range {tag.range[0]:g} to {tag.range[1]:g}: its type carries no other value",
-            expected=f"a tag whose type carries more than its range; this one carries {_said(tag, low, high)}",
+            expected=f"a tag whose type carries more than its range; this one carries {_in_words(tag, low, high)}",
         )
     return found
 
@@ -106,7 +106,7 @@ def check_fault(fault: Fault, register: str, tags: Iterable[Tag], device: str = 
         raise refused[0]
 
 
-def _said(tag: Tag, low: float, high: float) -> str:
+def _in_words(tag: Tag, low: float, high: float) -> str:
     unit = f" {tag.unit}" if tag.unit else ""
     bits = "" if tag.bits is None else f", bits {tag.bits[0]} to {tag.bits[1]}"
     return f"{low:g} to {high:g}{unit} ({tag.type}{bits})"

@@ -34,11 +34,11 @@ class IoModule(DeviceModel):
         self.digital_outputs: dict[int, int] = {}
         self.analogue_outputs: dict[int, int] = {}
         self._inputs: dict[Key, int] = {}
-        self._told: dict[int, int] = {}
+        self._reported: dict[int, int] = {}
 
     def power_on(self, situation: Situation) -> None:
         self._inputs.clear()
-        self._told.clear()
+        self._reported.clear()
 
     def step(self, situation: Situation) -> ModelOutput:
         self._set_outputs(situation)
@@ -71,14 +71,14 @@ class IoModule(DeviceModel):
             key = ANALOGUE_IN, sub
             value = round(situation.played.get(key, 0))
             event = bool(enabled) and self._interrupts(sub, value, objects)
-            if event or sub not in self._told:
-                self._told[sub] = value
+            if event or sub not in self._reported:
+                self._reported[sub] = value
             yield key, value, event
 
     def _interrupts(self, sub: int, value: int, objects: Objects) -> bool:
         """Return whether the limit conditions hold and the value has moved far enough since its last interrupt."""
         triggers = objects.whole(TRIGGERS, sub, default=AT_UPPER | BELOW_LOWER | MOVED)
-        moved = value - self._told.get(sub, value)
+        moved = value - self._reported.get(sub, value)
         limits = triggers & (AT_UPPER | BELOW_LOWER)
         at_limit = (triggers & AT_UPPER and value >= objects.number(UPPER, sub)) or (
             triggers & BELOW_LOWER and value < objects.number(LOWER, sub)

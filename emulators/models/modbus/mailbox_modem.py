@@ -47,7 +47,7 @@ class MailboxModem(RegisterBank):
         self._outgoing, self._incoming = outgoing, incoming
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
-        self._told = (-1, -1, -1, -1)
+        self._written_counters = (-1, -1, -1, -1)
         """The link's counters as last written to its registers (`_LINK`); none at first."""
         self._received: deque[bytes] = deque(maxlen=RECEIVED)
         self._sequence = 0
@@ -101,12 +101,12 @@ class MailboxModem(RegisterBank):
         if self._received and self._cells.peek("holding", self._inbox.ack.address) == self._sequence:
             self._fill_inbox(self._received.popleft())
         counters = 1, self._outgoing.sent, self._incoming.delivered, self._outgoing.resent
-        if counters != self._told:
+        if counters != self._written_counters:
             self._tell(counters, now_ns)
 
     def _tell(self, counters: tuple[int, int, int, int], now_ns: int) -> None:
         """Write the link's changed counters into their registers."""
-        before, self._told = self._told, counters
+        before, self._written_counters = self._written_counters, counters
         for name, number, told in zip(_LINK, counters, before, strict=True):
             tag = self._tags.get(name)
             if tag is not None and number != told:

@@ -100,5 +100,5 @@ def _named(data: bytes) -> tuple[str, str]:
         return service, f" {data[1]}"
     if command == lss.FASTSCAN and len(data) > 6:
         part = _PARTS[data[6]] if data[6] < 4 else "?"
-        return service, " from the start" if data[5] == lss.ANYBODY else f" {part} {number:X}h, bits from {data[5]}"
+        return service, " from the start" if data[5] == lss.ANY_SLAVE else f" {part} {number:X}h, bits from {data[5]}"
     return service, ""

@@ -80,7 +80,7 @@ def bridge_config(options: BridgeOptions) -> BridgeConfig:
         clients=options.clients,
         queue=options.queue,
         idle_s=options.idle_s,
-        insist=False,
+        keep_trying=False,
     )
 
 

@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Iterable
 
-ALIKE = 0.5
+MIN_SIMILARITY = 0.5
 """The smallest similarity of two names (`difflib.SequenceMatcher.ratio`) at which one is suggested for the other."""
 
 
@@ -18,12 +18,12 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> list[str]:
     names = {k.lower(): k for k in known}
     whole = re.compile(rf"(?:^|.*[^a-z0-9]){re.escape(name.lower())}(?:[^a-z0-9].*|$)") if name else None
     longer = [k for k in names if whole is not None and whole.fullmatch(k)]
-    alike = _by_likeness(name.lower(), longer, 0)
-    alike += _by_likeness(name.lower(), [k for k in names if k not in longer], ALIKE)
+    alike = _by_similarity(name.lower(), longer, 0)
+    alike += _by_similarity(name.lower(), [k for k in names if k not in longer], MIN_SIMILARITY)
     return [names[near] for near in alike[:most]]
 
 
-def _by_likeness(name: str, known: Iterable[str], least: float) -> list[str]:
+def _by_similarity(name: str, known: Iterable[str], least: float) -> list[str]:
     """Return the names with at least this likeness to `name`, the most similar first, equally similar ones as they come."""
     matcher = difflib.SequenceMatcher(b=name)
     found = []

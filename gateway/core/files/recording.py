@@ -235,7 +235,7 @@ class RecordingReader:
         try:
             header = _header_decoder.decode(line)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            other = next((told for begins, told in _OTHER_FILES if line.startswith(begins)), "")
+            other = next((advice for begins, advice in _OTHER_FILES if line.startswith(begins)), "")
             raise FileInvalid(
                 f"not a recording{other}" if other else f"not a recording's header: {error}",
                 path=str(self.path),

@@ -127,7 +127,7 @@ def load(path: Path, *, merges: bool = False) -> YamlFile:
     except OSError as e:
         raise FileInvalid(f"cannot read the file: {e.strerror or e}", path=str(path)) from e
     except UnicodeDecodeError as e:
-        hint = next((told for begins, told in _OTHER_FILES if e.object.startswith(begins)), "")
+        hint = next((advice for begins, advice in _OTHER_FILES if e.object.startswith(begins)), "")
         got = f"byte {e.object[e.start]:02X}h"
         raise FileInvalid("the file is not UTF-8 text", path=str(path), got=got, hint=hint) from e
     return parse(text, str(path), merges=merges)

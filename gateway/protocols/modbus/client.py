@@ -280,7 +280,7 @@ class ModbusClient:
             line.answered(reply.t_ns, transaction.sent_ns)
             self.latency.record(reply.t_ns - transaction.sent_ns)
             if self.units.hurried_ns:
-                self.units.relax(unit)
+                self.units.restore_timeout(unit)
             return reply
         except ModbusExceptionReply as e:
             counters.exceptions += 1
@@ -289,7 +289,7 @@ class ModbusClient:
             line.answered(now_ns, transaction.sent_ns)
             self.latency.record(now_ns - transaction.sent_ns)
             if not isinstance(e, GatewayRefusal):
-                self.units.relax(unit)
+                self.units.restore_timeout(unit)
             self._place(e)
             raise
         except CrcError as e:
@@ -301,7 +301,7 @@ class ModbusClient:
             raise
         except (Desync, ReplyTimeout, VerifyFailed) as e:
             self._count(e)
-            if self.units.hurried(unit) and isinstance(e, ReplyTimeout):
+            if self.units.is_shortened(unit) and isinstance(e, ReplyTimeout):
                 now_ns = self._clock.monotonic_ns()
                 self.units.pass_over(unit, transaction.sent_ns, now_ns, timeout_ns, self._line.longest_latency_ns)
                 self._line.passed_over(now_ns)

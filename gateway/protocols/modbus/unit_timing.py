@@ -63,7 +63,7 @@ class UnitTiming:
         """By unit ID: the time in ns until a reply arrived after its shortened timeout. The code that shortens timeouts
         removes the entries.
         """
-        self.hurried_timeouts = 0
+        self.shortened_timeouts = 0
         """The number of `timeouts` that were of units with a shortened timeout."""
         self.not_waited = 0.0
         """The sum of the time saved by shortened timeouts, each as a fraction of the unit's normal timeout."""
@@ -84,19 +84,19 @@ class UnitTiming:
         timeout_ns = self.timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
         return timeout_ns
 
-    def hurry(self, unit: int, timeout_s: float) -> None:
+    def shorten_timeout(self, unit: int, timeout_s: float) -> None:
         """Shorten the timeout of `unit` to `timeout_s`, and let other units use the line while its reply is outstanding.
 
-        This ends with the first reply of `unit`, or with `relax`. Without a reply, the next request to `unit` waits
+        This ends with the first reply of `unit`, or with `restore_timeout`. Without a reply, the next request to `unit` waits
         until its normal timeout is also over, because a late reply does not say which request it answers (case MB-013).
         """
         self.hurried_ns[unit] = round(checked_timeout(timeout_s) * NS_PER_S)
 
-    def relax(self, unit: int) -> None:
+    def restore_timeout(self, unit: int) -> None:
         """Restore the normal timeout of `unit`."""
         self.hurried_ns.pop(unit, None)
 
-    def hurried(self, unit: int) -> bool:
+    def is_shortened(self, unit: int) -> bool:
         """Return whether the timeout of `unit` is shortened and the unit has not answered since then."""
         return unit in self.hurried_ns
 
@@ -125,7 +125,7 @@ class UnitTiming:
         Other units can use the line.
         """
         own_ns = round(self._timeout_of(unit) * NS_PER_S)
-        self.hurried_timeouts += 1
+        self.shortened_timeouts += 1
         self.not_waited += max(0.0, 1.0 - timeout_ns / own_ns)
         # As long as the quarantine of a line after a normal timeout: a late reply must not answer the next request (MB-013).
         until_ns = max(now_ns, sent_ns + own_ns) + max(own_ns, latency_ns)

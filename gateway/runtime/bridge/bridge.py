@@ -92,7 +92,7 @@ class BridgeConfig:
     queue: int = 32
     in_flight: int = 16
     idle_s: float = 0.0
-    insist: bool = True
+    keep_trying: bool = True
     """Whether the bridge keeps trying to open a port that cannot be opened; otherwise this is an error."""
 
     @property
@@ -174,7 +174,7 @@ class Bridge:
                 max_clients=config.clients,
                 in_flight=config.in_flight,
                 admits=config.policy.admits,
-                insist=config.insist,
+                keep_trying=config.keep_trying,
                 idle_s=config.idle_s,
                 listen=listen,
                 refused=self._note_refusal,
@@ -202,7 +202,7 @@ class Bridge:
         response."""
         self.counters.requests += 1
         try:
-            asked, route = self._judged(caller, unit, pdu)
+            asked, route = self._checked(caller, unit, pdu)
             if route is None:
                 sent = self._broadcast(caller, pdu, asked)
                 return when_all_are_out(pdu, sent) if self.config.answer_broadcast else None
@@ -216,7 +216,7 @@ class Bridge:
         if changes_a_unit(pdu):
             self._record.refused(caller.on_record, self._place(unit, self._route(unit)), unit, pdu, code, why)
 
-    def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[ServerRequest, Route | None]:
+    def _checked(self, caller: Caller, unit: int, pdu: bytes) -> tuple[ServerRequest, Route | None]:
         """Check a client's request, and return it parsed, with its route. A route of None means a broadcast. Raises the
         exception with which the bridge answers a request that it does not forward.
         """

@@ -80,7 +80,7 @@ class FrontCounters:
 class TcpFront:
     """A listening port, which runs until cancelled.
 
-    A port that cannot be opened is tried again, and the status shows this; if `insist` is False, the error ends the server
+    A port that cannot be opened is tried again, and the status shows this; if `keep_trying` is False, the error ends the server
     (`EndpointBusy`, `Unreachable`).
     """
 
@@ -93,7 +93,7 @@ class TcpFront:
         max_clients: int = 16,
         in_flight: int = 16,
         admits: Callable[[str], bool] = lambda address: True,
-        insist: bool = True,
+        keep_trying: bool = True,
         idle_s: float = 0.0,
         listen: Listen = TcpListener.open,
         refused: Refused = _ignore,
@@ -107,7 +107,7 @@ class TcpFront:
         self._max_clients = max_clients
         self._in_flight = in_flight
         self._admits = admits
-        self._insist = insist
+        self._keep_trying = keep_trying
         self._idle_s = idle_s
         self._listen = listen
         self._refused = refused
@@ -126,7 +126,7 @@ class TcpFront:
                     self.endpoint, self._serve, self._max_clients, self._admits, self._idle_s
                 )
             except Unreachable as e:
-                if not self._insist:
+                if not self._keep_trying:
                     raise
                 self.error = str(e)
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(backoff.next_s() * NS_PER_S))

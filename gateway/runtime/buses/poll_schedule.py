@@ -139,9 +139,9 @@ class PollSchedule:
         self.missed[group] += max(0, passed - (due_ns - start_ns) // rate.period_ns)
         self.due_ns[group] = start_ns + (passed + 1) * rate.period_ns
         if group in self._goal_ns:
-            self._go_sooner(group, rate, now_ns)
+            self._move_earlier(group, rate, now_ns)
 
-    def _go_sooner(self, group: str, rate: PollSlot, now_ns: int) -> None:
+    def _move_earlier(self, group: str, rate: PollSlot, now_ns: int) -> None:
         """Move a group that is being read now by one step towards its target phase."""
         step_ns, most_ns = (rate.phase_ns - self._goal_ns[group]) % rate.period_ns, rate.period_ns // SOONER
         if self.due_ns[group] - now_ns < rate.period_ns - most_ns:

@@ -22,7 +22,7 @@ class OutputGroup:
     def __init__(self, name: str, outputs: Sequence[Output]) -> None:
         self.name = name
         self.outputs = tuple(outputs)
-        self.told: tuple[object, ...] = ()
+        self.reported: tuple[object, ...] = ()
         """The last report to the journal about values that are held back, so that each is reported once."""
 
     @property

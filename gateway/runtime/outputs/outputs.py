@@ -251,17 +251,17 @@ class OutputWriter:
 
     def _hold_back(self, group: OutputGroup, differing: list[Output], culprit: Output, why: str) -> None:
         held = [o for o in differing if o is not culprit and o.refused != (o.wanted, o.by)]
-        told = (culprit.tag, why, *((o.tag, o.wanted) for o in held))
-        if told == group.told:
+        reported = (culprit.tag, why, *((o.tag, o.wanted) for o in held))
+        if reported == group.reported:
             return
-        group.told = told
+        group.reported = reported
         for output in held:
             error = NotAllowed(f"held back: {why}, and the group {group.name!r} is written whole or not at all")
             self._note(output, output.wanted, RefusalCause.GROUP, error, output.by)
 
     def _start_group(self, group: OutputGroup) -> None:
         """Check every member, then record every member, then write them all."""
-        commands, group.told = [], ()
+        commands, group.reported = [], ()
         wanted = {output.tag: output.wanted for output in group.outputs if output.wanted is not None}
         for output in group.outputs:
             try:

@@ -15,7 +15,16 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Aim, DelayedBytes, FaultEffect, Hang, ValueFault, WireFault, passed
+from fieldtwin.emulators.faults.fault import (
+    Active,
+    Aim,
+    ConnectionEffect,
+    DelayedBytes,
+    FaultEffect,
+    ValueFault,
+    WireFault,
+    passed,
+)
 from fieldtwin.emulators.faults.frames import Assembler, FaultFrame, FrameDirection, Framing, understood
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import parse_fault
@@ -162,9 +171,11 @@ def test_an_echo_goes_back_first() -> None:
 
 
 def test_faults_of_a_connection() -> None:
-    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect((DelayedBytes(ON_TCP[:4]),), Hang.RESET)
-    assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(hang=Hang.HALF_OPEN)
-    assert made("disconnect").appears() is Hang.CLOSE
+    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect(
+        (DelayedBytes(ON_TCP[:4]),), ConnectionEffect.RESET
+    )
+    assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(hang=ConnectionEffect.HALF_OPEN)
+    assert made("disconnect").appears() is ConnectionEffect.CLOSE
     assert made("disconnect").refuses
 
 

@@ -136,7 +136,7 @@ def test_the_command_lists_every_fault() -> None:
         ),
         ("{name: wrong-transaction, device: ctd}", "changes nothing in RTU frames; expected Modbus TCP frames", 6),
         ("{name: fewer-registers, device: ctd, function: 6}", "expected function 01h, 02h, 03h, 04h, 17h; got", 41),
-        ("{name: drop, device: ctd, address: 'holding:3', function: 4}", "strikes no frame here", 31),
+        ("{name: drop, device: ctd, address: 'holding:3', function: 4}", "changes no frame at this target", 31),
         ("{name: drop, device: ctd, unit: 77}", "ctd has a different address; expected 1; got 77", 31),
         ("{name: heartbeat-loss, device: inclinometer, cob_id: 0x185}", "changes no frame with the COB-ID 185h", 50),
         (

@@ -168,7 +168,7 @@ def test_a_recorded_device_behaves_as_its_profile_states(tmp_path: Path) -> None
 def test_busy_as_stated(tmp_path: Path, recorded: bool) -> None:
     replay = ExchangeReplay([RecordedExchange(0.0, 1, bytes.fromhex("03000a0001"), bytes.fromhex("03020003"), 0.01)])
     unit: ModbusUnit = ProfiledReplay(profile_of(tmp_path), replay, 1) if recorded else stated(tmp_path)
-    unit.be_busy_behind(3, 100)
+    unit.be_busy_after(3, 100)
     replies = [ask(unit, "03 000A 0001", now_ns) for now_ns in (0, 1, 2, 3, 101, 102, 103, 104, 105)]
     assert [reply[:4] for reply in replies] == ["0302"] * 3 + ["8306"] * 2 + ["0302"] * 3 + ["8306"]
     assert unit.counters.busy == 3

@@ -213,7 +213,7 @@ def test_endlessly_new_writes_cost_no_memory() -> None:
         situations.write("holding", 0, [value])
     assert situations.now is None
     assert situations.written(("holding", 0)) == 999
-    assert situations.most_alike([0, 1, 2]) == 1  # the earliest in which that register was written at all
+    assert situations.most_similar([0, 1, 2]) == 1  # the earliest in which that register was written at all
 
 
 # -- shapes -------------------------------------------------------------------------------------------------------

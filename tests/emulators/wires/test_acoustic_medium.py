@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.models.modbus.acoustic_link import AcousticLink
-from fieldtwin.emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, AcousticProperties
+from fieldtwin.emulators.wires.acoustic import MAX_RECEIVED, QUEUE, AcousticMedium, AcousticProperties
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -70,7 +70,7 @@ def test_a_modem_accepts_a_limited_number_of_bytes() -> None:
 
 def test_a_listener_that_takes_nothing_loses_the_oldest() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
-    for n in range(HEARD + 3):
+    for n in range(MAX_RECEIVED + 3):
         assert sea.say("west", bytes([n]), s(n))
     assert sea.take("middle", s(500)) == bytes([3])
     assert sea.counters["middle"].dropped == 3

@@ -101,7 +101,7 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
     kept: dict[str, Section] = {}
     for name, allowed in (("DeviceInfo", (_DEVICE_TEXT, _DEVICE_NUMBERS)), ("DeviceComissioning", _commissioning())):
         section = sections.get(name, Section(name, 0))
-        kept[name] = _mend_information(section, allowed, path, mended)
+        kept[name] = _repair_information(section, allowed, path, mended)
     for name in sorted((n for n in sections if _OBJECT.match(n) and not n.endswith("Denotation")), key=_order):
         parent = sections.get(name[:4])
         if parent is None:
@@ -112,11 +112,11 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
         elif name != parent.name and _is_variable(parent, path) and "CompactSubObj" not in kept[parent.name].values:
             mended.append(f"[{name}]: left out, [{parent.name}] is a single variable")
         elif name.endswith("Name"):
-            _mend_names(sections[name], parent, kept, path, mended)
+            _repair_names(sections[name], parent, kept, path, mended)
         elif name.endswith("Value"):
             _spell_out(sections[name], parent, kept, path, mended)
         else:
-            kept[name] = _mend_object(sections[name], sections, path, mended)
+            kept[name] = _repair_object(sections[name], sections, path, mended)
     return EdsText(kept, tuple(mended))
 
 
@@ -207,7 +207,7 @@ def _number(section: Section, key: str, if_empty: str, path: str, mended: list[s
     return value
 
 
-def _mend_information(
+def _repair_information(
     section: Section, allowed: tuple[tuple[str, ...], tuple[str, ...]], path: str, mended: list[str]
 ) -> Section:
     """Return the section [DeviceInfo] or [DeviceComissioning] with only the keys that are needed."""
@@ -217,13 +217,13 @@ def _mend_information(
         if key in texts:
             kept.values[key] = section.values[key]
         elif key in numbers and (section.values[key] or key not in _COMMISSIONING_NUMBERS):
-            _mend_count(section, key, kept, path, mended)
+            _repair_count(section, key, kept, path, mended)
         elif key.lower() == "compactpdo" and section.values[key] not in ("", "0", "0x0", "0x00"):
             mended.append("[DeviceInfo] CompactPDO: PDO parameters that the file leaves out are not made up")
     return kept
 
 
-def _mend_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
+def _repair_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
     """Copy a number that describes the whole device. An impossible number is left out, because no object depends on it."""
     try:
         number = int(_number(section, key, "0", path, mended), 0)
@@ -263,7 +263,7 @@ def _data_type(section: Section, kept: Section, sections: dict[str, Section], pa
     return _DOMAIN
 
 
-def _mend_object(section: Section, sections: dict[str, Section], path: str, mended: list[str]) -> Section:
+def _repair_object(section: Section, sections: dict[str, Section], path: str, mended: list[str]) -> Section:
     """Return the section of an object or sub-object with all keys that the strict reader of `canopen` requires."""
     kept = Section(section.name, section.line, lines=section.lines)
     for key, value in section.values.items():
@@ -337,7 +337,7 @@ def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path:
         kept[own.name] = own
 
 
-def _mend_names(names: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
+def _repair_names(names: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
     """Complete [xxxxName], which lists the names of a compact array's entries only where they differ from the default."""
     array = kept[parent.name]
     if "CompactSubObj" not in array.values:

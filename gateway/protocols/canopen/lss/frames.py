@@ -22,7 +22,7 @@ IDENTIFY_NON_CONFIGURED = 0x4C
 INQUIRE = (0x5A, 0x5B, 0x5C, 0x5D)
 INQUIRE_NODE_ID = 0x5E
 
-ANYBODY = 0x80
+ANY_SLAVE = 0x80
 """The bit number of a fastscan request that every unconfigured slave answers, and that restarts its scan."""
 
 UNCONFIGURED = 0xFF

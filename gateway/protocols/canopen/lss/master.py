@@ -129,7 +129,7 @@ class LssMaster:
     async def any_unconfigured(self) -> bool:
         """Return whether a slave without a node ID is on the bus (slaves that have a node ID do not answer: CO-057)."""
         async with self._turn:
-            return await self._anybody(lss.request(lss.IDENTIFY_NON_CONFIGURED), lss.NON_CONFIGURED_FOUND)
+            return await self._any_answer(lss.request(lss.IDENTIFY_NON_CONFIGURED), lss.NON_CONFIGURED_FOUND)
 
     async def fastscan(self, *, verify: bool = True) -> LssAddress | None:
         """Find one slave without a node ID and leave it in the configuration state; return None if there is no such slave.
@@ -140,19 +140,19 @@ class LssMaster:
         contradict each other, or if the slave that was found reports a different identity.
         """
         async with self._turn:
-            if not await self._anybody(lss.fastscan(0, lss.ANYBODY, 0, 0), lss.SLAVE_FOUND):
+            if not await self._any_answer(lss.fastscan(0, lss.ANY_SLAVE, 0, 0), lss.SLAVE_FOUND):
                 return None
             found = LssAddress(*[await self._scan_part(part) for part in range(4)])
-        if verify and (told := await self.inquire_address()) != found:
-            raise Desync("fastscan found a different slave", expected=str(found), got=str(told))
+        if verify and (reported := await self.inquire_address()) != found:
+            raise Desync("fastscan found a different slave", expected=str(found), got=str(reported))
         return found
 
     async def _scan_part(self, part: int) -> int:
         number = 0
         for bit in range(31, -1, -1):
-            if not await self._anybody(lss.fastscan(number, bit, part, part), lss.SLAVE_FOUND):
+            if not await self._any_answer(lss.fastscan(number, bit, part, part), lss.SLAVE_FOUND):
                 number |= 1 << bit
-        if not await self._anybody(lss.fastscan(number, 0, part, (part + 1) % 4), lss.SLAVE_FOUND):
+        if not await self._any_answer(lss.fastscan(number, 0, part, (part + 1) % 4), lss.SLAVE_FOUND):
             raise Desync(f"no slave confirms part {part} of the address that fastscan found", got=f"{number:08X}h")
         return number
 
@@ -192,7 +192,7 @@ class LssMaster:
             self._waiting = False
         raise ReplyTimeout(why or "no LSS slave answers", hint="is one in configuration state?" if not why else "")
 
-    async def _anybody(self, frame: CanFrame, expected: int) -> bool:
+    async def _any_answer(self, frame: CanFrame, expected: int) -> bool:
         """Return whether at least one slave answers. Always wait for the whole reply time, so that no late reply is left."""
         self._begin()
         heard = False

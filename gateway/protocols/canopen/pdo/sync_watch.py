@@ -52,9 +52,9 @@ class SyncWatch:
             if self._last_counter and data[0] not in expected:
                 self._jumps += 1
             self._last_counter = data[0]
-        self.verdict = self.verdict or self._judge()
+        self.verdict = self.verdict or self._evidence()
 
-    def _judge(self) -> str:
+    def _evidence(self) -> str:
         if self._own:
             return "a SYNC came from another node, and this master produces SYNC: there are two producers"
         if self._jumps >= _OUT_OF_ORDER:

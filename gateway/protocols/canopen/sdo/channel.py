@@ -207,7 +207,7 @@ class SdoChannel:
         self._began_ambiguous, self._final_seen = self._late.is_ambiguous(request), False
         self._answers.pop(request, None)
         try:
-            await self._tell_owed(transfer)
+            await self._send_owed_abort(transfer)
             began_ns = self._clock.monotonic_ns()
             data = await self._drive(transfer)
             self._latency.record(self._clock.monotonic_ns() - began_ns)
@@ -239,7 +239,7 @@ class SdoChannel:
         if transfer.to_abort:
             self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
 
-    async def _tell_owed(self, transfer: SdoTransfer) -> None:
+    async def _send_owed_abort(self, transfer: SdoTransfer) -> None:
         """Send the abort of a transfer that was abandoned earlier. Otherwise the node might take our request for one of its
         segments.
         """

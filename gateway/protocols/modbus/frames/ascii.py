@@ -79,7 +79,7 @@ class AsciiFramer(Framer):
             if self._damaged >= MOST_DAMAGED:
                 self._skip(len(self._buffer))
                 return None
-            pdu = self._judge(text, request)
+            pdu = self._examine(text, request)
             if pdu is not None:
                 return pdu
         return None
@@ -130,7 +130,7 @@ class AsciiFramer(Framer):
         del buffer[:end]
         return text
 
-    def _judge(self, text: bytes, request: Request[Any]) -> bytes | None:
+    def _examine(self, text: bytes, request: Request[Any]) -> bytes | None:
         """Return the PDU of a frame with the requested unit ID and function, or None for any other frame. Raises as `feed`."""
         frame = _decoded(text)
         ours = f":{self._unit:02X}{request.function:02X}".encode()

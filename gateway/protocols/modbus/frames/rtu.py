@@ -97,7 +97,7 @@ class RtuFramer(Framer):
 
     def settle(self) -> bytes | None:
         if self._request is not None:
-            self._request.heard_out()
+            self._request.line_silent()
         return self._scan(settled=True)
 
     def drained(self, data: bytes) -> None:

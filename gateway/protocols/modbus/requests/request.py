@@ -63,7 +63,7 @@ class Request(ABC, Generic[R_co]):
         """Return the number of bytes of the reply PDU if the request determines it, else `NEED_MORE`."""
         return NEED_MORE
 
-    def heard_out(self) -> None:
+    def line_silent(self) -> None:
         """Note a silence on the line after the last byte. A silence ends a reply of unknown length (SL 2.5.1.1)."""
 
     def unanswered(self, t_ns: int) -> R_co:

@@ -39,14 +39,14 @@ class Forwarded(Request[ForwardedReply]):
     last byte is 00 looks like a shorter reply with a 00 after it.
     """
 
-    __slots__ = ("_asked", "_heard_out", "_length", "_on_line", "_pdu", "_unit")
+    __slots__ = ("_asked", "_length", "_line_silent", "_on_line", "_pdu", "_unit")
 
     def __init__(self, unit: int, pdu: bytes, asked: ServerRequest, *, on_line: bool) -> None:
         self._unit = unit
         self._pdu = pdu
         self._asked = asked
         self._on_line = on_line
-        self._heard_out = False
+        self._line_silent = False
         self._length = asked.reply_bytes
 
     @property
@@ -88,14 +88,14 @@ class Forwarded(Request[ForwardedReply]):
             return super().unanswered(t_ns)
         return ForwardedReply(b"", t_ns)
 
-    def heard_out(self) -> None:
-        self._heard_out = True
+    def line_silent(self) -> None:
+        self._line_silent = True
 
     def _open_length(self, head: bytes) -> int:
         """Return the reply length of a user-defined function: on RTU, all bytes before a silence, if their check sum is right."""
         if not self._on_line:
             return len(head)
-        if not self._heard_out or len(head) < 3 or crc16(bytes([self._unit]) + head) != 0:
+        if not self._line_silent or len(head) < 3 or crc16(bytes([self._unit]) + head) != 0:
             return NEED_MORE
         self._length = len(head) - 2
         return self._length

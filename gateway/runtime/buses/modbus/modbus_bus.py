@@ -87,7 +87,7 @@ class ModbusBus:
         self._wakeup = Wakeup(clock)
         self.guests = BridgeQueue()
         self.guests.on_put = self._wakeup.wake
-        self._guest_was_last = False
+        self._bridge_request_was_last = False
         line = config.endpoint
         t35_ns = round(3.5 * line.serial.char_time_s * NS_PER_S) if line.is_serial else 0
         self._turns = Turns(self.devices, config.probe_share, t35_ns)
@@ -314,22 +314,26 @@ class ModbusBus:
             seen_ns, timeout_s = self.latency.recent_longest_ns, self.config.timeout_s
             device, group, at_ns = self._turns.next(client.units.spaced_ns, now_ns, seen_ns, timeout_s)
             due = at_ns <= now_ns
-            if self.guests.size and not (due and self._guest_was_last) and await self._carry_guest():
+            if (
+                self.guests.size
+                and not (due and self._bridge_request_was_last)
+                and await self._carry_out_bridge_request()
+            ):
                 backoff.reset()
             elif due and device is not None:
-                self._guest_was_last = False
+                self._bridge_request_was_last = False
                 await self._poll(client, device, group)
                 backoff.reset()
             else:
                 await self._wakeup.sleep(min(at_ns, wake_ns))
 
-    async def _carry_guest(self) -> bool:
+    async def _carry_out_bridge_request(self) -> bool:
         """Carry out one waiting request of a bridge client. Return False if there was none."""
         client = self._client
         guest = self.guests.take(self._clock.monotonic_ns()) if client is not None else None
         if guest is None or client is None:
             return False
-        self._guest_was_last = True
+        self._bridge_request_was_last = True
         await self.guests.carry_out(guest, client, framing_of(self.config.endpoint) == "rtu")
         return True
 
@@ -342,15 +346,15 @@ class ModbusBus:
             if probed:
                 device.tried, device.asked_ns = True, begun_ns
                 if device.timeout_ns:
-                    client.units.hurry(unit, device.timeout_ns / NS_PER_S)
+                    client.units.shorten_timeout(unit, device.timeout_ns / NS_PER_S)
                 group = await self._requests.bring_online(device)
             elif not device.alone:
-                client.units.hurry(unit, self._patience.timeout_s(device, begun_ns))
+                client.units.shorten_timeout(unit, self._patience.timeout_s(device, begun_ns))
             await self._requests.turn(device, group)
         except ConnectionLost:
             raise
         except ReplyTimeout as e:
-            self._silent(client, device, e, begun_ns, probed)
+            self._handle_no_answer(client, device, e, begun_ns, probed)
         except (WireError, WrongDevice, Unreachable, GatewayRefusal) as e:
             self._failed(client, device, e, begun_ns, probed)
         except DeviceRefused as e:
@@ -361,10 +365,10 @@ class ModbusBus:
             device.answered_ns = self._clock.monotonic_ns()
             device.backoff.reset()
         finally:
-            if client.units.hurried(unit):
-                client.units.relax(unit)
+            if client.units.is_shortened(unit):
+                client.units.restore_timeout(unit)
 
-    def _silent(
+    def _handle_no_answer(
         self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
     ) -> None:
         """Handle a device that did not answer. If it answered before, its request is repeated while repetitions are left.
@@ -390,7 +394,7 @@ class ModbusBus:
         self._offline(device, error)
         now_ns = self._clock.monotonic_ns()
         clear_ns = max(now_ns, client.clear_ns)
-        answered_first = probed and not client.units.hurried(device.driver.config.address)
+        answered_first = probed and not client.units.is_shortened(device.driver.config.address)
         device.fits = device.fits and probed and not answered_first
         device.last_cost_ns = clear_ns - begun_ns if answered_first else 0
         self._turns.failed(device, begun_ns, now_ns, clear_ns)

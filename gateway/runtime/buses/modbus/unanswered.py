@@ -15,9 +15,9 @@ MOST_UNANSWERED = 5
 class Unanswered:
     """The timeouts of `client` since its latest reply.
 
-    Timeouts of requests with a shortened timeout (`UnitTiming.hurry`) count only while no device is online: devices that are
-    away may be asked often while an online device is rarely polled, and their silence shows nothing about the connection. A
-    shortened timeout counts as the fraction that it is of the unit's own timeout.
+    Timeouts of requests with a shortened timeout (`UnitTiming.shorten_timeout`) count only while no device is online: devices
+    that are away may be asked often while an online device is rarely polled, and their silence shows nothing about the
+    connection. A shortened timeout counts as the fraction that it is of the unit's own timeout.
     """
 
     def __init__(self, client: ModbusClient) -> None:
@@ -33,7 +33,10 @@ class Unanswered:
         """
         client, counters = self._client, self._client.counters
         answered = counters.replies + counters.exceptions
-        others, waited = counters.timeouts - client.units.hurried_timeouts, counters.timeouts - client.units.not_waited
+        others, waited = (
+            counters.timeouts - client.units.shortened_timeouts,
+            counters.timeouts - client.units.not_waited,
+        )
         if answered != self._answered:
             self._answered, self._others, self._waited = answered, others, waited
             return False

@@ -38,7 +38,7 @@ class EndOfRecording(Enum):
 
 
 class UsedUp(FileInvalid):
-    """The recording has no more entries, and the prototype file says that this is an error."""
+    """A recording has no more entries, and the prototype file says that this is an error."""
 
 
 class Recorded(msgspec.Struct, frozen=True):
@@ -53,8 +53,8 @@ class Recorded(msgspec.Struct, frozen=True):
 
 
 RELEASE_AT = 512
-"""Number of taken recordings of a command that are kept before they are removed together: removing each one from the
-head of a list would take as many steps as there are recordings after it.
+"""The number of taken recordings of a command after which they are removed together. To remove each one from the head of a
+list would take as many steps as there are recordings after it.
 """
 
 

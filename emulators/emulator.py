@@ -38,7 +38,7 @@ class Emulator(Device, ABC):
         super().__init__(connection, profile.command_list)
         self.virtual_context = virtual_context
         self.executed: Counter[str] = Counter()
-        """How often each command of the list was executed."""
+        """By command of the list: the number of times that it was executed."""
 
 
 class UnitEmulator(Emulator):

@@ -57,7 +57,7 @@ class ModbusWire:
 
     @property
     def is_line(self) -> bool:
-        """Whether the frames are those of a serial line (RTU or ASCII) on whatever connection."""
+        """Return whether the frames are those of a serial line (RTU or ASCII), whatever kind of connection carries them."""
         return framing_of(self.plant) is not Framing.MBAP
 
 

@@ -18,7 +18,7 @@ SHARED, LEAST = 1_000_000, 1_000
 
 
 class DeviceValue(msgspec.Struct, frozen=True, gc=False):
-    """From `t_ns` (the emulator's monotonic time) on, `tag` had the value `raw`."""
+    """An entry of the journal: from `t_ns` (the emulator's monotonic time) on, `tag` had the value `raw`."""
 
     number: int
     tag: str
@@ -40,7 +40,7 @@ class DeviceValueLog:
         self._last: dict[str, bytes] = {}
         self._watched: dict[str, Callable[[bytes, int], None]] = {}
         self.number = 0
-        """Number of the latest entry; numbering starts at 1."""
+        """The number of the latest entry; numbering starts at 1."""
 
     def keep(self, capacity: int) -> None:
         """Keep at most `capacity` entries from now on. The oldest entries are dropped."""

@@ -60,9 +60,11 @@ class EmulatedConnection(TCPConnection):
         self.written_bytes = 0
         self.read_bytes = 0
         self.dropped_write_bytes = 0
-        """Bytes from the near side that were lost, because there was no carrier or it was lost while they were sent."""
+        """The number of bytes from the near side that were lost, because there was no carrier or it was lost while they were
+        sent.
+        """
         self.dropped_read_bytes = 0
-        """Bytes from the far side that were lost because the near side did not accept them."""
+        """The number of bytes from the far side that were lost because the near side did not accept them."""
 
     def emulate_write(self, data: bytes) -> bytes:
         """Pass outgoing bytes from the near side to the carrier unchanged."""

@@ -50,9 +50,9 @@ class SignalTrack:
         if not self._times:
             raise FileInvalid("the recording holds no rows", path=path, expected="at least one")
         self.first_s = self._times[0]
-        """Time of the first row."""
+        """The time of the first row, in seconds."""
         self.last_s = self._times[-1]
-        """Time of the last row."""
+        """The time of the last row, in seconds."""
 
     @classmethod
     def load(cls, path: Path) -> SignalTrack:
@@ -95,7 +95,7 @@ class SignalTrack:
         return self._times[distances.index(min(distances))] if known else None
 
     def values(self, t_s: float) -> dict[str, float]:
-        """Return all signals at `t_s`, all of the same instant."""
+        """Return the values of all signals at `t_s`."""
         row, fraction = self._locate(t_s)
         columns = self._columns
         if fraction == 0.0:
@@ -146,8 +146,8 @@ class Signals(Protocol):
         ...
 
     def values_at(self, position_s: float) -> dict[str, float]:
-        """Return all signals at a position that `position_s` returned; for a simulation, no earlier than a position
-        used before.
+        """Return the values of all signals at a position that `position_s` returned. For a simulation, it may not be earlier
+        than a position that was used before.
         """
         ...
 
@@ -156,7 +156,7 @@ class Signals(Protocol):
         ...
 
     def at(self, now_ns: int, name: str) -> float:
-        """Return one signal now; NaN if it has no value. Raises `FileInvalid` for an unknown name."""
+        """Return the present value of one signal, or NaN if it has none. Raises `FileInvalid` for an unknown name."""
         ...
 
 
@@ -196,7 +196,7 @@ class SignalPlayer(Signals):
         return (now_ns - self.start_ns) / NS_PER_S * self.speed > self.track.last_s
 
     def at(self, now_ns: int, name: str) -> float:
-        """Return the signal `name` now; NaN if the recording has no value."""
+        """Return the present value of the signal `name`, or NaN if the recording has none."""
         return self.track.at(self.position_s(now_ns), name)
 
     def values(self, now_ns: int) -> dict[str, float]:
@@ -211,7 +211,7 @@ class SignalPlayer(Signals):
         return True
 
     def values_at(self, position_s: float) -> dict[str, float]:
-        """Return all signals at a time of the recording."""
+        """Return the values of all signals at a time of the recording."""
         return self.track.values(position_s)
 
     def __len__(self) -> int:

@@ -162,7 +162,9 @@ class Core:
         return out
 
     def refresh(self, now_ns: int) -> None:
-        """Take the source's values of `now_ns`. Raises `UsageError` if they do not fit the dictionary."""
+        """Put the values that the source has at `now_ns` into the objects. Raises `UsageError` if they do not fit the
+        dictionary.
+        """
         if self._source is not None:
             values, put = self._source(now_ns), self.data.put
             for (index, subindex), raw in values.items():

@@ -81,7 +81,7 @@ class TcpEnd(ByteConnection):
             raise self._loss()
 
     def finish(self) -> None:
-        """Send the end of the stream, and keep receiving."""
+        """Tell the peer that no more bytes follow, and continue to receive."""
         if self.wire.open:
             self.wire.transport.write_eof()
 
@@ -173,7 +173,7 @@ class TcpAcceptor:
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> TcpAcceptor:
-        """Listen; `bound` then has the real port. Raises `EndpointBusy` or `Unreachable`."""
+        """Start to listen. Afterwards `bound` contains the actual port. Raises `EndpointBusy` or `Unreachable`."""
         door = cls(endpoint)
         where = str(endpoint)
         try:

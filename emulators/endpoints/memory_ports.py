@@ -31,7 +31,7 @@ class MemoryNet:
     def __init__(self, loop: VirtualLoop) -> None:
         self.loop = loop
         self.wires: list[MemoryWire] = []
-        """All open wires, in the order of their opening."""
+        """The open connections, in the order in which they were opened."""
         self._listeners: dict[str, _Listener | MemoryDatagrams] = {}
         self._serial: dict[str, _SerialPort] = {}
         self._buses: dict[str, MemoryBus] = {}

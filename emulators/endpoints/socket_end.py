@@ -192,7 +192,7 @@ class SocketListener:
         max_clients: int = MAX_CLIENTS,
         priority: frozenset[str] = frozenset(),
     ) -> SocketListener:
-        """Listen; port 0 selects a free port (`bound` gives it). Raises `EndpointBusy`, `Unreachable` or `UsageError`.
+        """Start to listen; port 0 selects a free port (`bound` gives it). Raises `EndpointBusy`, `Unreachable` or `UsageError`.
 
         A ``tls`` endpoint names the server's certificate with ``cert``, ``key``, and with ``ca`` the authority of
         accepted clients.

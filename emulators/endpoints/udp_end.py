@@ -40,7 +40,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
     @classmethod
     async def open(cls, endpoint: Endpoint, max_pending: int = MAX_PENDING) -> UdpEnd:
-        """Bind; port 0 selects a free port (`bound` gives it). Raises `EndpointBusy` or `Unreachable`."""
+        """Bind the socket; port 0 selects a free port (`bound` gives it). Raises `EndpointBusy` or `Unreachable`."""
         end = cls(endpoint, max_pending)
         try:
             infos = await end._loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_DGRAM)

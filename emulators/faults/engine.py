@@ -18,9 +18,10 @@ class WireFaults:
         self.framing = framing
         self.active: dict[str, Active] = {}
         self.listeners: list[Callable[[Active], None]] = []
-        """Called with each fault that is injected. The functions are called in the order in which they subscribed."""
+        """Functions that are called with each fault that is injected, in the order in which they were added."""
         self.watch: Callable[[object, FrameDirection, bytes], None] | None = None
-        """Called with the bytes that the line or connection carries: the end, their direction, the bytes.
+        """A function that is called with the bytes that the line or connection carries. Its arguments are the end, the
+        direction and the bytes.
 
         A reply that a fault holds back is not carried; a request is carried even if a fault keeps it from the emulator. The
         callback may not raise.

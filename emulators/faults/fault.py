@@ -33,7 +33,7 @@ class ConnectionEffect(Enum):
 
 @dataclass(frozen=True, slots=True)
 class DelayedBytes:
-    """Bytes to forward, `delay_s` after the frame arrived and after all bytes that still wait.
+    """Bytes that are forwarded `delay_s` after the frame arrived, and after all bytes that still wait.
 
     With `overtake` they are forwarded before bytes that still wait, with `gather` together with bytes that arrive within that
     time. With `back` they are returned to the sender.
@@ -74,14 +74,14 @@ class Aim(BaseModel):
     unit: int | None = Field(default=None, ge=0, le=255)
     function: int | None = Field(default=None, ge=1, le=127)
     address: str | int | None = None
-    """A PDU address, or ``holding:0x10``."""
+    """The address of a register or bit: a PDU address, or ``holding:0x10``."""
     registers: str | int | None = None
     """The number of registers or bits that the request reads or writes: ``40``, ``65..125`` or ``65..``."""
     register_: str = Field(default="", alias="register")
-    """A tag of the device."""
+    """The name of a tag of the device: requests for its registers match."""
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
     index: int | None = Field(default=None, ge=0, le=0xFFFF)
-    """A CANopen object: the SDO requests and replies that name it."""
+    """The index of a CANopen object: SDO requests and replies for this object match."""
     direction: Literal["request", "reply", "both", ""] = ""
     nth: int | None = Field(default=None, ge=1)
     every: int | None = Field(default=None, ge=1)

@@ -1,4 +1,4 @@
-"""All faults by name."""
+"""The list of all faults, by name."""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 CHARACTER_GAP_NS = NS_PER_S
 """The longest pause between two characters of a frame (SL 2.5.2.1)."""
 MAX_CHARACTERS = 513
-"""Longest frame in characters: colon, 2 for each byte of unit ID, 253 bytes of PDU and LRC, CR and LF (SL 2.5.2.1)."""
+"""The number of characters of the longest frame: colon, 2 for each byte of unit ID, 253 bytes of PDU and LRC, CR and LF (SL
+2.5.2.1).
+"""
 MIN_BYTES = 3
 """The number of bytes of the shortest frame: unit ID, function code and LRC."""
 _COLON, _RETURN = b":", b"\r"

@@ -21,7 +21,7 @@ Undeclared = Literal["exception", "zero", "hold"]
 BIT_TABLES: frozenset[str] = frozenset({"coil", "discrete"})
 WRITABLE_TABLES: frozenset[str] = frozenset({"coil", "holding"})
 ADDRESSES = 0x10000
-"""Number of addresses in a table: 0000h to FFFFh as sent in a PDU (AP 4.4)."""
+"""The number of addresses in a table: 0000h to FFFFh as sent in a PDU (AP 4.4)."""
 
 
 class Refusal(DeviceRefused):

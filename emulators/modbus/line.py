@@ -64,7 +64,7 @@ class LineServer(ABC):
     """The units of one line. `units` maps a unit ID (1 to 247) to its unit."""
 
     check_bytes: int
-    """Number of checksum bytes at the end of a received frame."""
+    """The number of checksum bytes at the end of a received frame."""
 
     def __init__(self, units: Mapping[int, ModbusUnit], receiver: Receiver) -> None:
         for unit_id in units:
@@ -95,7 +95,7 @@ class LineServer(ABC):
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
     def receive(self, data: bytes, now_ns: int) -> list[ServedFrame]:
-        """Do the same as `feed`, but return every received frame too, for taps and journals."""
+        """Handle received bytes as `feed` does, and return every received frame with its reply, for taps and journals."""
         errors_before = self._receiver.crc_errors
         frames = self._receiver.feed(data, now_ns)
         errors = self._receiver.crc_errors - errors_before

@@ -62,7 +62,7 @@ class MbapServer:
         """The numbers of requests that reached a unit, and of the replies to them."""
         self.requests = 0
         self.discarded = 0
-        """Number of ADUs that were dropped: not Modbus, or too short for a function code."""
+        """The number of ADUs that were dropped because they were not Modbus, or too short for a function code."""
         self._allow = allow
         self._any_unit = any_unit
         self._buffer = bytearray()
@@ -77,7 +77,7 @@ class MbapServer:
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
     def receive(self, data: bytes, now_ns: int) -> list[ServedFrame]:
-        """Do the same as `feed`, but return every request ADU too, for taps and journals."""
+        """Handle received bytes as `feed` does, and return every request ADU with its response, for taps and journals."""
         if self.desync is not None:
             return []
         if not self._buffer and _is_adu(data):
@@ -92,7 +92,7 @@ class MbapServer:
         return exchanges
 
     def answer(self, data: bytes, now_ns: int) -> bytes:
-        """Do the same as `feed`, but return the responses as one byte string.
+        """Handle received bytes as `feed` does, and return the responses as one byte string.
 
         Usually `data` is exactly one ADU, which is then not copied into the buffer first: 8 % less for 10 registers.
         """
@@ -104,7 +104,9 @@ class MbapServer:
         return b"".join(self.feed(data, now_ns))
 
     def receive_datagram(self, data: bytes, now_ns: int) -> list[ServedFrame]:
-        """Do the same as `receive`, for a datagram: an ADU that is incomplete at its end is dropped, and no state is kept."""
+        """Handle a datagram as `receive` handles received bytes. An ADU that is incomplete at the end of the datagram is
+        dropped, and no state is kept.
+        """
         exchanges = self.receive(data, now_ns)
         self.discarded += bool(self._buffer)
         self._buffer.clear()

@@ -114,7 +114,7 @@ class _View(Sequence[Recorded], ABC):
 
 
 class Outcomes(_View):
-    """All outcomes of a column's request, silence included."""
+    """A sequence of all outcomes of a column's request, silence included."""
 
     def __init__(self, column: OutcomeColumn) -> None:
         self._column = column

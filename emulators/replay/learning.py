@@ -43,7 +43,7 @@ class ReplayCounters:
 
 
 class LearntUnit:
-    """The learned properties of one unit, besides the recordings themselves."""
+    """The properties of one unit that were learned from its recordings."""
 
     def __init__(self) -> None:
         self.situations = Situations()
@@ -54,9 +54,10 @@ class LearntUnit:
         self.request_lengths: dict[int, set[int]] = {}  # non-standard function -> recorded lengths
         self.writable: set[Cell] = set()
         self.refused_writes: dict[tuple[int, int, int], Recorded] = {}
-        self.most_read: dict[int, int] = {}  # function -> most cells ever answered
-        self.least_refused: dict[int, int] = {}  # function -> fewest cells ever refused with 03
-        self.latency: dict[int, tuple[int, float]] = {}  # function -> number, sum
+        self.most_read: dict[int, int] = {}  # function -> the largest number of cells that was ever answered
+        # function -> the smallest number of cells that was ever refused with 03
+        self.least_refused: dict[int, int] = {}
+        self.latency: dict[int, tuple[int, float]] = {}  # function -> number of reads, and the sum of their latencies
         self.by_situation: dict[int, dict[bytes, OutcomeColumn]] = {0: {}}  # while learning
         self.columns = self.by_situation[0]  # the columns of the present situation
         self.addresses: dict[Table, list[int]] | None = (

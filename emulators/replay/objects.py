@@ -101,8 +101,8 @@ class RecordedObjects:
         self._values: dict[Key, list[bytes]] = {}
         self._answers: dict[Key, list[bytes]] = {}
         self._next: dict[Key, int] = {}
-        self._sent: set[Key] = set()  # by TPDO
-        self._given: set[Key] = set()  # by SDO
+        self._sent: set[Key] = set()  # objects whose values the node sent in TPDOs
+        self._given: set[Key] = set()  # objects whose values the node returned to SDO uploads
         self._count = 0
         self._written: set[Key] = set()
         self._transfer: tuple[Key, bool, bytearray] | None = None

@@ -123,7 +123,7 @@ class CanBus:
         if len(sender.queue) == 1 and node not in self._wire.off:
             self._wire.waiting[node] = sender
             if self._next is not None and now_ns <= self._next.start_ns:
-                self._next = None  # it takes part in that arbitration
+                self._next = None  # the new frame takes part in the next arbitration
         return True
 
     def withdraw(self, node: int, can_ids: Collection[int], now_ns: int) -> list[CanFrame]:

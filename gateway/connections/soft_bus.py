@@ -26,7 +26,7 @@ SEND_BUFFER_BYTES = 8 * 1024
 
 
 class SoftBus(can.BusABC):
-    """python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
+    """The class for python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
 
     `bitrate` (bit/s) is checked against the bus's; 0 accepts any. With `fd` it also sends and receives CAN FD frames,
     and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames are received, with
@@ -118,7 +118,9 @@ class SoftBus(can.BusABC):
         except can.CanOperationError:
             if not self._is_shutdown:
                 raise
-        threading.Event().wait(max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)  # never set
+        threading.Event().wait(
+            max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
+        )  # an event that is never set
         return None
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -185,7 +187,7 @@ class SoftBus(can.BusABC):
             except can.CanTimeoutError:
                 raise  # CanTimeoutError is also an OSError, through TimeoutError
             except BlockingIOError:
-                pass  # filled up between select and send
+                pass  # the buffer was filled between select and send
             except (OSError, ValueError) as e:
                 raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
 

@@ -85,7 +85,7 @@ class _TappedBytes(ByteConnection):
         super().__init__(inner.inbound, endpoint, inner.max_pending)
         self._inner, self.local = inner, inner.local
         self._observers = observers
-        for chunk in inner.inbound.data_stream:  # arrived while opening
+        for chunk in inner.inbound.data_stream:  # these chunks arrived while the connection was opened
             observers.saw_bytes(endpoint, Direction.RECEIVED, chunk)
         inner.on_arrival = self._arrived
 
@@ -101,7 +101,7 @@ class _TappedBytes(ByteConnection):
 
     def _arrived(self, chunk: bytes) -> None:
         self._observers.saw_bytes(self.endpoint, Direction.RECEIVED, chunk)
-        if self.on_arrival is not None:  # another tapped connector around this one
+        if self.on_arrival is not None:  # a different tapped connector wraps this one
             self.on_arrival(chunk)
 
     # Return the inner connection's own coroutine: a coroutine around it would cost time at every wake-up.

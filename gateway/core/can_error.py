@@ -19,7 +19,7 @@ CLASS_BUS_OFF = 0x040
 CLASS_BUS_ERROR = 0x080
 CLASS_RESTARTED = 0x100
 CLASS_COUNTERS = 0x200
-"""Bytes 6 and 7 hold TEC and REC."""
+"""The class bit which says that bytes 6 and 7 hold TEC and REC."""
 
 _OVERFLOW, _ACTIVE = 0x01, 0x40
 _WARNING = {"rx": 0x04, "tx": 0x08}

@@ -91,12 +91,12 @@ class _End(Generic[T]):
         self.endpoint = endpoint
         self.max_pending = max_pending
         self.on_arrival: Callable[[T], None] | None = None
-        """Called with every item when it arrives, whether or not it is read later (a tap). It must not feed, read or
-        raise.
+        """A function that is called with every item when it arrives, whether or not it is read later (a tap). It must not
+        feed, read or raise.
         """
         self.intercept: Callable[[T], bool] | None = None
-        """Called with each item before any other code sees it. It returns True if it took the item, and may then pass
-        it on with `feed_through`.
+        """A function that is called with each item before any other code sees it. It returns True if it took the item, and may
+        then pass it on with `feed_through`.
         """
         self.local = ""
         """The local address, ``HOST:PORT``, if the medium has such addresses."""

@@ -304,4 +304,4 @@ class ControlClient:
         try:
             await self._writer.wait_closed()
         except OSError:
-            pass  # the peer was gone already
+            pass  # the peer had already closed the connection

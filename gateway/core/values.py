@@ -37,7 +37,7 @@ class RESPONSE(DATA):
 
 @dataclass(frozen=True, slots=True)
 class MEASUREMENT(RESPONSE):
-    """Sampled values."""
+    """The response with the values that a sensor has sampled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Quality(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a value is not good. Small integers, so that they fit into the process image."""
+    """The reason why a value is not good. The members are small integers, so that they fit into the process image."""
 
     NONE = 0
     NEVER_READ = 1

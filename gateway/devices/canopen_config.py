@@ -43,7 +43,7 @@ class RpdoConfig:
 
 @dataclass(frozen=True)
 class CanopenNodeConfig:
-    """How a node is booted.
+    """The settings with which a node is booted.
 
     `identity` is the expected identity, and `configuration` the configuration that the node has to hold, from the DCF `dcf`.
     `lss` is the LSS address by which the node gets its node ID if no node on the bus has that ID. `tpdos` are the TPDOs of the

@@ -52,9 +52,9 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     online: bool
     """Whether the device answers and is the expected one."""
     error: str
-    """Why the device is not online, or which problem it has; empty if it has none."""
+    """The reason why the device is not online, or its problem; empty if it has none."""
     identity_error: str
-    """How the device differs from the one in the system file; empty if it does not differ."""
+    """The difference between the device and the one in the system file; empty if they do not differ."""
     polls: int
     errors: int
     """The number of polls that failed, and of PDOs that were malformed."""

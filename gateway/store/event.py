@@ -37,7 +37,7 @@ class Kind(IntEnum):
     PAYLOAD = 5
     """`value` is a RESPONSE as it was received (bytes); `name` is the program or device that sent it."""
     LOSS = 6
-    """`value` is the number of events that were never stored; `name` is the reason."""
+    """Events were lost: `value` is the number of events that were never stored, and `name` is the reason."""
 
 
 Value = None | int | float | str | bytes

@@ -31,7 +31,7 @@ async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | N
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)
     check_place(place)
     try:
-        from fieldtwin.gateway.store.postgres_knowledge import PostgresKnowledge  # an extra
+        from fieldtwin.gateway.store.postgres_knowledge import PostgresKnowledge  # its library is an extra
     except ModuleNotFoundError as e:
         raise UsageError("PostgreSQL needs an extra", hint=install_hint("postgres")) from e
     return await PostgresKnowledge.open(place)

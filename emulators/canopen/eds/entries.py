@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fieldtwin.emulators.canopen.eds import codec
 
 Key = tuple[int, int]
-"""(index, subindex)."""
+"""The address of an object: (index, subindex)."""
 
 VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 

@@ -120,7 +120,9 @@ class PdoParameters:
         )
 
     def _read_mapping(self) -> tuple[Mapped, ...]:
-        """Return the mapping; empty if it exceeds a PDO's length (a data sheet can have invalid defaults)."""
+        """Return the mapping of the PDO. It is empty if the objects exceed the length of a PDO, because a data sheet can have
+        invalid defaults.
+        """
         count = self._data.number(self.map_index)
         entries = tuple(Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1))
         return entries if sum(entry.bits for entry in entries) <= MAX_BITS else ()

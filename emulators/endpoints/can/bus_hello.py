@@ -48,7 +48,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class BusHello:
-    """Request and answer; fields that do not apply are 0."""
+    """A request to join the bus, or the bus's answer to it. Fields that do not apply are 0."""
 
     bitrate: int
     version: int = VERSION

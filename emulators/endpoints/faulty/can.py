@@ -48,7 +48,7 @@ class FaultyCan(CanConnection):
         return await self.inner.recv()
 
     def send_at_once(self, frame: CanFrame) -> bool:
-        """Do the same as `inner` while no fault is active; otherwise return False, because a fault may delay frames."""
+        """Queue a frame as `inner` does while no fault is active. Otherwise return False, because a fault may delay frames."""
         return self._inner_at_once is not None and not self._faults.active and self._inner_at_once(frame)
 
     async def send(self, frame: CanFrame) -> None:

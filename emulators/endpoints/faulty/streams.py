@@ -81,7 +81,7 @@ class FaultyEnd(ByteConnection):
             self._show(FrameDirection.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
-        """Do the same as `PtyEnd.answer`."""
+        """Send a reply as `PtyEnd.answer` does, after the faults were applied to it."""
         assert self._pty is not None
         for n, piece in enumerate(self._apply_to_reply(data, after_s)):
             await (self._pty.answer(piece, after_s) if n == 0 else self._pty.write(piece))

@@ -1,4 +1,4 @@
-"""Bytes after a frame that belong to no frame."""
+"""A disturbance that adds bytes after a frame. These bytes do not belong to any frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bytes before a frame, as on a floating line that no device drives."""
+"""A disturbance that adds bytes before a frame, as on a floating line that no device drives."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class UnitCounters:
     naks: int = 0
     """Exception responses with code 07 (CPT6)."""
     overruns: int = 0
-    """Messages that arrived faster than the unit could take them (CPT8). Only a fault can cause one in an emulator."""
+    """Messages that arrived faster than the unit could take them (CPT8). In an emulator, only a fault causes such a message."""
 
     @property
     def messages(self) -> int:

@@ -114,7 +114,9 @@ class Declared:
         self._lengths = lengths or {}
 
     def request_shape(self, head: bytes | bytearray) -> Shape | None:
-        """Do the same as the function `request_shape`, and also use the lengths declared by the addressed unit."""
+        """Return the shape of a request as the function `request_shape` does, and also use the lengths that the addressed unit
+        declares.
+        """
         shape = request_shape(head)
         if shape is None:
             length = self._lengths.get(head[0], {}).get(head[1])

@@ -91,7 +91,7 @@ class Drive(DeviceModel):
         self._homing: HomingPath | None = None
         self._homed = 0  # bits of the statusword in homing mode
         self._wanted: int | None = None  # the demand value of cyclic synchronous position
-        self._torque: float | None = None  # of cyclic synchronous torque, after its first use
+        self._torque: float | None = None  # the demand value of cyclic synchronous torque; None before its first use
         self._seen: frozenset[int] = frozenset()
 
     # -- interface for the mechanics of a twin ------------------------------------------------------------------------
@@ -137,7 +137,9 @@ class Drive(DeviceModel):
     # -- state machine ------------------------------------------------------------------------------------------------
 
     def _by_itself(self, now_ns: int, objects: Objects) -> None:
-        """Process the events that are due since the last step: the end of the self-test, the end of a ramp."""
+        """Process the events that have become due since the last step, without a command: the end of the self-test, and the
+        end of a ramp.
+        """
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
             self._go(TransitionCause.INITIALISED, now_ns, objects)

@@ -147,7 +147,7 @@ class AdapterConnection(CanConnection):
                 remote=message.is_remote_frame,
                 error=message.is_error_frame,
                 dlc=min(message.dlc, 8),
-                t_ns=self._clock.monotonic_ns(),  # the drivers' time stamps have other origins
+                t_ns=self._clock.monotonic_ns(),  # the time stamps of the drivers begin at different times
             )
         except Desync:
             self.malformed += 1
@@ -221,12 +221,17 @@ def _open(endpoint: Endpoint, words: dict[str, Any]) -> can.BusABC:
     channel: str | int = int(endpoint.path) if endpoint.path.isdigit() else endpoint.path
     try:
         return can.Bus(interface=endpoint.interface, channel=channel, ignore_config=True, **words)
-    except (can.CanInterfaceNotImplementedError, ImportError, NameError, AttributeError) as e:  # Kvaser's: NameError
+    except (
+        can.CanInterfaceNotImplementedError,
+        ImportError,
+        NameError,
+        AttributeError,
+    ) as e:  # the driver of Kvaser raises NameError
         raise _no_driver(endpoint, e) from e
     except (TypeError, ValueError) as e:
         raise UsageError(f"{endpoint}: the driver of {endpoint.interface} refuses these settings", got=str(e)) from e
     except (can.CanError, OSError) as e:
-        if "library not found" in str(e):  # PCAN's
+        if "library not found" in str(e):  # the message of the driver of PCAN
             raise _no_driver(endpoint, e) from e
         if "busy" in str(e).lower() or "in use" in str(e).lower():
             raise EndpointBusy("the adapter is held by another program", where=str(endpoint), hint=str(e)) from e

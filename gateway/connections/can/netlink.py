@@ -95,5 +95,5 @@ def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
         length, kind = _ATTRIBUTE.unpack_from(data, at)
         if length < _ATTRIBUTE.size or at + length > len(data):
             return
-        yield kind & 0x3FFF, data[at + _ATTRIBUTE.size : at + length]  # the top bits are flags
+        yield kind & 0x3FFF, data[at + _ATTRIBUTE.size : at + length]  # the two highest bits of the type are flags
         at += (length + 3) & ~3

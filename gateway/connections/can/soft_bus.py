@@ -105,7 +105,7 @@ class SoftBusConnection(CanConnection):
                     self._progress.clear()
                     await self._progress.wait()
         except TimeoutError:
-            pass  # a slow bus: it sends the rest later
+            pass  # the bus is slow and sends the rest later
         self.feed_lost(closed_locally(self.endpoint))
         self._progress.set()
         self.inbound.data_stream.clear()

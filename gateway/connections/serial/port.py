@@ -113,7 +113,7 @@ def _cannot_open(endpoint: Endpoint, number: int, text: str) -> Unreachable:
         return Unreachable("there is no such serial port", where=where, hint=_ports_hint())
     if number in (errno.EACCES, errno.EPERM):
         return Unreachable("no permission for the port", where=where, hint=_group_hint(endpoint.path))
-    if number == errno.ENOTTY or "Could not configure port" in text:  # pyserial gives this one no number
+    if number == errno.ENOTTY or "Could not configure port" in text:  # this error of pyserial has no number
         return Unreachable("this is not a serial port", where=where, hint=_ports_hint())
     return Unreachable(f"cannot open the port: {os.strerror(number) if number else text}", where=where)
 

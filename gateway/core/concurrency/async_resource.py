@@ -21,7 +21,7 @@ class AsyncResource(ABC):
     async def _start(self) -> None:
         """Start the parts, in order."""
 
-    async def _stop(self) -> None:  # noqa: B027  # most have nothing to do then
+    async def _stop(self) -> None:  # noqa: B027  # most resources have nothing to do here
         """Do what has to happen before the first part is ended. The default does nothing."""
 
     async def __aenter__(self) -> Self:

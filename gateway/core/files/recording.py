@@ -35,7 +35,7 @@ MAX_LINE_BYTES = 65_536
 """Longer lines are refused: the longest Modbus exchange takes about 1,100 bytes."""
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""Of the last two flags, each operating system has only one."""
+"""The flags for a new file. Of the last two flags, each operating system has only one."""
 
 _OTHER_FILES = (
     (b'{"fieldtwin_dump"', " but a dump: fieldtwin infer, diff and report read it"),
@@ -44,12 +44,14 @@ _OTHER_FILES = (
 """Files that users give by mistake, recognised by their first bytes."""
 
 BLOCK_BYTES = 4 * MAX_LINE_BYTES
-"""Bytes of a recording of exchanges that are read in one block."""
+"""The number of bytes of a recording of exchanges that are read in one block."""
 
 Kind = Literal["exchanges", "signals"]
 Source = Literal["measured", "synthetic", "imported"]
 ExchangeError = Literal["timeout", "crc", "desync", "lost"]
-"""Why an exchange has no reply: timeout, wrong check sum, a frame that did not answer the request, or a lost connection."""
+"""The reason why an exchange has no reply: timeout, wrong check sum, a frame that did not answer the request, or a lost
+connection.
+"""
 
 
 def looks_like_another_file(path: Path) -> bool:
@@ -100,7 +102,7 @@ class RecordedExchange(msgspec.Struct, frozen=True, gc=False):
 
 
 class SignalRow(msgspec.Struct, frozen=True, gc=False):
-    """All signals at one time, in the header's order; NaN for a signal without a value."""
+    """The values of all signals at one time, in the header's order; NaN for a signal without a value."""
 
     t_s: float
     values: tuple[float, ...]

@@ -25,8 +25,8 @@ from fieldtwin.gateway.core.image.snapshot import Message, RegionFlag, Snapshot
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
-"""Number of attempts of a reader before it gives up for now. With four slots, a read needed 0.0015 further attempts on
-average.
+"""The number of attempts after which a reader returns its last snapshot. With four slots, a read needed 0.0015 further attempts
+on average.
 """
 
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality but no value

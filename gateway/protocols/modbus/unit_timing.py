@@ -50,7 +50,7 @@ class UnitTiming:
         self._has_broadcast = has_broadcast
         self._paces: dict[int, UnitPace] = {}
         self.have_pauses = False
-        """Whether any unit needs pauses."""
+        """Whether at least one unit needs pauses."""
         self.spaced: dict[int, int] = {}
         """By unit ID: the end of its pause, in ns."""
         self.timeouts_ns: dict[int, int] = {}

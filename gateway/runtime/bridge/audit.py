@@ -60,4 +60,4 @@ class WriteRecord:
         try:
             self._audit.note(action, device, by=by, result=result, unit=unit, pdu=pdu, **details)
         except Unreachable:
-            self.lost += 1  # counted; the next write does not start without a record
+            self.lost += 1  # the missing record is counted; the next write does not start without a record

@@ -93,7 +93,7 @@ class BridgeConfig:
     in_flight: int = 16
     idle_s: float = 0.0
     keep_trying: bool = True
-    """Whether the bridge keeps trying to open a port that cannot be opened; otherwise this is an error."""
+    """Whether the bridge repeats its attempts if its port cannot be opened. Otherwise the first failure is an error."""
 
     @property
     def buses(self) -> set[str]:

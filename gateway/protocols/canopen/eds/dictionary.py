@@ -67,7 +67,9 @@ class DictionaryEntry:
 
 @dataclass(frozen=True, slots=True)
 class ObjectDictionary:
-    """All entries by (index, subindex), in order. `mended` lists the repairs that the file needed."""
+    """The object dictionary of a device: all entries by (index, subindex), in order. `mended` lists the repairs that the file
+    needed.
+    """
 
     entries: Mapping[tuple[int, int], DictionaryEntry]
     vendor_name: str = ""

@@ -72,7 +72,7 @@ class SdoBlockUpload(SdoUpload):
         self._switch_bytes = switch_bytes
         self._in_blocks = False
         self._crc = False
-        self._good = 0  # of the present sub-block
+        self._good = 0  # the last segment of the present sub-block that arrived in sequence
         self._surplus = 0  # consecutive segments that were not the one expected
         self._repeats = 0
         self._nudged = False

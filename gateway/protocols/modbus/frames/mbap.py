@@ -46,7 +46,8 @@ class MbapFramer(Framer):
         return _HEADER.size + pdu_length
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
-        self._transaction = self._transaction % 0xFFFF + 1  # broken servers always answer with 0 (case MB-056)
+        # 0 is not used, because broken servers always answer with 0 (case MB-056)
+        self._transaction = self._transaction % 0xFFFF + 1
         self._unit = unit
         self._awaiting = True
         self._seen = ""

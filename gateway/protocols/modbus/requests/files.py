@@ -91,7 +91,7 @@ class WriteFileRecords(Request[WriteReply]):
         if not self.groups:
             raise UsageError("no file records to write", expected="at least one group")
         for file, record, values in self.groups:
-            FileSpan(file, record, len(values))  # for its checks
+            FileSpan(file, record, len(values))  # its constructor checks the range
             for value in values:
                 check_range("record value", value, 0, 0xFFFF)
         check_range("bytes of the request", len(self.encode()) - 2, 1, _MOST_WRITE_BYTES)

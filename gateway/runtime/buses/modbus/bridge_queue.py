@@ -35,7 +35,7 @@ class BridgeRequest:
     done: Callable[[ForwardedReply | FieldtwinError], None]
     wanted: Callable[[], bool]
     before: Callable[[], None] = lambda: None
-    """Called before each attempt, just before it is sent. An error that it raises ends the request."""
+    """A function that is called just before each attempt is sent. An error that it raises ends the request."""
     deferred: bool = False
 
 

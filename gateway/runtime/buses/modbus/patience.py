@@ -23,7 +23,7 @@ class Patience:
         self._turns = turns
         self._latency = latency
         self._alarm_until_ns = 0
-        """Until this time, devices that answer are polled with shortened timeouts, because one of them stopped
+        """The time until which devices that answer are polled with shortened timeouts, because one of them stopped
         answering."""
 
     def restate(self, config: BusConfig) -> None:

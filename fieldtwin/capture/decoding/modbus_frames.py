@@ -173,7 +173,7 @@ def _by_its_byte_count(head: bytearray, size: int, expected: Expected | None) ->
 
 
 class AsciiSplitter(Splitter):
-    """ASCII (SL 2.5.2): from a colon to LF."""
+    """Splits one direction of a Modbus ASCII line into frames. A frame begins with a colon and ends with LF (SL 2.5.2)."""
 
     def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         found = []

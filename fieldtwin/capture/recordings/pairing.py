@@ -279,7 +279,9 @@ class SerialPairer(Pairer):
 
 
 class HalfDuplexPairer(SerialPairer):
-    """A line without known directions: a frame that can be the answer to the last request is taken for it."""
+    """Pairs requests and replies of a serial line whose recording does not say which side sent a byte. A frame that can be the
+    reply to the last request is treated as that reply, and every other frame as a request.
+    """
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
         found: list[RecordedExchange] = []

@@ -51,7 +51,9 @@ def name_of(settings: SerialSettings) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ScanStep:
-    """One stretch of a scan: these units at these settings (None: no serial line). `request_chars` for its time."""
+    """One part of a scan: the unit IDs that are asked with one setting of the serial line (None: not a serial line).
+    `request_chars` is the length of a request in characters, from which `seconds` follows.
+    """
 
     settings: SerialSettings | None
     units: tuple[int, ...]

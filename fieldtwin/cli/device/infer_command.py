@@ -45,7 +45,11 @@ def command(
     fieldtwin emulate ./meter.yaml --on tcp://127.0.0.1:1502
     """
     if out is not None and out.exists():
-        raise FileInvalid("the file already exists", path=str(out))
+        raise FileInvalid(
+            "the file already exists",
+            path=str(out),
+            hint="choose another name, or remove the file: the draft replaces no file",
+        )
     loaded = [_load(path, unit) for path in dumps]
     inference = infer(series_of(loaded))
     if inference.series.passes < FEWEST_PASSES:

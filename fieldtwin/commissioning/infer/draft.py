@@ -7,16 +7,18 @@ does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from fieldtwin.commissioning.dump.coverage import STATE_KEYS, STATE_NAMES
 from fieldtwin.commissioning.dump.file import Dump
 from fieldtwin.commissioning.infer.fields import Interpretation, Level
 from fieldtwin.commissioning.infer.infer import BIT_TABLES, Inference, Series
 from fieldtwin.commissioning.infer.joint import toggled_bits
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, gap_text
 from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
@@ -37,7 +39,7 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
         f"device: draft/{slug}",
         f'source: "drafted by fieldtwin infer from {len(dumps)} dump{"s" if len(dumps) > 1 else ""}"',
         "protocol: modbus",
-        f"factory: {{unit: {unit}}}",
+        _factory(dumps[0].header, unit),
         "numbering: sent",
         *_limits(dumps, series),
     ]
@@ -47,6 +49,17 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
         lines.append(f"# left out: {more_bits} bits; an emulator of this draft refuses them")
     lines += ["tags:", *tags, *bits] if tags or bits else ["tags: {}"]
     return "\n".join(lines) + "\n"
+
+
+def _factory(header: Mapping[str, Any], unit: int) -> str:
+    """Return the line with the unit ID and, for a serial line, the settings with which the dump reached the device.
+
+    A recording does not name its line.
+    """
+    endpoint = Endpoint.parse(header["endpoint"]) if "endpoint" in header else None
+    stated = dict(endpoint.params) if endpoint is not None and endpoint.is_serial else {}
+    settings = [f"{key}: {stated[key]}" for key in ("baudrate", "frame") if key in stated]
+    return f"factory: {{{', '.join([*settings, f'unit: {unit}'])}}}"
 
 
 def checked(text: str, path: Path) -> DeviceProfile:

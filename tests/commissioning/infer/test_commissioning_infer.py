@@ -308,3 +308,23 @@ def test_dumps_of_two_units_or_of_nothing_are_refused(tmp_path: Path) -> None:
         series_of([load_dump(tmp_path / "a"), load_dump(tmp_path / "b")])
     with pytest.raises(FileInvalid, match="without values"):
         series_of([load_dump(tmp_path / "c")])
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "expected"),
+    [
+        ("rtu:/dev/ttyUSB0?baudrate=9600&frame=8E1", "factory: {baudrate: 9600, frame: 8E1, unit: 17}"),
+        ("rtu:/dev/ttyUSB0?baudrate=9600", "factory: {baudrate: 9600, unit: 17}"),
+        ("tcp://192.0.2.1:502", "factory: {unit: 17}"),
+    ],
+)
+def test_draft_has_the_serial_settings_of_the_dump(tmp_path: Path, endpoint: str, expected: str) -> None:
+    path = tmp_path / "dump"
+    path.write_text(
+        f'{{"fieldtwin_dump":2,"protocol":"modbus","endpoint":"{endpoint}","address":17,"ranges":[]}}\n'
+        '{"pass":0,"at":"2026-01-01T00:00:00+00:00"}\n{"read":"holding:0","hex":"0001","us":1}\n{"ended":"x"}\n'
+    )
+    dumps = [load_dump(path)]
+    text = draft_profile(infer(series_of(dumps)), dumps)
+    assert expected in text.splitlines()
+    checked(text, tmp_path / "p.yaml")

@@ -59,3 +59,6 @@ def test_the_command_finds_the_counter_of_a_recording(tmp_path: Path) -> None:
     readings = json.loads(done.stdout)
     assert "uint32" in json.dumps(readings)
     assert "CDAB" in draft.read_text()
+    again = CliRunner().invoke(command, [str(path), "-o", str(draft)])
+    assert isinstance(again.exception, FileInvalid)
+    assert "choose another name" in str(again.exception)

@@ -20,6 +20,7 @@ if str(Path(__file__).parent) not in sys.path:
 
 from case_pages import case_pages  # noqa: E402
 from cli_page import cli_page  # noqa: E402
+from contents import KINDS, LINK, with_indexes  # noqa: E402
 from explain_page import explain_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
 from league import league_page  # noqa: E402
@@ -34,13 +35,6 @@ PAPERS = {  # file of the repository: page of the book
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
 }
-KINDS = {
-    "tutorials": "Tutorials",
-    "how-to": "How-to guides",
-    "reference": "Reference",
-    "explanation": "Explanation",
-}
-"""The folders of docs/, which are the four parts of the sidebar."""
 FOLDERS = {"docs/decisions": "decisions/README.md", "docs": "index.md", "examples": "tutorials/README.md"}
 FOLDERS |= {f"docs/{kind}": f"{kind}/README.md" for kind in KINDS}
 GENERATED = (
@@ -49,7 +43,6 @@ GENERATED = (
     *("reference/cases/README.md", "reference/troubleshooting.md", "reference/studio-operations.md"),
 )
 
-_LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 _FENCE = re.compile(r"^(```+|~~~+)")
 
 
@@ -87,7 +80,7 @@ def with_links(text: str, source: str, page: str, book: dict[str, str]) -> tuple
             here = os.path.relpath(target, Path(page).parent).replace(os.sep, "/")
             return f"{match[1]}{here}{match[3] or ''}{match[4]}"
 
-        lines.append(_LINK.sub(turned, line))
+        lines.append(LINK.sub(turned, line))
     return "".join(lines), beside
 
 
@@ -105,44 +98,6 @@ def _target(link: str, source: str, number: int, book: dict[str, str], beside: d
         raise BrokenLink(f"{source}:{number}: nothing is at {link}")
     beside[wanted] = wanted.removeprefix("docs/") if wanted.startswith("docs/") else f"files/{wanted}"
     return beside[wanted]
-
-
-def contents(page: str, text: str, book: set[str]) -> str:
-    """Return the hidden table of contents of an index page.
-
-    The book's first page lists the four kinds, the decisions and the papers. The README.md of a folder lists the pages of this
-    folder: first those to which it links, in that order, then all others by name. A folder below it is listed as its README.md.
-    """
-    folder = Path(page).parent.as_posix()
-    if page == "index.md":
-        project = ["decisions/README.md", *PAPERS.values()]
-        first = [f"{kind}/README.md" for kind in KINDS]
-        top = {name for name in book if "/" not in name or (name.count("/") == 1 and name.endswith("/README.md"))}
-        others = sorted(top - {*first, *project, page})
-        return _toctree([*first, *others]) + _toctree([name for name in project if name in book], "Project")
-    if Path(page).name != "README.md":
-        return ""
-    names = {name for name in book if Path(name).parent.as_posix() == folder}
-    names |= {name for name in book if Path(name).parent.parent.as_posix() == folder and Path(name).name == "README.md"}
-    linked = [os.path.normpath(Path(folder, link).as_posix()) for _, link, _, _ in _LINK.findall(text)]
-    ordered = [name for name in dict.fromkeys(linked) if name in names]
-    ordered += sorted(names - {*ordered})
-    return _toctree([os.path.relpath(name, folder) for name in ordered if name != page])
-
-
-def _toctree(names: list[str], caption: str = "") -> str:
-    entries = [name.removesuffix(".md") for name in names]
-    options = [":hidden:", *([f":caption: {caption}"] if caption else [])]
-    return "\n".join(["", "```{toctree}", *options, "", *entries, "```", ""])
-
-
-def list_of(folder: str, title: str, texts: dict[str, str]) -> str:
-    """Return an index page of a folder that has none: its title, and the titles of its pages."""
-    lines = [f"# {title}", ""]
-    for page in sorted(page for page in texts if Path(page).parent.as_posix() == folder):
-        heading = next((line[2:] for line in texts[page].splitlines() if line.startswith("# ")), Path(page).stem)
-        lines.append(f"- [{heading}]({Path(page).name})")
-    return "\n".join([*lines, ""])
 
 
 def generated() -> dict[str, str]:
@@ -171,17 +126,10 @@ def stage(target: Path) -> None:
         for name, place in beside.items():
             (target / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, target / place)
-    for page, text in with_indexes(texts).items():
+    for page, text in with_indexes(texts, [*PAPERS.values()]).items():
         _write(target / page, text)
     left_out = shutil.ignore_patterns("__pycache__", ".*")
     shutil.copytree(ROOT / "examples", target / "files" / "examples", ignore=left_out, dirs_exist_ok=True)
-
-
-def with_indexes(texts: dict[str, str]) -> dict[str, str]:
-    """Return all pages of the book with an index page for each kind, and with tables of contents."""
-    missing = {f"{kind}/README.md": list_of(kind, title, texts) for kind, title in KINDS.items()}
-    texts = missing | texts
-    return {page: text + contents(page, text, {*texts}) for page, text in texts.items()}
 
 
 def _write(path: Path, text: str) -> None:

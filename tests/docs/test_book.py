@@ -57,6 +57,15 @@ def test_every_page_is_in_one_table_of_contents(tmp_path):
     assert sorted(listed) == sorted(page for page in pages if page.as_posix() != "index.md")
 
 
+def test_pages_of_a_kind_are_grouped_by_the_subjects_of_its_index():
+    index = "# Reference\n\n## Files\n\n- [A](a.md), and [b](b.md) *\n\n## One page\n\n[c](c.md) and [a](a.md)\n"
+    texts = {f"reference/{name}.md": f"# {name}\n" for name in ("a", "b", "c", "left")}
+    pages = book.with_indexes(texts | {"reference/README.md": index}, [])
+    assert pages["reference/README.md"] == f"{index}\n```{{toctree}}\n:hidden:\n\nsubject-files\nc\nleft\n```\n"
+    expected = "# Files\n\n- [A](a.md), and [b](b.md)\n\n```{toctree}\n:hidden:\n\na\nb\n```\n"
+    assert pages["reference/subject-files.md"] == expected
+
+
 def test_every_page_lies_in_the_folder_of_its_kind():
     folders = {page.relative_to(ROOT / "docs").parts[0] for page in (ROOT / "docs").rglob("*.md")}
     assert folders - {"troubleshooting", "troubleshooting.md"} == {*book.KINDS, "decisions", "index.md"}

@@ -44,6 +44,10 @@ class Probe(Protocol):
         """Learn that the current value represents `word`; return False while there is no value."""
         ...
 
+    def latest_text(self) -> str:
+        """Return the latest registers or the latest line, for a message; empty if there were none."""
+        ...
+
 
 class Classifier:
     """A classifier of readings. A reading is any text; it learns how the correct words look, and recognises the poison value
@@ -100,6 +104,9 @@ class RegisterProbe:
     def learn(self, word: Word) -> bool:
         return self._classifier.learn(word)
 
+    def latest_text(self) -> str:
+        return self._classifier.latest
+
     async def run(self) -> None:
         """Poll until cancelled. A server that cannot be reached yields no value."""
         while True:
@@ -155,6 +162,7 @@ class OutputProbe:
         self._forms: dict[str, set[int]] = {}
         self._lines = _Lines()
         self._learns = True
+        self._latest_line = ""
         self.on_shown: OnShown = lambda word, text: None
 
     def learn(self, word: Word) -> bool:
@@ -165,12 +173,17 @@ class OutputProbe:
             self._learns = False
         return word in self._seen
 
+    def latest_text(self) -> str:
+        return self._latest_line
+
     def feed(self, text: str, log: bool = False) -> None:
         """Add text of the output or of the log."""
         for line in self._lines.feed(text, log):
             self._line(line, log)
 
     def _line(self, line: str, log: bool) -> None:
+        if not log and line.strip():
+            self._latest_line = line.strip()[:SHOWN_CHARACTERS]
         numbers = _ANY_NUMBER.findall(line)
         form = _ANY_NUMBER.sub("\0", line.strip())
         words = [self._word(number) for number in numbers]
@@ -205,14 +218,20 @@ class MarkedOutputProbe:
         self._value = re.compile(re.escape(mark) + r"\s*([^\s,;:\"'(){}\[\]]+)")
         self._classifier = classifier
         self._lines = _Lines()
+        self._latest_line = ""
         self.on_shown: OnShown = lambda word, text: None
 
     def learn(self, word: Word) -> bool:
         return self._classifier.learn(word)
 
+    def latest_text(self) -> str:
+        return self._latest_line
+
     def feed(self, text: str, log: bool = False) -> None:
         """Add text of the output or of the log."""
         for line in self._lines.feed(text, log):
+            if not log and line.strip():
+                self._latest_line = line.strip()[:SHOWN_CHARACTERS]
             for reading in self._value.findall(line):
                 known = reading if _ANY_NUMBER.fullmatch(reading) else ""
                 self.on_shown(self._classifier.word(known), reading)

@@ -185,8 +185,12 @@ class ClientRun(Generic[C]):
         await asyncio.sleep(TRAIL_S)
         probe = self.probe
         if not await self._until(lambda: probe.learn(word), self.plan.patience_s):
-            held = f"the device holds {self._held}"
-            raise Unreachable("the probe never showed the device's value, or shows the same for all values", hint=held)
+            raise Unreachable(
+                "the probe never showed the device's value, or shows the same for all values",
+                expected=f"the register {self._held}, as a whole number or converted without rounding",
+                got=repr(probe.latest_text()) if probe.latest_text() else "nothing",
+                hint="a program with the probe `output` has to flush each line",
+            )
 
     async def _silence(self) -> float:
         """Return the time in seconds from an unanswered request to the next request; 0 if there was none."""

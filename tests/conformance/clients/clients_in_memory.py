@@ -44,6 +44,9 @@ class Told:
     def learn(self, word: Word) -> bool:
         return self._classifier.learn(word)
 
+    def latest_text(self) -> str:
+        return self._classifier.latest
+
     def publish(self, text: str) -> None:
         self.on_shown(self._classifier.word(text), text)
 

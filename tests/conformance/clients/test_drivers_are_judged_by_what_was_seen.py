@@ -23,6 +23,7 @@ from fieldtwin.emulators.modbus.rtu.receiver import crc16, with_crc
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.results.model import Verdict
 
 pytestmark = pytest.mark.long
@@ -185,6 +186,28 @@ def test_a_marked_text_that_is_not_a_number_is_not_a_value() -> None:
     assert probe.learn(Word.FIRST)
     probe.feed("level=11.11\nlevel=None\nlevel=-1\nlevel=3333\nlevel=0\n7\n")
     assert [word for word, _ in seen[1:]] == [Word.FIRST, Word.NONE, Word.NONE, Word.POISON, Word.OTHER]
+
+
+async def _rounds(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+    line = await net.open_bytes(endpoint)
+    while True:
+        await line.write(with_crc(REQUEST))
+        await _frame(line, sees_short=True)
+        publish("0.0")
+        await asyncio.sleep(0.05)
+
+
+def test_a_client_that_rounds_the_value_is_told_what_the_probe_showed() -> None:
+    with pytest.raises(Unreachable, match=r"expected the register 2222, .*without rounding; got '0\.0'"):
+        judge(_rounds, LINE, "MB-021")
+
+
+def test_output_probes_keep_the_latest_line_for_a_message() -> None:
+    for probe in (OutputProbe({}), MarkedOutputProbe("level=", Classifier(3333))):
+        assert probe.latest_text() == ""
+        probe.feed("level=1\nlevel of 0.0 degC\n\n")
+        probe.feed("an error\n", log=True)
+        assert probe.latest_text() == "level of 0.0 degC"
 
 
 def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:

@@ -82,9 +82,11 @@ class SiteDevice:
 
     @property
     def polled(self) -> dict[str, int]:
-        """Return the poll groups with their periods in ms: the watched value's every 500 ms, the others every second."""
+        """Return the poll groups with their periods in ms: the watched value's and `fast` every 500 ms, the others every second."""
         first = self.watched.poll if self.watched is not None else ""
-        groups = {g: 500 if g == first else 1000 for g in self.profile.groups if g == first or g not in NEVER_POLLED}
+        groups = {
+            g: 500 if g in (first, "fast") else 1000 for g in self.profile.groups if g == first or g not in NEVER_POLLED
+        }
         return {"inbox": 200, **groups} if self.profile.inbox is not None else groups
 
 

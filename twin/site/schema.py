@@ -26,14 +26,14 @@ class SiteModel(BaseModel):
 class SyncForm(SiteModel):
     """The SYNC producer of a CANopen bus (CiA 301: objects 1006h and 1019h of the master)."""
 
-    period_ms: Milliseconds
+    period_ms: Milliseconds = Field(examples=[100])
     counter: int = Field(default=0, ge=0, le=240, description="highest value of the counter, 2 to 240; 0: no counter")
 
 
 class BusForm(SiteModel):
     """A bus or serial line, and the endpoint at which the plant opens it."""
 
-    url: str
+    url: str = Field(examples=["tcp://192.0.2.7:502"])
     timeout_ms: Milliseconds = 1000
     retries: int = Field(default=1, ge=0, le=10)
     bitrate: int = Field(
@@ -64,7 +64,7 @@ class PollForm(SiteModel):
     By default groups with the same period are spread over it.
     """
 
-    every_ms: Milliseconds
+    every_ms: Milliseconds = Field(examples=[500])
     phase_ms: int | None = Field(default=None, ge=0, lt=3_600_000)
 
 
@@ -75,14 +75,14 @@ class HeartbeatForm(SiteModel):
     """
 
     producer_ms: Milliseconds | None = None
-    consumer_ms: Milliseconds
+    consumer_ms: Milliseconds = Field(examples=[1500])
 
 
 class TpdoForm(SiteModel):
     """The tags that a TPDO of the node carries, and how often it is sent."""
 
     map: list[Name] = Field(min_length=1, max_length=8)
-    event_ms: Milliseconds
+    event_ms: Milliseconds = Field(examples=[200])
 
 
 class RpdoForm(SiteModel):
@@ -106,8 +106,8 @@ class IdentityForm(SiteModel):
 class DeviceForm(SiteModel):
     """A device of the system."""
 
-    profile: str
-    bus: Name
+    profile: str = Field(examples=["eastron-sdm630"])
+    bus: Name = Field(examples=["line1"])
     unit: int | None = Field(default=None, ge=1, le=255)
     node: int | None = Field(default=None, ge=1, le=127)
     expect: dict[Name, str] = {}
@@ -160,7 +160,7 @@ class WatchdogForm(SiteModel):
 class InputForm(SiteModel):
     """The source of a program's input, and the value that the program sees while that source is bad."""
 
-    tag: TagName
+    tag: TagName = Field(examples=["meter.frequency"])
     if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
@@ -177,7 +177,7 @@ class StartForm(SiteModel):
 class ProgramForm(SiteModel):
     """A program of the PLC: its source, and the tags to which its variables are bound."""
 
-    source: str
+    source: str = Field(examples=["control.st"])
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[Name, InputForm] = {}
@@ -234,7 +234,7 @@ class ServedTagForm(SiteModel):
 class ServeForm(SiteModel):
     """The process image as Modbus TCP registers, for HMIs and other controllers."""
 
-    url: str
+    url: str = Field(examples=["tcp://127.0.0.1:1502"])
     unit: int = Field(default=1, ge=0, le=255)
     tags: dict[TagName, ServedTagForm] = Field(min_length=1)
     if_bad: Literal["exception", "nan"] = "exception"
@@ -264,7 +264,7 @@ class AllowForm(SiteModel):
 class BridgeForm(SiteModel):
     """A bridge: lets Modbus TCP clients, or the client on a serial line (`url`), reach units of the system's buses."""
 
-    url: str
+    url: str = Field(examples=["tcp://127.0.0.1:1502"])
     to: Name | None = Field(default=None, description="the bus whose units keep their unit IDs")
     units: dict[int, str] = Field(default={}, description="the client's unit ID -> BUS/UNIT")
     allow: list[AllowForm] = Field(default=[], description="default: reading functions, from this host")
@@ -319,7 +319,7 @@ class SystemForm(SiteModel):
     """A plant. The physical twin and its prototype read the same file, byte for byte."""
 
     fieldtwin: Literal[1]
-    system: Name
+    system: Name = Field(examples=["mysite"])
     buses: dict[Name, BusForm] = Field(min_length=1)
     devices: dict[Name, DeviceForm] = Field(min_length=1)
     plc: PlcForm = Field(default=PlcForm(), description="default: no programs, only the gateway")
@@ -416,7 +416,7 @@ class EmulatedForm(SiteModel):
 class PrototypeForm(SiteModel):
     """Which devices are emulated, from which data source, and at which endpoint. The plant never opens this file."""
 
-    prototype_of: str
+    prototype_of: str = Field(examples=["mysite.yaml"])
     unmapped: Literal["refuse"] = "refuse"
     seed: int = 1
     buses: dict[Name, BusMappingForm | Literal["plant"]]

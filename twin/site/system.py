@@ -161,7 +161,7 @@ def _device(
         raise file.error((*loc, "bus"), f"a transmitter on {buses[d.bus].endpoint}", expected="a bus on TCP")
     address, wanted = (d.node, "node") if is_can else (d.unit, "unit")
     if address is None:
-        raise file.error(loc, f"the key {wanted!r} is missing", expected=f"the device's {wanted} id")
+        raise file.error(loc, f"the key {wanted!r} is missing", expected=f"{wanted}: 1, the device's {wanted} ID")
     config = DeviceConfig(
         name=name,
         profile=profile,

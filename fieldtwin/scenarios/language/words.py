@@ -115,10 +115,10 @@ class Cycle(_Form):
 
 
 class ScenarioForm(_Form):
-    scenario: str = Field(min_length=1, max_length=200)
+    scenario: str = Field(min_length=1, max_length=200, examples=["The tank overflows"])
     about: str = ""
     requirements: list[str] = []
-    system: str
+    system: str = Field(examples=["mysite.yaml"])
     prototype: str | None = None
     seed: int | None = None
     start: Literal["fresh"] | None = None

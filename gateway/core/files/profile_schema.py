@@ -193,8 +193,8 @@ class EffectForm(Strict):
 class ProfileForm(Strict):
     """A device profile."""
 
-    device: str = Field(pattern=r"^[a-z0-9-]+/[a-z0-9.-]+$")
-    source: str
+    device: str = Field(pattern=r"^[a-z0-9-]+/[a-z0-9.-]+$", examples=["acme/t-1000"])
+    source: str = Field(examples=["manual, revision 3"])
     protocol: Literal["modbus", "canopen"]
     factory: Factory = Factory()
     numbering: Literal["printed", "sent"] = "printed"

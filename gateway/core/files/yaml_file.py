@@ -10,12 +10,13 @@ every key and value are kept, so that a validation error can name them.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -272,7 +273,8 @@ def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) 
         return file.error(loc, f"unknown key {str(loc[-1])!r}{_inside(loc)}", expected=expected, hint=hint)
     if error["type"] == "missing":
         missing = str(error["loc"][-1])
-        return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}")
+        expected = _example(model, error["loc"][:-1], missing)
+        return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}", expected=expected)
     if error["type"] == "too_short" and not error["input"]:
         return file.error(loc, f"{name} is empty")
     got = "" if error["type"] == "value_error" else repr(error["input"])[:80]
@@ -297,7 +299,12 @@ def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
-    """Return the keys of the model at `loc`, found from the annotations, or those of the top level if there is no model."""
+    """Return the keys of the model at `loc`, or those of the top level if there is no model."""
+    return [info.alias or name for name, info in _model_at(model, loc).model_fields.items()]
+
+
+def _model_at(model: type[BaseModel], loc: tuple[Key, ...]) -> type[BaseModel]:
+    """Return the model at `loc`, found from the annotations, or `model` if there is none."""
     current: Any = model
     for part in loc:
         fields = getattr(current, "model_fields", None)
@@ -306,8 +313,25 @@ def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
         for candidate in _models_in(current):
             current = candidate
             break
-    fields = getattr(current, "model_fields", None) or model.model_fields
-    return [info.alias or name for name, info in fields.items()]
+    return current if getattr(current, "model_fields", None) else model
+
+
+def _example(model: type[BaseModel], loc: tuple[Key, ...], key: str) -> str:
+    """Return a missing key with a value that it may have, or with the kind of its value."""
+    fields = _model_at(model, loc).model_fields
+    info = next((info for name, info in fields.items() if key in (name, info.alias)), None)
+    if info is None:
+        return ""
+    choices = [str(value) for value in get_args(info.annotation)] if get_origin(info.annotation) is Literal else []
+    examples = [each if isinstance(each, str) else json.dumps(each) for each in info.examples or []]
+    if choices:
+        return f"{key}: {' or '.join(choices)}"
+    return f"{key}: {examples[0]}, for example" if examples else _KINDS.get(_kind_of(info.annotation), "")
+
+
+def _kind_of(annotation: Any) -> str:
+    kind = get_origin(annotation) or annotation
+    return {str: "string"}.get(kind, getattr(kind, "__name__", ""))
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

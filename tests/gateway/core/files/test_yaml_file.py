@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES, load, parse, validate
@@ -20,10 +21,18 @@ class Inner(BaseModel):
     names: list[str] = []
 
 
+class Line(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+    url: str = Field(examples=["tcp://h:502"])
+    kind: Literal["rtu", "ascii"]
+    speeds: list[int] = Field(examples=[[9600]])
+
+
 class Outer(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     title: str
     inner: dict[str, Inner] = {}
+    line: Line | None = None
 
 
 @pytest.mark.parametrize(
@@ -74,6 +83,15 @@ def test_errors_point_at_their_position(text: str, line: int, column: int, told:
         ("title: x\ninner:\n  a:\n    cuont: 1\n", 4, 5, "did you mean 'count'?"),
         ("inner: {}\n", 1, 1, "'title' is missing"),
         ("title: x\ninner:\n  a: {names: []}\n", 3, 3, "'count' is missing in 'inner.a'"),
+        ("title: x\ninner:\n  a: {}\n", 3, 3, "'count' is missing in 'inner.a'; expected a whole number"),
+        ("title: x\nline: {}\n", 2, 1, "'url' is missing in 'line'; expected url: tcp://h:502, for example"),
+        ("title: x\nline: {url: a}\n", 2, 1, "'kind' is missing in 'line'; expected kind: rtu or ascii"),
+        (
+            "title: x\nline: {url: a, kind: rtu}\n",
+            2,
+            1,
+            "'speeds' is missing in 'line'; expected speeds: [9600], for example",
+        ),
         ("title: 5\n", 1, 1, "title; expected text; got 5"),
         ("title: x\ninner:\n  a: {count: 1, names: [b, 5]}\n", 3, 28, "inner.a.names.1"),
         ("title: x\ninner:\n  a: {count: true}\n", 3, 7, "inner.a.count; expected a whole number; got true"),

@@ -82,7 +82,7 @@ class SiteDevice:
 
     @property
     def polled(self) -> dict[str, int]:
-        """Return the poll groups with their periods in ms: the watched value's and `fast` every 500 ms, the others every second."""
+        """Return the periods of the poll groups in ms: of the watched value and of `fast` 500 ms, of the others a second."""
         first = self.watched.poll if self.watched is not None else ""
         groups = {
             g: 500 if g in (first, "fast") else 1000 for g in self.profile.groups if g == first or g not in NEVER_POLLED

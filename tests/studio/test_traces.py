@@ -9,9 +9,11 @@ from typing import Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from studio_rig import VIEW, studio, until
 from trace_rig import FAILED_NS, FAULT_NS, TITLE, failing_trace, folded, lines_of
 
+from fieldtwin.cli.test.test_command import command
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.studio.replay.replay import Replay
 
@@ -150,6 +152,38 @@ def test_a_description_cannot_make_studio_serve_another_file(client: httpx.Clien
     finally:
         other.unlink()
         moved.unlink()
+
+
+@pytest.mark.long
+def test_the_trace_of_a_network_shows_its_systems_under_the_names_of_the_network(
+    client: httpx.Client, folder: Path
+) -> None:
+    scenario, trace = folder / "net.scenario.yaml", folder / "net.jsonl"
+    steps = "  - expect: {tag: east.modem.address, quality: good, within: 3s}\n  - pause: 2s\n"
+    scenario.write_text(f"scenario: a network\nsystem: ocean_network\nsteps:\n{steps}")
+    ran = CliRunner().invoke(command, [str(scenario), "--trace", str(trace)], standalone_mode=False)
+    assert ran.return_value == 0, ran.output
+    name = "/traces/net.jsonl"
+    until(lambda: get(client, name)["behind_bytes"] == 0, "the trace is read to its end")
+    about, state = get(client, name), get(client, f"{name}/state")
+    assert {"west.ctd", "middle.optode", "east.modem"} <= set(about["system"]["devices"])
+    tags = folded(trace, "tag", about["end_ns"])
+    assert state["gateway"]["tags"]["west.ctd.sample_count"]["value"] == tags["west.ctd.sample_count"]["value"]
+    assert "west.adapt.state" in state["plc"]["variables"]
+    assert {"west.line", "east.lan"} <= {row["bus"] for row in get(client, f"{name}/frames", count=200)["rows"]}
+
+
+@pytest.mark.long
+def test_the_trace_of_processes_says_that_its_programs_are_not_described(tmp_path: Path) -> None:
+    failing_trace(tmp_path, "--target", "local", "--html", "report.html")
+    with studio("fail.jsonl", folder=tmp_path) as running, running.client() as client:
+        until(lambda: client.get(TRACE).json()["behind_bytes"] == 0, "the trace is read to its end")
+        about = get(client, TRACE)
+        assert (about["verdict"], about["growing"], about["programs_described"]) == ("failed", False, False)
+        [failed] = about["failed"]
+        state = get(client, f"{TRACE}/state", at_ns=failed["t_ns"])
+        assert state["gateway"]["tags"]["ctd.pressure"]["quality"] == "bad"
+        assert "Show the trace at this instant" in client.get(f"{TRACE}/report").text
 
 
 def test_only_known_traces_are_opened_and_the_role_view_may_read_them(client: httpx.Client, folder: Path) -> None:

@@ -24,6 +24,7 @@ from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.results.trace_about import TraceAbout, write_results
 from fieldtwin.run.benches.control_bench import ControlBench, Where
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
@@ -32,6 +33,7 @@ from fieldtwin.run.processes.with_controller import WithController
 from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.virtual_scenario import prototype_of, reproduce, run_virtual
 from fieldtwin.run.virtual.group_kinds import kind_named
+from fieldtwin.run.virtual.trace_description import begin_bare_description, described_checks
 from fieldtwin.scenarios.bench import Can, NothingKnown
 from fieldtwin.scenarios.judging.runner import ScenarioRunner, gone
 from fieldtwin.scenarios.judging.target_limits import refusal
@@ -103,6 +105,17 @@ def _attempt(
         refused = _of_a_foreign_controller(scenario)
     sink = open_sink(trace_file) if trace_file is not None else None
     trace = Trace(sink=sink)
+    seed = target.seed if target.seed is not None else scenario.form.seed
+    about: TraceAbout | None = None
+    if trace_file is not None and not refused:
+        about = begin_bare_description(
+            trace_file,
+            scenario.system,
+            target=target.name,
+            seed=seed,
+            profiles=scenario.profiles,
+            title=scenario.form.scenario,
+        )
     trace.listen(collector.feed)
     if progress is not None:
         progress.begin(scenario, target.name, trace)
@@ -121,9 +134,13 @@ def _attempt(
         result = result_of(scenario, target.name, Verdict.ERROR, checks=checks, reason=str(e), trace=events)
     finally:
         trace.close()
+    if trace_file is not None:
+        checks_of = described_checks(result.checks)
+        write_results(trace_file, about, verdict=result.verdict.value, reason=result.reason, checks=checks_of)
     return replace(
         result,
-        seed=target.seed if target.seed is not None else scenario.form.seed,
+        seed=seed,
+        trace_file="" if about is None else str(trace_file),
         reproduce=reproduce(scenario, *_words(target)) + _with_words(target),
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),

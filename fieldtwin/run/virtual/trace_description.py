@@ -12,8 +12,10 @@ from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.results.model import CheckResult
 from fieldtwin.results.trace_about import VERSION, CheckAbout, ProgramAbout, TraceAbout, write_about
+from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.twin.prototype.group import SystemGroup
+from fieldtwin.twin.site.system import System
 
 
 def begin_description(
@@ -24,15 +26,40 @@ def begin_description(
     seed: int,
     profiles: Iterable[Path] = (),
     title: str = "",
-) -> TraceAbout | None:
-    """Write the description of a run that begins, and return it. None for several systems, whose tags have other names.
+) -> TraceAbout:
+    """Write the description of a run that begins, and return it. Several systems are described as one, under the group's names.
 
     Raises `FileInvalid`.
     """
-    if group.kind:
-        return None
-    [bench] = running.systems.values()
-    system = bench.system
+    system = group.whole
+    systems = {group.members[name].prefix: bench for name, bench in running.systems.items()}
+    target = next(iter(systems.values())).target
+    bare = begin_bare_description(trace, system, target=target, seed=seed, profiles=profiles, title=title)
+    about = msgspec.structs.replace(
+        bare,
+        programs={
+            f"{prefix}{name}": _under(prefix, program)
+            for prefix, bench in systems.items()
+            for name, program in _programs(bench).items()
+        },
+        stale_after_ms={
+            f"{prefix}{tag}": limit
+            for prefix, bench in systems.items()
+            for driver in bench.run.gateway.drivers.values()
+            for tag, limit in stale_limits(driver).items()
+        },
+    )
+    write_about(trace, about)
+    return about
+
+
+def begin_bare_description(
+    trace: Path, system: System, *, target: str, seed: int | None, profiles: Iterable[Path], title: str
+) -> TraceAbout:
+    """Write the description of a run whose gateway and PLC are other processes: without programs and age limits.
+
+    Raises `FileInvalid`.
+    """
     about = TraceAbout(
         version=VERSION,
         run=os.urandom(8).hex(),
@@ -41,17 +68,24 @@ def begin_description(
         system_hash=system.hash,
         profiles=[str(folder.absolute()) for folder in profiles],
         title=title,
-        target=bench.target,
+        target=target,
         seed=seed,
-        programs=msgspec.convert(
-            describe_programs(bench.run.plc.programs, bench.run.plc.sources), dict[str, ProgramAbout]
-        ),
-        stale_after_ms={
-            tag: limit for driver in bench.run.gateway.drivers.values() for tag, limit in stale_limits(driver).items()
-        },
     )
     write_about(trace, about)
     return about
+
+
+def _programs(bench: VirtualBench) -> dict[str, ProgramAbout]:
+    return msgspec.convert(describe_programs(bench.run.plc.programs, bench.run.plc.sources), dict[str, ProgramAbout])
+
+
+def _under(prefix: str, program: ProgramAbout) -> ProgramAbout:
+    """Return the description of a program whose tags have a prefix."""
+    variables = {
+        name: msgspec.structs.replace(variable, tag=f"{prefix}{variable.tag}") if variable.tag else variable
+        for name, variable in program.variables.items()
+    }
+    return msgspec.structs.replace(program, variables=variables)
 
 
 def described_checks(checks: Iterable[CheckResult]) -> list[CheckAbout]:

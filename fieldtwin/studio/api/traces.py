@@ -54,6 +54,7 @@ async def get_trace(request: Request) -> dict[str, Any]:
         "failed": [msgspec.to_builtins(check) for check in failed_checks(replay.log, about)],
         "marks": marks,
         "marks_left_out": left_out,
+        "programs_described": about is not None and bool(about.programs),
         "frames": True,
         "system": replay.description,
     }

@@ -12,6 +12,7 @@ from fieldtwin.studio.live.observed import describe_system
 from fieldtwin.studio.replay.replayed_history import ReplayedHistory
 from fieldtwin.studio.replay.trace_frames import TraceFrames
 from fieldtwin.studio.replay.trace_log import TraceLog
+from fieldtwin.twin.prototype.group import load_group
 from fieldtwin.twin.site.data_files import search_path
 from fieldtwin.twin.site.system import System, load_system
 
@@ -97,7 +98,7 @@ def _system_of(path: Path, about: TraceAbout | None, named: str, profiles: tuple
     Reading a system file executes nothing, and opens no endpoint.
     """
     if named:
-        return load_system(named, profiles)
+        return _load(named, profiles)
     if about is None:
         raise FileInvalid(
             "the trace has no description, so its system is not known",
@@ -117,4 +118,10 @@ def _system_of(path: Path, about: TraceAbout | None, named: str, profiles: tuple
             expected=str(own),
             hint="name the system: fieldtwin studio TRACE --system SYSTEM",
         )
-    return load_system(str(found), folders)
+    return _load(str(found), folders)
+
+
+def _load(name: str, profiles: tuple[Path, ...]) -> System:
+    """Return a system; the systems of a network as one, under the names that they have in the trace."""
+    group = load_group(name, profiles)
+    return load_system(name, profiles) if group is None else group.whole

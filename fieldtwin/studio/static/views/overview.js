@@ -10,6 +10,7 @@ const NARROW = 236; // width of a device
 const WIDE = 420; // from this width on, a device shows two columns of values with their last minute
 const ROOMY = 280; // in a narrower column the last minute would lie below the texts
 const TALL = 116;
+const LEAST_SCALE = 0.8; // a drawing that does not fit the window is scrolled rather than drawn smaller
 const MOST_VALUES = 3; // in a column
 const GAP = 16;
 const WIDEST = 1240;
@@ -38,7 +39,7 @@ export function Overview({ store }) {
   }
   const height = Math.max(y, 240);
   return html`<h1 class="visually-hidden">Overview of ${store.name}</h1>
-    <svg class="plan" viewBox="0 0 ${total} ${height}" role="group" aria-label="Buses and devices of ${system.name}">
+    <svg class="plan" viewBox="0 0 ${total} ${height}" style=${{ minHeight: `${Math.round(LEAST_SCALE * height)}px` }} role="group" aria-label="Buses and devices of ${system.name}">
       <${Controller} store=${store} height=${height - 14} />
       ${buses.map((bus) => html`<${BusLine} store=${store} bus=${bus} seen=${gateway?.buses[bus.name]} columns=${columns} box=${box} />`)}
     </svg>

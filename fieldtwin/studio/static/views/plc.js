@@ -35,6 +35,10 @@ export function Plc({ store }) {
       <div class="stack">
         ${programs.map((name) => html`<${Program} key=${name} store=${store} name=${name} plc=${plc} changes=${transitions?.[name] ?? []} />`)}
         ${!store.isTrace && tags}
+        ${store.isTrace &&
+        programs.length > 0 &&
+        !store.about.programs_described &&
+        html`<p class="card soft">The trace does not describe its programs, so their diagrams and sources are missing. A run in virtual time describes them.</p>`}
       </div>
       <div class="stack">
         ${store.isTrace && tags}

@@ -137,9 +137,9 @@ def test_a_page_takes_the_start_time_of_the_new_run_when_a_run_starts_under_the_
     try:
         write_record(folder, structs.replace(first, started_ns=time.monotonic_ns() - 5000 * 10**9, capture=""))
         page.go(f"{observatory.url}#/again/trends")
-        page.sees("main", "Recorded since 1:2")
+        page.sees("main", "recorded since 1:2")
         write_record(folder, structs.replace(first, started_ns=time.monotonic_ns(), capture=""))
-        page.sees("main", "Recorded since 0:0")
+        page.sees("main", "recorded since 0:0")
     finally:
         page.go(f"{observatory.url}#/observatory/overview")
         page.sees(".plan", "ctd")  # the page of the other instance is closed before its folder is gone

@@ -83,7 +83,7 @@ class Attachment:
         self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
         self.field_channel = Channel(found.dir / FIELD_SOCKET, "field simulator")
         self.history_from_ns = clock.monotonic_ns()
-        """Since when changes of tags are recorded: the start of the observation."""
+        """Since when changes of tags are known: the start of the observation, or an earlier one that the gateway remembers."""
         self.changes_lost = 0
         """Changes of tags that the gateway had dropped before they were read."""
         self.frames: FrameLog | None = None
@@ -93,6 +93,8 @@ class Attachment:
         self.history = TagHistory(tags)
         self._seen_change: int | None = None
         """The number of the latest change that was read, None before the first answer."""
+        self._is_complete = False
+        """Whether the changes that the gateway remembers from an earlier observation have been read."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
         self._plc_values = PlcValues(found.dir)
@@ -219,20 +221,25 @@ class Attachment:
         self.fault_marks.look(self.field, self.now_ns())
 
     async def _read_tags(self) -> None:
-        names = self.history.names() if self._seen_change is None else []
+        names = [] if self._is_complete else self.history.names()
         since = self._seen_change or 0
         answer = await self.gateway_channel.call("watch", since=since, names=names, refused=NONE_OF_THEM)
         if answer["last"] < since:  # another gateway, whose numbers begin again
-            self._seen_change = None
+            self._seen_change, self._is_complete = None, False
             return
-        for name, (value, quality, reason, t_ns) in answer["tags"].items():
-            self.history.add(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
+        if self._seen_change is None and answer["changes"]:
+            self.history_from_ns = min(self.history_from_ns, answer["changes"][0][1])
         changes = []
         for _, t_ns, name, value, quality, reason in answer["changes"]:
             point = self.point(name, t_ns, value, quality, reason)
             self.history.add(name, point)
             changes.append([name, *point])
-        self.changes_lost += answer["dropped"]
+        if not self._is_complete and (not changes or answer["changes"][-1][0] == answer["last"]):
+            for name, (value, quality, reason, t_ns) in answer["tags"].items():
+                self.history.add_present(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
+            self._is_complete = True
+        if self._seen_change is not None:  # what it forgot before this observation is not lost to it
+            self.changes_lost += answer["dropped"]
         self._seen_change = answer["changes"][-1][0] if answer["changes"] else answer["last"]
         if changes:
             self.updates.publish({"type": "tags", "changes": changes})

@@ -39,6 +39,17 @@ class TagHistory:
         if points is not None:
             points.append(point)
 
+    def add_present(self, name: str, point: Point) -> None:
+        """Add the present value of a tag, unless its latest change says the same. It is never older than that change."""
+        points = self._points.get(name)
+        if points is None:
+            return
+        latest = points[-1] if points else None
+        if latest is None:
+            points.append(point)
+        elif latest[1:] != point[1:]:
+            points.append(point._replace(t_ns=max(point.t_ns, latest.t_ns)))
+
     def names(self) -> list[str]:
         """Return the names of all tags."""
         return list(self._points)

@@ -81,9 +81,17 @@ export function Trends({ store, query }) {
     ${!chosen.length && html`<p class="empty">Add a tag to see it over time.</p>`}
     <${Marks} started=${started} marks=${marks} view=${view} setView=${setView} />
     <p class="soft">
-      ${store.isTrace ? "The dashed line is the present instant." : `Recorded since ${clock(Math.max(0, store.about.history_from_ns - started))} after the start of the run.`}
+      ${store.isTrace ? "The dashed line is the present instant." : since(store.about)}
       ${" "}Shaded times have no good value. Drag to zoom, click for a cursor, double-click to reset both.
     </p>`;
+}
+
+const LATE_NS = 5e9; // a run that is started with Studio is observed within this time
+
+/** Since when there are values, and why not from the beginning of the run. */
+function since({ history_from_ns: from, started_ns: started }) {
+  const said = `Values are recorded since ${clock(Math.max(0, from - started))} after the start of the run`;
+  return from - started < LATE_NS ? `${said}.` : html`${said}, when Studio first observed it. A run with <code>--studio</code> has them from its beginning.`;
 }
 
 const middle = ([from, to], share) => from + (to - from) * share;

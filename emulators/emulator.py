@@ -24,7 +24,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 Answer = Callable[[bytes, int], bytes | None]
-"""``(request, now_ns) -> response``, None for silence: a unit's processing of a request PDU."""
+"""A function ``(request, now_ns) -> response`` by which a unit answers a request PDU; None for silence."""
 
 
 class Emulator(Device, ABC):

@@ -21,12 +21,13 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost
 
 OnFrame = Callable[[Direction, int, bytes], None]
-"""``(direction, t_ns, adu)`` for each complete ADU. The directions are those of the gateway: SENT is a request. `t_ns`
-is monotonic: when the request was complete, or when the last byte of the reply was handed over. It may not raise.
+"""A function that is called with ``(direction, t_ns, adu)`` for each complete ADU. The directions are those of the gateway:
+SENT is a request. `t_ns` is monotonic: when the request was complete, or when the last byte of the reply was handed over. It
+may not raise.
 """
 
 Latency = Callable[[ServedFrame], float]
-"""Processing time of a device for one exchange, in seconds."""
+"""A function that returns the processing time of a device for one exchange, in seconds."""
 
 
 def as_recorded(line: SerialSettings | None = None) -> Latency:

@@ -24,7 +24,7 @@ ANY_UNIT = (0, 255)
 NO_PATH = 0x0A
 
 Allow = Callable[[int, bytes], bool]
-"""``(unit ID, PDU)`` -> whether this client may send that request."""
+"""A function that is called with the unit ID and the PDU of a request, and returns whether the client may send that request."""
 
 
 class MbapServer:

@@ -36,7 +36,9 @@ MAX_SERVER_DATA = 249
 """The number of bytes of the server ID, and of the data after the run indicator, that fit a reply to 11h together."""
 
 Handler = Callable[[bytes, int], bytes | None]
-"""``(pdu, now_ns)`` -> the response PDU, or None for silence. It may raise a `Refusal` if it has changed nothing."""
+"""A function that is called with the request PDU and now_ns, and returns the response PDU, or None for silence. It may raise a
+`Refusal` if it has changed nothing.
+"""
 
 
 class UnitParts(TypedDict, total=False):

@@ -61,7 +61,9 @@ class Reception:
 
 
 Spoils = Callable[[int, int, bytes], bool]
-"""``spoils(t_ns, listener, payload)``: whether a fault removes a packet at the receiver with that number (from 1)."""
+"""A function ``spoils(t_ns, listener, payload)`` that returns whether a fault removes the packet at the receiver with the
+number `listener` (from 1).
+"""
 
 LOSSES = ("collision", "speaking", "chance", "fault")
 

@@ -270,7 +270,9 @@ class Clients(Protocol):
 Listen = Callable[
     [Endpoint, Callable[[Client], Awaitable[None]], int, Callable[[str], bool], float], Awaitable[Clients]
 ]
-"""``listen(endpoint, on_client, max_clients, admits, idle_s)``. Raises `EndpointBusy` or `Unreachable`."""
+"""A function that starts to listen: ``listen(endpoint, on_client, max_clients, admits, idle_s)``. Raises `EndpointBusy` or
+`Unreachable`.
+"""
 
 
 class CanConnection(_End[CanFrame], ABC):

@@ -193,7 +193,7 @@ class RegisterDriver(DeviceDriver):
         return True
 
     def finish(self, reading: GroupReading) -> None:
-        """Emit what occurred."""
+        """Emit the events that `reading` has collected, such as messages, to the consumers of the driver."""
         for item in reading.items:
             self.emitter.emit(item)
 

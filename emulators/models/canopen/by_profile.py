@@ -23,7 +23,7 @@ MODELS: dict[int, Callable[[], DeviceModel]] = {
 
 
 NO_MODEL = "none"
-"""The user's choice of no model, instead of a number of `MODELS` or the value of 1000h."""
+"""The value by which a user asks for a node without a model, in place of a number of `MODELS`."""
 
 
 def model_for(dictionary: Dictionary, chosen: str | None = None) -> DeviceModel | None:

@@ -186,7 +186,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class DeviceProfile:
-    """A profile, resolved. Dictionaries keep the file's order."""
+    """A device profile with resolved addresses and defaults. Dictionaries keep the file's order."""
 
     path: str
     hash: str

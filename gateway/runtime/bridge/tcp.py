@@ -53,11 +53,13 @@ Answer = bytes | None | asyncio.Future[bytes | None]
 """A response PDU, None for no answer, or a future of either."""
 
 Ask = Callable[[Caller, int, bytes], Answer]
-"""``(caller, unit, request PDU)``. Never waits, and never raises an error because of what a client sends."""
+"""A function that answers a request: ``(caller, unit, request PDU)``. It never waits, and never raises an error because of
+what a client sends.
+"""
 
 
 Refused = Callable[[Caller, int, bytes, int, str], None]
-"""``(caller, unit, request PDU, exception code, reason)``: called with a request that `Ask` never receives."""
+"""A function that is called with a request that `Ask` never receives: ``(caller, unit, request PDU, exception code, reason)``."""
 
 
 def _ignore(caller: Caller, unit: int, pdu: bytes, code: int, why: str) -> None:

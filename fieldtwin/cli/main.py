@@ -208,7 +208,7 @@ def main() -> None:
 
     write_plainly()
     survive_broken_stderr()
-    signal.signal(signal.SIGTERM, _told_to_end)
+    signal.signal(signal.SIGTERM, _end_on_sigterm)
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
@@ -233,13 +233,13 @@ def main() -> None:
         if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
             _bug(e)
         click.echo(f"fieldtwin: {e.filename or 'a file or the output'}: {e.strerror}", err=True)
-        _drop_what_is_unsaid()
+        _discard_unsent_output()
         sys.exit(FileInvalid.exit_code)
     except Exception as e:  # the outermost handler: an exception that arrives here is a bug of fieldtwin
         _bug(e)
 
 
-def _told_to_end(number: int, frame: object) -> NoReturn:
+def _end_on_sigterm(number: int, frame: object) -> NoReturn:
     """Handle SIGTERM for commands that do not handle it: delete temporary files, as after Ctrl-C."""
     sys.exit(128 + number)
 
@@ -254,7 +254,7 @@ def _bug(error: Exception) -> NoReturn:
     sys.exit(BUG)
 
 
-def _drop_what_is_unsaid() -> None:
+def _discard_unsent_output() -> None:
     """Discard buffered output: else Python tries to flush it at exit, fails, and exits with 120."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -15,10 +15,10 @@ from fieldtwin.doctor import host as here
 from fieldtwin.doctor.verdicts import (
     DoctorCheck,
     HostVerdict,
-    judged_can,
-    judged_clock,
-    judged_processor,
-    judged_watches,
+    can_interface_verdict,
+    clock_verdict,
+    processor_verdict,
+    watches_verdict,
 )
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.twin.plant.instance import runtime_root
@@ -132,7 +132,7 @@ def _can() -> DoctorCheck:
             reason,
             "prototypes use the software CAN bus; a plant needs `modprobe can-raw`",
         )
-    return judged_can(here.can_interfaces())
+    return can_interface_verdict(here.can_interfaces())
 
 
 def _realtime() -> DoctorCheck:
@@ -158,15 +158,15 @@ def _files() -> DoctorCheck:
 
 
 def _watches() -> DoctorCheck:
-    return judged_watches(here.kernel_number("fs/inotify/max_user_instances"))
+    return watches_verdict(here.kernel_number("fs/inotify/max_user_instances"))
 
 
 def _processor() -> DoctorCheck:
-    return judged_processor(here.cpu_count(), here.cgroup_quota())
+    return processor_verdict(here.cpu_count(), here.cgroup_quota())
 
 
 def _clock() -> DoctorCheck:
-    return judged_clock(here.clock_state())
+    return clock_verdict(here.clock_state())
 
 
 def _disk() -> DoctorCheck:

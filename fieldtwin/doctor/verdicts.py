@@ -40,7 +40,7 @@ class ClockState:
     year: int
 
 
-def judged_clock(state: ClockState | None) -> DoctorCheck:
+def clock_verdict(state: ClockState | None) -> DoctorCheck:
     """Judge the clock.
 
     Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
@@ -59,7 +59,7 @@ def judged_clock(state: ClockState | None) -> DoctorCheck:
     return DoctorCheck("clock", HostVerdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
 
 
-def judged_can(interfaces: Mapping[str, bool]) -> DoctorCheck:
+def can_interface_verdict(interfaces: Mapping[str, bool]) -> DoctorCheck:
     """Judge the kernel's CAN interfaces; `interfaces` maps each name to whether it is up.
 
     The bit rate has to be set before an interface is brought up, by an authorised user.
@@ -72,7 +72,7 @@ def judged_can(interfaces: Mapping[str, bool]) -> DoctorCheck:
     return DoctorCheck("kernel CAN", HostVerdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
 
 
-def judged_watches(instances: int | None) -> DoctorCheck:
+def watches_verdict(instances: int | None) -> DoctorCheck:
     """Judge the inotify limit.
 
     fieldtwin does not use inotify; udev, journald and systemd need it to announce ports and start services.
@@ -85,7 +85,7 @@ def judged_watches(instances: int | None) -> DoctorCheck:
     return DoctorCheck("inotify", HostVerdict.OK, f"{instances} instances per user")
 
 
-def judged_processor(cpus: int, quota: float | None) -> DoctorCheck:
+def processor_verdict(cpus: int, quota: float | None) -> DoctorCheck:
     """Judge the processors. `quota`: the processors that a cgroup allows, None for no limit.
 
     A quota stops all processes until its period is over.

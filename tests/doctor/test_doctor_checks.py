@@ -13,11 +13,11 @@ from fieldtwin.doctor.host import cgroup_quota, clock_state, cpu_count, join_adv
 from fieldtwin.doctor.verdicts import (
     ClockState,
     HostVerdict,
-    judged_can,
-    judged_clock,
-    judged_processor,
-    judged_watches,
+    can_interface_verdict,
+    clock_verdict,
+    processor_verdict,
     quota_of,
+    watches_verdict,
 )
 
 
@@ -31,7 +31,7 @@ from fieldtwin.doctor.verdicts import (
     ],
 )
 def test_verdict_on_the_clock(state: ClockState | None, verdict: HostVerdict) -> None:
-    check = judged_clock(state)
+    check = clock_verdict(state)
     assert check.verdict is verdict
     assert bool(check.advice) is (verdict is not HostVerdict.OK)
 
@@ -42,17 +42,17 @@ def test_quota_of_a_cgroup(text: str, quota: float | None) -> None:
 
 
 def test_less_than_a_processor_is_reported() -> None:
-    assert judged_processor(8, None).verdict is HostVerdict.OK
-    assert judged_processor(8, 2.0).verdict is HostVerdict.OK
-    tight = judged_processor(8, 0.5)
+    assert processor_verdict(8, None).verdict is HostVerdict.OK
+    assert processor_verdict(8, 2.0).verdict is HostVerdict.OK
+    tight = processor_verdict(8, 0.5)
     assert tight.verdict is HostVerdict.NOTE
     assert "0.5" in tight.found
 
 
 def test_verdict_on_the_inotify_limit() -> None:
-    assert judged_watches(128).verdict is HostVerdict.OK
-    assert judged_watches(None).verdict is HostVerdict.OK
-    assert judged_watches(4).verdict is HostVerdict.NOTE
+    assert watches_verdict(128).verdict is HostVerdict.OK
+    assert watches_verdict(None).verdict is HostVerdict.OK
+    assert watches_verdict(4).verdict is HostVerdict.NOTE
 
 
 def test_the_group_to_join_is_the_ports_own(tmp_path: Path) -> None:
@@ -107,9 +107,9 @@ def test_an_unreadable_folder_is_not_an_internal_error(monkeypatch: pytest.Monke
 
 
 def test_a_can_interface_that_is_down_is_reported() -> None:
-    assert judged_can({}).verdict is HostVerdict.OK
-    assert judged_can({"can0": True, "vcan0": True}).found == "can0, vcan0"
-    down = judged_can({"can0": True, "can1": False})
+    assert can_interface_verdict({}).verdict is HostVerdict.OK
+    assert can_interface_verdict({"can0": True, "vcan0": True}).found == "can0, vcan0"
+    down = can_interface_verdict({"can0": True, "can1": False})
     assert (down.verdict, down.found) == (HostVerdict.NOTE, "can0, can1 (down)")
     assert down.advice == "sudo ip link set can1 up type can bitrate 125000 restart-ms 100"
-    assert judged_can({"vcan0": False}).advice == "sudo ip link set vcan0 up"
+    assert can_interface_verdict({"vcan0": False}).advice == "sudo ip link set vcan0 up"

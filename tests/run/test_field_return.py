@@ -41,7 +41,7 @@ class Field:
 async def met(system: System, port: int, returns: list[bool]) -> FieldReturn:
     client, _ = await connect_control(f"127.0.0.1:{port}", "")
     contact = FieldContact(client, {}, {})
-    contact.life, contact.far_said = "first", {"modem": "tcp://127.0.0.1:5"}
+    contact.life, contact.reported_endpoints = "first", {"modem": "tcp://127.0.0.1:5"}
 
     async def returned(another: bool) -> None:
         returns.append(another)

@@ -51,7 +51,7 @@ program.
 """
 MOST_COMMAND_BYTES = 64
 WRITE_WITHIN_S = 5.0
-MOST_CHANGES_TOLD = 20
+MOST_REPORTED_CHANGES = 20
 PUBLISHED_AT_ONCE = 20_000
 """The largest number of entries that fits into one line of the control channel."""
 
@@ -296,7 +296,7 @@ class GatewayProcess:
                     self._gateway,
                     gateway_config(new, allow_writes=writes, free_ports=free, delegated=self._config.delegated),
                 )
-                self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
+                self._reloads, self._changed = self._reloads + 1, texts[:MOST_REPORTED_CHANGES]
             self._system = new
             if self._config.resolved:  # for a process of the run that starts again later
                 await asyncio.to_thread(write_resolved, Path(self._config.resolved), new)

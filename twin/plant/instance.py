@@ -45,11 +45,11 @@ def runtime_root() -> Path:
     if not hasattr(os, "getuid"):  # Windows
         return Path(tempfile.gettempdir()) / f"fieldtwin-{getpass.getuser()}"
     folder = TEMPORARY / f"fieldtwin-{os.getuid()}"
-    _refuse_a_strangers(folder)
+    _refuse_foreign_folder(folder)
     return folder
 
 
-def _refuse_a_strangers(folder: Path) -> None:
+def _refuse_foreign_folder(folder: Path) -> None:
     """Refuse a folder that another user owns or may write to.
 
     Any user may create a file in /tmp, and the folder's owner could replace its contents, sockets included.
@@ -132,5 +132,5 @@ def capture_path(instance: str) -> Path:
         folder.mkdir(mode=0o700, exist_ok=True)
     except OSError as e:
         raise Unreachable(f"cannot make a folder for captures: {e.strerror}", where=str(folder)) from e
-    _refuse_a_strangers(folder)
+    _refuse_foreign_folder(folder)
     return folder / f"{instance}.capture.jsonl"

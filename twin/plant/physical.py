@@ -203,7 +203,7 @@ def gateway_config(
 
     With `free_ports` it serves and bridges on free ports, so that several gateways can run on one host. Without
     `true_silences` no serial line checks the pauses in RTU frames, because pauses on virtual ports carry no information;
-    `free_ports` implies this by default. The mailboxes of the transmitters in `lent` are delegated to a digital thread.
+    `free_ports` implies this by default. The mailboxes of the transmitters in `delegated` are delegated to a digital thread.
     """
     true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)

@@ -205,7 +205,7 @@ class FieldProcess:
                     await asyncio.gather(asked, running, return_exceptions=True)
                 if self._fresh_asked.is_set() and not stopping.done():
                     self._fresh_asked.clear()
-                    await self._make_anew()
+                    await self._recreate()
 
     async def _end_leases(self) -> None:
         """Remove what a test runner injected as soon as its lease has expired."""
@@ -222,7 +222,7 @@ class FieldProcess:
             except TimeoutError:
                 self._leases.expire(self._clock.monotonic_ns())
 
-    async def _make_anew(self) -> None:
+    async def _recreate(self) -> None:
         """Create all devices again from the same prototype, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
         prototype = _listening_as(self._twin.prototype, old)

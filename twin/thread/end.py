@@ -231,7 +231,7 @@ class ThreadEnd:
                 await self._keep(effect)
             elif isinstance(effect, NoteLost):
                 await self._note_lost(effect)
-            await self._tell(effect.origin)
+            await self._pass_on(effect.origin)
 
     async def _open(self, origin: str) -> None:
         _, last = await self._store.span(origin)
@@ -256,7 +256,7 @@ class ThreadEnd:
             self._lost[effect.origin] = self._lost.get(effect.origin, 0) + end - first + 1
         self.into.noted(effect.origin, effect.first, effect.last, self._clock.monotonic_ns())
 
-    async def _tell(self, origin: str) -> None:
+    async def _pass_on(self, origin: str) -> None:
         """Pass on the next events in order, without gaps except for lost events."""
         through = self.into.through(origin)
         while self._on_events is not None and (told := self._told.get(origin, through)) < through:

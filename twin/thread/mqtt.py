@@ -45,7 +45,7 @@ class _Socket(ssl.SSLSocket):
             raise
 
 
-class _Heard(logging.Handler):
+class _LastMessage(logging.Handler):
     """A log handler that keeps the last message of paho. No other source states why a connection was lost."""
 
     def __init__(self) -> None:
@@ -190,7 +190,7 @@ class MqttCarrier(Carrier):
         side = self._make_side(self._sessions, self._clock.utc_ns() // NS_PER_MS)
         self._sessions += 1
         will = side.will()
-        heard = _Heard()
+        heard = _LastMessage()
         logger = logging.Logger("mqtt", logging.WARNING)  # logger of this session only; nothing is printed
         logger.addHandler(heard)
         client = aiomqtt.Client(

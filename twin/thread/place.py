@@ -28,7 +28,7 @@ MODEM = "modem:"
 MODEM_POLL_MS = 200
 
 
-def lent_transmitter(place: str, system: System) -> str:
+def delegated_transmitter(place: str, system: System) -> str:
     """Return the transmitter whose mailboxes the plant delegates to a thread at `place`; empty for other carriers.
 
     Raises `UsageError` if there is no transmitter, or if several and none is named.
@@ -56,7 +56,7 @@ async def plant_carrier(
 
     Port 0 in the URL chooses a free port. `connector` opens the bus of a modem. Raises `UsageError`.
     """
-    if device := lent_transmitter(place, system):
+    if device := delegated_transmitter(place, system):
         bus = system.buses[system.devices[device].bus]
         return _modem(system, device, bus.endpoint, connector or OsConnector(), clock), place
     if is_broker(place):

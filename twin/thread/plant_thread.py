@@ -46,7 +46,7 @@ from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layou
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.end import ThreadEnd
-from fieldtwin.twin.thread.place import lent_transmitter, plant_carrier
+from fieldtwin.twin.thread.place import delegated_transmitter, plant_carrier
 from fieldtwin.twin.thread.status import PlantThreadStatus
 from fieldtwin.twin.thread.thread import PTtoDTConnection, schema_of
 
@@ -133,12 +133,12 @@ class ImageProcess(PTDigitalThreadProcess):
         for program in self._programs:
             self._value(program, runs, now_ms, offset_ns)
         if dead:
-            self.tell_again()
+            self.share_again()
             return
         for program, period in self._machines.items():
             self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
 
-    def tell_again(self) -> None:
+    def share_again(self) -> None:
         """Share the states again with the next `look`, because the sender of a refused command assumes a wrong state."""
         for program in self._machines:
             self._said.pop(f"{program}.", None)
@@ -190,7 +190,7 @@ class PlantThread:
             store = await open_knowledge(c.store)
             stack.push_async_callback(store.aclose)
             origin = await store.own("plant", system=system.name, prototype=c.prototype, log=secrets.token_hex(4))
-            if delegated := lent_transmitter(c.place, system):
+            if delegated := delegated_transmitter(c.place, system):
                 audit = AuditLog(Path(c.run_dir) / "audit.jsonl", clock)
                 stack.callback(audit.close)
                 audit.note("lend", delegated, by="digital thread", result="the thread uses its mailboxes")
@@ -257,13 +257,13 @@ class PlantThread:
         self._gate.restate(remote=now["remote"], bounds=CommandLimits(least_s, most_s, now["per_minute"]))
         command = self._gate.admit(origin, event)
         if command is None:
-            self._process.tell_again()
+            self._process.share_again()
             return
         if not (await client.call("command", payload=command.data.hex(), by=origin))["taken"]:
             self._gate.share(
                 Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant is switched to local"
             )
-            self._process.tell_again()
+            self._process.share_again()
 
     async def _look(self, connection: PTtoDTConnection, readers: Any) -> None:
         inputs, outputs = readers

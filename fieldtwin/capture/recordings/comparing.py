@@ -165,7 +165,7 @@ class Comparer:
                 kept[0].append(recorded.latency_s)
                 kept[1].append(other.latency_s)
 
-    def is_alike(self, recorded: RecordedExchange, other: RecordedExchange) -> bool:
+    def is_equal(self, recorded: RecordedExchange, other: RecordedExchange) -> bool:
         """Return whether two exchanges are equal by the rules. Counts nothing."""
         if recorded.reply == other.reply and recorded.error == other.error:
             return True
@@ -193,7 +193,7 @@ class Comparer:
 
     def result(self) -> Comparison:
         """Return the result of the comparison."""
-        judge_latencies(self._result, {_service(f): both for f, both in sorted(self._latencies.items())}, self._rules)
+        compare_latencies(self._result, {_service(f): both for f, both in sorted(self._latencies.items())}, self._rules)
         return self._result
 
     def _asked(self, request: bytes) -> DecodedRequest:
@@ -220,9 +220,9 @@ class Comparer:
         elif asked.read_span is None or one.problem or two.problem or not one.read:
             self._differ(recorded, "reply", "", recorded.reply.hex(" "), other.reply.hex(" "))
         else:
-            self._judge_values(recorded, asked.read_span, one, two)
+            self._compare_values(recorded, asked.read_span, one, two)
 
-    def _judge_values(
+    def _compare_values(
         self, recorded: RecordedExchange, span: TouchedSpan, one: DecodedReply, two: DecodedReply
     ) -> None:
         """Compare the values: tags known to the profile, else registers and bits. One difference per exchange is counted."""
@@ -276,7 +276,7 @@ class Comparer:
                 )
 
 
-def judge_latencies(result: Comparison, kept: Mapping[str, tuple[array[float], array[float]]], rules: Rules) -> None:
+def compare_latencies(result: Comparison, kept: Mapping[str, tuple[array[float], array[float]]], rules: Rules) -> None:
     """Fill the rows of `result.latency` and its `timing` from the latencies of each service on both sides."""
     weighed, count = 0.0, 0
     result.latency = []

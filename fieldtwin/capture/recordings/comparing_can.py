@@ -20,7 +20,7 @@ from fieldtwin.capture.recordings.comparing import (
     ReplyDifference,
     Rules,
     Tolerance,
-    judge_latencies,
+    compare_latencies,
     pairs_of,
 )
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -124,7 +124,7 @@ def compare_logs(
             if len(kept[0]) < MAX_LATENCIES:
                 kept[0].append(one.latency_ns / 1e9)
                 kept[1].append(two.latency_ns / 1e9)
-    judge_latencies(result, latencies, rules)
+    compare_latencies(result, latencies, rules)
     if messages:
         _compare_messages(sides[0].kinds, sides[1].kinds, rules, result)
     began_s = max(sides[0].began_ns, 0) / 1e9

@@ -17,7 +17,7 @@ from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.tcp_segments import Conversation, Conversations, PacketCounters, Side
 from fieldtwin.capture.recordings.draft import Drafts
 from fieldtwin.capture.recordings.importing import BadFile, write_drafts
-from fieldtwin.capture.recordings.modbus_conversation import ModbusTalk
+from fieldtwin.capture.recordings.modbus_conversation import ModbusConversation
 from fieldtwin.capture.recordings.pairing import Bad, HalfDuplexPairer, PairCounters, Pairer, SerialPairer
 from fieldtwin.capture.recordings.rotating_file import RotatingFile
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -141,20 +141,20 @@ class PacketImport:
 
     def _said(self, conversation: Conversation, side: Side, data: bytes, t_ns: int, lost: int) -> None:
         talk = conversation.state
-        if not isinstance(talk, ModbusTalk):
+        if not isinstance(talk, ModbusConversation):
             talk = conversation.state = self._talk(conversation)
         self._add(talk, talk.feed(side, data, t_ns, lost))
 
-    def _talk(self, conversation: Conversation) -> ModbusTalk:
+    def _talk(self, conversation: Conversation) -> ModbusConversation:
         def keep(bad: Bad) -> None:
             self._bad.keep(bad, talk.endpoint)
 
-        talk = ModbusTalk(conversation, self._zero_ns, self._ports, keep)
+        talk = ModbusConversation(conversation, self._zero_ns, self._ports, keep)
         return talk
 
     def _ended(self, conversation: Conversation) -> None:
         talk = conversation.state
-        if not isinstance(talk, ModbusTalk):
+        if not isinstance(talk, ModbusConversation):
             return
         self._add(talk, talk.finish())
         if talk.pairer is None:
@@ -162,7 +162,7 @@ class PacketImport:
         else:
             self.summary.pairs.add(talk.pairer.counters)
 
-    def _add(self, talk: ModbusTalk, exchanges: list[RecordedExchange]) -> None:
+    def _add(self, talk: ModbusConversation, exchanges: list[RecordedExchange]) -> None:
         if exchanges and talk.server is not None:
             self._of(talk.endpoint, exchanges)
 

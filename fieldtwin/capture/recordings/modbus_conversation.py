@@ -20,7 +20,7 @@ MAX_UNDECIDED = 600
 """Number of bytes after which a conversation that is not recognised counts as foreign."""
 
 
-class ModbusTalk:
+class ModbusConversation:
     """One conversation. `server` is None until Modbus is recognised; `foreign` means that it is another protocol."""
 
     def __init__(

@@ -15,7 +15,7 @@ from fieldtwin.cli.device.device_options import log_option, logged
 from fieldtwin.cli.device.scan_progress import ScanProgress
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.stop_key import StopKey
-from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line
+from fieldtwin.commissioning.scan.line import LineCheckOptions, LineReport, look_at_line
 from fieldtwin.console import stdout
 from fieldtwin.gateway.wallclock import run as run_precise
 
@@ -48,7 +48,7 @@ def command(endpoint: str, log: Path | None, as_json: bool, **options: Any) -> i
 
     Settings that ENDPOINT leaves open are found from the traffic, if there is any. Exit code 1: there is a sign of a fault.
     """
-    report = run_precise(_look(endpoint, log, LineLook(**options | {"bitrate": options["bitrate"] or 0})))
+    report = run_precise(_look(endpoint, log, LineCheckOptions(**options | {"bitrate": options["bitrate"] or 0})))
     if as_json:
         click.echo(json.dumps(_json(report)))
     else:
@@ -56,7 +56,7 @@ def command(endpoint: str, log: Path | None, as_json: bool, **options: Any) -> i
     return 0 if report.healthy else 1
 
 
-async def _look(endpoint: str, log: Path | None, look: LineLook) -> LineReport:
+async def _look(endpoint: str, log: Path | None, look: LineCheckOptions) -> LineReport:
     with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
         return await look_at_line(endpoint, look, on_progress=show, stop=stop.pressed, taps=taps)
 

@@ -174,7 +174,7 @@ def _live(
             ) as asker:
                 await compare_device(
                     exchanges_of(recording), asker, comparer, unit=device.unit, writes=sending.writes,
-                    wearing=_wearing(target.profile),
+                    wearing=_limited_write_cycles(target.profile),
                     most=sending.most or 0, stop=stop, progress=progress,
                 )  # fmt: skip
 
@@ -233,7 +233,7 @@ def _allow_writes(recording: Path, url: str, sending: LiveOptions) -> None:
         raise NotAllowed("the writes were not confirmed", hint="--yes")
 
 
-def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
+def _limited_write_cycles(profile: DeviceProfile | None) -> set[tuple[str, int]]:
     """Return the items with a limited number of write cycles. Each is written once, and never repeatedly."""
     tags = profile.tags.values() if profile is not None else ()
     return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}

@@ -153,7 +153,7 @@ def modbus_client(
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.modbus.cases import CASES
-    from fieldtwin.conformance.clients.session import Options, judge_modbus_client
+    from fieldtwin.conformance.clients.session import Options, check_modbus_client
 
     cases = [case.about for case in CASES]
     if files.list_only:
@@ -172,7 +172,7 @@ def modbus_client(
         command=argv,
     )
     return _judged(
-        lambda listener: judge_modbus_client(options, listener), "modbus", listen, plan, cases, choice, files
+        lambda listener: check_modbus_client(options, listener), "modbus", listen, plan, cases, choice, files
     )
 
 
@@ -227,7 +227,7 @@ def canopen_master(
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.canopen.cases import CASES
-    from fieldtwin.conformance.clients.session import Options, judge_canopen_master
+    from fieldtwin.conformance.clients.session import Options, check_canopen_master
 
     cases = [case.about for case in CASES]
     if files.list_only:
@@ -249,7 +249,7 @@ def canopen_master(
         bitrate=bitrate,
     )
     return _judged(
-        lambda listener: judge_canopen_master(options, listener), "canopen", listen, plan, cases, choice, files
+        lambda listener: check_canopen_master(options, listener), "canopen", listen, plan, cases, choice, files
     )
 
 

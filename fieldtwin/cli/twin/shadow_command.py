@@ -25,7 +25,7 @@ from fieldtwin.twin.site.system import System, load_system
 STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
 
 
-class ShadowTalk:
+class ShadowOutput:
     """Prints each verdict as it is reached, and changes of the agreed state."""
 
     def __init__(self, *, quiet: bool) -> None:
@@ -105,7 +105,7 @@ async def _run(
     system: System, place: str, instance: Instance, store: str, duration_s: float, as_json: bool
 ) -> dict[str, Any]:
     stop = stop_signal()
-    talks = ShadowTalk(quiet=as_json)
+    talks = ShadowOutput(quiet=as_json)
     shadowing = Shadowing(system, place, instance, store=store, on_verdict=talks)
     shadowing.on_trouble = talks.trouble
     if not as_json:

@@ -13,7 +13,7 @@ import click
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
-from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
+from fieldtwin.cli.twin.shadow_command import ShadowOutput, print_shadow, why_nothing
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
@@ -133,7 +133,7 @@ def command(
     questions = [*([question] if question else []), *questions_of(plans.planner)]
     with Instance(instance or f"{loaded.name}-twin") as here:
         by_hand = [encode_period(period) for period in periods]
-        talks = TwinTalk(quiet=as_json)
+        talks = TwinOutput(quiet=as_json)
         subject = ForkSubject(loaded, folders, prototype_file)
         asking = (
             Asking(subject, WallClock(), timeout_s, talks.asks)
@@ -162,7 +162,7 @@ def command(
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 
-class TwinTalk(ShadowTalk):
+class TwinOutput(ShadowOutput):
     """Prints, in addition, what is simulated, sent and refused."""
 
     def asks(self, command: COMMAND, question: Question) -> None:

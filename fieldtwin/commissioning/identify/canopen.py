@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.access.connection import canopen_at
-from fieldtwin.commissioning.identify.matching import CanClues, Candidate, certain, judge_canopen, rank, summary
+from fieldtwin.commissioning.identify.matching import CanClues, Candidate, certain, rank, rate_canopen, summary
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted
@@ -79,7 +79,7 @@ async def identify_canopen(
         result.conflict = master.conflicts.get(node, "")
     if result.answers:
         result.candidates = rank(
-            judge_canopen(p, _data_sheet(p, node), result.clues) for p in profiles if p.protocol == "canopen"
+            rate_canopen(p, _data_sheet(p, node), result.clues) for p in profiles if p.protocol == "canopen"
         )
     return result
 

@@ -134,7 +134,7 @@ def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
     return ""
 
 
-def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]) -> Candidate:
+def rate_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]) -> Candidate:
     """Return the certainty that the unit is a device of `profile`.
 
     `readings`: tags of its `identify`, and others, by name.
@@ -289,7 +289,7 @@ def _shown(reading: ProfileReading) -> str:
 # -- CANopen ----------------------------------------------------------------------------------------------------------
 
 
-def judge_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: CanClues) -> Candidate:
+def rate_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: CanClues) -> Candidate:
     """Return the certainty that the node is a device of `profile`, whose data sheet is `eds`."""
     told = clues.identity
     if eds is None or told is None:

@@ -17,8 +17,8 @@ from fieldtwin.commissioning.identify.matching import (
     Sureness,
     certain,
     contradicted,
-    judge_modbus,
     rank,
+    rate_modbus,
     summary,
 )
 from fieldtwin.gateway.core.clock import Clock
@@ -205,11 +205,11 @@ async def _compare(client: ModbusClient, result: ModbusIdentity, profile: Device
     others.sort(key=_telling)
     first = [profile.tags[name] for name in keys if profile.tags[name].readable] or others[:4]
     readings = await _read(point, first)
-    verdict = judge_modbus(profile, result.clues, readings)
+    verdict = rate_modbus(profile, result.clues, readings)
     if verdict.against and verdict.sureness is Sureness.RULED_OUT:
         return verdict
     readings |= await _read(point, [t for t in others if t.name not in readings][:MOST_TAGS])
-    return judge_modbus(profile, result.clues, readings)
+    return rate_modbus(profile, result.clues, readings)
 
 
 def _telling(tag: Tag) -> int:

@@ -63,7 +63,7 @@ async def compare_device(
     try:
         await _ask_all(recorded, asker, comparer, dialogue, unit, writes, wearing, most, stop, progress)
     finally:
-        for pair in dialogue.aligned(comparer.is_alike):
+        for pair in dialogue.aligned(comparer.is_equal):
             if pair.recorded is None:
                 comparer.not_compared()
             else:

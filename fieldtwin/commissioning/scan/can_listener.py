@@ -18,7 +18,7 @@ _STUFF = 1.1
 
 
 @dataclass(slots=True)
-class NodeHeard:
+class ObservedNode:
     """A node ID in the traffic.
 
     `state` is from its heartbeat; `period_s` is the time between two heartbeats; `pdos` are by the predefined
@@ -41,14 +41,14 @@ class NodeHeard:
 
 
 @dataclass(slots=True)
-class BusHeard:
+class ObservedBus:
     """The totals of the observation."""
 
     frames: int = 0
     errors: int = 0
     extended: int = 0
     bits: float = 0.0
-    nodes: dict[int, NodeHeard] = field(default_factory=dict)
+    nodes: dict[int, ObservedNode] = field(default_factory=dict)
     sdo_masters: dict[int, int] = field(default_factory=dict)
     """Node -> time (ns) of the last SDO request that another master sent to it."""
     nmt_commands: int = 0
@@ -76,7 +76,7 @@ class BusListener:
     """Feed it every frame that is received."""
 
     def __init__(self) -> None:
-        self.heard = BusHeard()
+        self.heard = ObservedBus()
         self._sync = SyncWatch()
 
     def feed(self, frame: CanFrame, t_ns: int) -> None:
@@ -117,7 +117,7 @@ class BusListener:
     def _of_node(self, function: int, number: int, frame: CanFrame, t_ns: int) -> None:
         if function == 0x700 and (frame.remote or len(frame.data) != 1):
             return
-        node = self.heard.nodes.setdefault(number, NodeHeard())
+        node = self.heard.nodes.setdefault(number, ObservedNode())
         match function:
             case 0x700 if frame.data[0] == 0:
                 node.boot_ups += 1

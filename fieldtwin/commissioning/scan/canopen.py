@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from fieldtwin.commissioning.access.connection import canopen_at, frames_at
 from fieldtwin.commissioning.access.progress import PhaseProgress
-from fieldtwin.commissioning.scan.can_listener import BusHeard, BusListener
+from fieldtwin.commissioning.scan.can_listener import BusListener, ObservedBus
 from fieldtwin.gateway.connections.can.facts import CanFacts, can_facts
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -60,7 +60,7 @@ class CanScan:
     url: str
     bitrate: int = 0
     facts: CanFacts | None = None
-    heard: BusHeard = field(default_factory=BusHeard)
+    heard: ObservedBus = field(default_factory=ObservedBus)
     listened_s: float = 0.0
     nodes: list[FoundNode] = field(default_factory=list)
     blocked: list[int] = field(default_factory=list)

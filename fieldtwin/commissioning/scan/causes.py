@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from fieldtwin.commissioning.scan.can_listener import BusHeard
+from fieldtwin.commissioning.scan.can_listener import ObservedBus
 from fieldtwin.commissioning.scan.listening import LineVerdict
 from fieldtwin.commissioning.scan.settings import name_of
 from fieldtwin.commissioning.scan.traffic import Heard
@@ -341,7 +341,7 @@ def _of_probe(probe: ScanProbe, e: SerialEvidence) -> list[LikelyCause]:
 # -- CAN --------------------------------------------------------------------------------------------------------------
 
 
-def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[LikelyCause]:
+def can_causes(facts: CanFacts, heard: ObservedBus, load: float) -> list[LikelyCause]:
     """Return the causes of a silent CAN bus, of errors, and of a full bus."""
     found: list[LikelyCause] = []
     errors = facts.tx_errors + facts.rx_errors

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from fieldtwin.commissioning.access.connection import bytes_at
 from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan import settings as plan
-from fieldtwin.commissioning.scan.can_listener import BusHeard
+from fieldtwin.commissioning.scan.can_listener import ObservedBus
 from fieldtwin.commissioning.scan.canopen import CanScanner, CanScanOptions
 from fieldtwin.commissioning.scan.causes import (
     LikelyCause,
@@ -49,7 +49,7 @@ class LineReport:
     causes: list[LikelyCause] = field(default_factory=list)
     heard: Heard | None = None
     errors: UartCounters | None = None
-    bus: BusHeard | None = None
+    bus: ObservedBus | None = None
     can: CanFacts | None = None
     probe: ScanProbe | None = None
     sent: bool = False
@@ -61,7 +61,7 @@ class LineReport:
 
 
 @dataclass(frozen=True, slots=True)
-class LineLook:
+class LineCheckOptions:
     """The options of an observation: its duration, and the unit of a probe, `probe_unit` (None: nothing is sent)."""
 
     listen_s: float = 5.0
@@ -73,7 +73,7 @@ class LineLook:
 
 async def look_at_line(
     url: str,
-    look: LineLook | None = None,
+    look: LineCheckOptions | None = None,
     *,
     on_progress: Callable[[PhaseProgress], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
@@ -87,7 +87,7 @@ async def look_at_line(
     report instead), `NotAllowed` for a probe into foreign traffic.
     """
     endpoint = Endpoint.parse(url)
-    looker = _Looker(endpoint, look or LineLook(), on_progress, stop, taps, connector, clock or WallClock())
+    looker = _Looker(endpoint, look or LineCheckOptions(), on_progress, stop, taps, connector, clock or WallClock())
     if endpoint.is_can:
         return await looker.at_bus()
     framing_of(endpoint)
@@ -98,7 +98,7 @@ class _Looker:
     def __init__(
         self,
         endpoint: Endpoint,
-        look: LineLook,
+        look: LineCheckOptions,
         on_progress: Callable[[PhaseProgress], None],
         stop: Callable[[], bool],
         taps: Sequence[Tap],

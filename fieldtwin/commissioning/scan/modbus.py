@@ -16,7 +16,7 @@ from fieldtwin.commissioning.scan import settings as plan
 from fieldtwin.commissioning.scan.listening import Audition, LineVerdict, dwell_over, judge, siblings, worth_hearing
 from fieldtwin.commissioning.scan.odd_replies import OddReply, gathered
 from fieldtwin.commissioning.scan.settings import Pace, ScanStep
-from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, Alike, likeness, spread_over
+from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, SharedUnitIds, detect_shared_unit_ids, spread_over
 from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
 from fieldtwin.gateway.connections.serial.line_counters import CountsErrors, UartCounters
@@ -80,7 +80,7 @@ class ModbusScan:
     units: list[FoundUnit] = field(default_factory=list)
     damaged: list[OddReply] = field(default_factory=list)
     behind_gateway: set[int] = field(default_factory=set)
-    alike: Alike | None = None
+    alike: SharedUnitIds | None = None
     echo: bool = False
     asked: int = 0
     took_s: float = 0.0
@@ -160,7 +160,7 @@ class ModbusScanner:
             first = spread_over(self._units)
             rest = [u for u in self._units if u not in first]
             return [("some units", [self._pace.step(None, first)]), ("every unit", [self._pace.step(None, rest)])]
-        said = plan.settings_said(self._endpoint)
+        said = plan.stated_settings(self._endpoint)
         if said is not None:
             return [("every unit", [self._pace.step(said, self._units)])]
         likely = plan.likely_settings(self._endpoint)
@@ -173,7 +173,7 @@ class ModbusScanner:
     # -- a serial line --------------------------------------------------------------------------------------------
 
     async def _scan_line(self) -> None:
-        said = plan.settings_said(self._endpoint)
+        said = plan.stated_settings(self._endpoint)
         if not await self._listen(said):
             return
         verdict = self.result.verdict
@@ -376,7 +376,7 @@ class ModbusScanner:
                 "the line is never silent: another client on the line, or a unit that sends continuously"
             )
         if settings is not None:
-            alike = likeness([f.answer for f in result.units if f.settings == settings], sweep.asked)
+            alike = detect_shared_unit_ids([f.answer for f in result.units if f.settings == settings], sweep.asked)
             result.alike = alike or result.alike
 
     # -- a host ---------------------------------------------------------------------------------------------------
@@ -391,7 +391,7 @@ class ModbusScanner:
         rest = plan.full_pass(self._pace, [None], self._units, [sample])
         await self._steps([sample], "some units")
         answers = [f.answer for f in self.result.units]
-        self.result.alike = likeness(answers, len(first))
+        self.result.alike = detect_shared_unit_ids(answers, len(first))
         if self.result.alike is None and len(answers) == len(first) and not self._ended:
             self.result.alike = await self._ask_once_more(answers, first)
         if self.result.alike is not None and self.result.alike.one_device and not self._options.every_setting:
@@ -401,7 +401,7 @@ class ModbusScanner:
             await self._steps(rest, "every unit")
         self.result.units.sort(key=lambda f: f.answer.unit)
 
-    async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> Alike | None:
+    async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> SharedUnitIds | None:
         """Ask all units again whose answers differed. This shows whether one device with a changing register answered, or many
         devices.
         """
@@ -411,7 +411,7 @@ class ModbusScanner:
         )  # fmt: skip
         await self._drive(sweep, self._endpoint, lambda: None)
         self.result.asked += sweep.asked
-        return likeness(answers, len(units), again=list(sweep.found.values()))
+        return detect_shared_unit_ids(answers, len(units), again=list(sweep.found.values()))
 
 
 def _counters(connection: ByteConnection) -> UartCounters | None:

@@ -32,7 +32,7 @@ OPENING_S = 0.02
 """Time in seconds to change the settings of a port."""
 
 
-def settings_said(endpoint: Endpoint) -> SerialSettings | None:
+def stated_settings(endpoint: Endpoint) -> SerialSettings | None:
     """Return the settings that the endpoint states; None if it does not state baud rate and frame."""
     said = {name for name, _ in endpoint.params}
     return endpoint.serial if endpoint.is_serial and {"baudrate", "frame"} <= said else None

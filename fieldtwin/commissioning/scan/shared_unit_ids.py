@@ -17,7 +17,7 @@ SPREAD = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Alike:
+class SharedUnitIds:
     """The `units` that give the same answer. `one_device`: they are certainly one device; if it is False, they may be one
     device.
     """
@@ -27,7 +27,9 @@ class Alike:
     why: str
 
 
-def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()) -> Alike | None:
+def detect_shared_unit_ids(
+    answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()
+) -> SharedUnitIds | None:
     """Return how likely the units that answered, of `asked`, are one device.
 
     `again` are their answers to a second round. None if they are several devices, or fewer than three units.
@@ -39,8 +41,10 @@ def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnsw
     if len(contents) == 1:
         text = next(iter(contents)).hex(" ")
         if asked >= SPREAD:
-            return Alike(units, True, f"all {asked} unit ids that were asked answered with the same bytes ({text})")
-        return Alike(
+            return SharedUnitIds(
+                units, True, f"all {asked} unit ids that were asked answered with the same bytes ({text})"
+            )
+        return SharedUnitIds(
             units,
             False,
             f"{asked} units answer with the same bytes ({text}): one device, or several new devices with equal values",
@@ -48,7 +52,9 @@ def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnsw
     before = {a.unit: a.reply for a in answers}
     changed = sum(1 for a in again if before.get(a.unit) not in (None, a.reply))
     if asked >= SPREAD and changed > len(answers) // 2:
-        return Alike(units, False, f"all {asked} unit ids answer, and each gives a different answer a moment later")
+        return SharedUnitIds(
+            units, False, f"all {asked} unit ids answer, and each gives a different answer a moment later"
+        )
     return None
 
 

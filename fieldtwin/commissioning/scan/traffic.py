@@ -21,7 +21,7 @@ SURE_FRAMES = 3
 
 
 @dataclass(slots=True)
-class UnitHeard:
+class ObservedUnit:
     """One unit ID on the line. It is live when it answered."""
 
     requests: int = 0
@@ -43,7 +43,7 @@ class Heard:
     good_bytes: int = 0
     frames: int = 0
     bad_frames: int = 0
-    units: dict[int, UnitHeard] = field(default_factory=dict)
+    units: dict[int, ObservedUnit] = field(default_factory=dict)
     repeated: int = 0
     """Number of requests that were immediately repeated, as with an adapter that returns sent bytes."""
     glitches: int = 0
@@ -111,7 +111,7 @@ class LineListener:
             return
         heard.frames += 1
         heard.good_bytes += len(frame.raw)
-        unit = heard.units.setdefault(frame.unit, UnitHeard())
+        unit = heard.units.setdefault(frame.unit, ObservedUnit())
         function = frame.pdu[0]
         unit.functions.add(function & 0x7F)
         asked, self._open = self._open, None

@@ -65,7 +65,7 @@ class Listener:
     log: Callable[[Event], None] = lambda event: None
 
 
-async def judge_modbus_client(options: Options, listener: Listener) -> list[CaseResult]:
+async def check_modbus_client(options: Options, listener: Listener) -> list[CaseResult]:
     """Test a Modbus client; return the results in the order of the cases.
 
     Raises `UsageError`, `Unreachable` or `EndpointBusy`. SIGTERM ends the test, and the program with it.
@@ -87,7 +87,7 @@ async def judge_modbus_client(options: Options, listener: Listener) -> list[Case
         return await _judged(run, options, theirs, on_text, listener)
 
 
-async def judge_canopen_master(options: Options, listener: Listener) -> list[CaseResult]:
+async def check_canopen_master(options: Options, listener: Listener) -> list[CaseResult]:
     """Test the SDO client and NMT master on a CAN bus. A software bus is created here."""
     if not options.listen.is_can:
         expected = "can:fieldtwin/HOST:PORT or can:socketcan/INTERFACE"

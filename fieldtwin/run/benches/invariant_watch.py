@@ -60,7 +60,7 @@ class InvariantWatch:
                 said = rule.look(now_s, knowledge.look, bench)
             if said is not None:
                 late_s = bench.host_late_s(now_s - said.bound_s - RECENT_S)
-                unknown = said.nobody_knows or (said.bound_s > 0 and late_s > LATE_SHARE * said.bound_s)
+                unknown = said.undecidable or (said.bound_s > 0 and late_s > LATE_SHARE * said.bound_s)
                 verdict = Verdict.INCONCLUSIVE if unknown else Verdict.FAILED
                 late = f"; but this host itself was {late_s * 1000:.0f} ms late" if unknown else ""
                 self._broken[rule.number] = verdict, f"broken at {now_s:.3f} s: {said.got}{late}", now_s

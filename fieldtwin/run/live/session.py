@@ -47,7 +47,7 @@ from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
-from fieldtwin.twin.thread.place import MODEM, lent_transmitter
+from fieldtwin.twin.thread.place import MODEM, delegated_transmitter
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
@@ -87,7 +87,7 @@ class RunSession(AsyncResource):
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
         self.twin = PhysicalTwin(self.system)
-        self.delegated = self._lent_to_the_thread()
+        self.delegated = self._delegated_to_the_thread()
         self._prototype: Prototype | None = None
         if options.prototype and not options.field_host:
             from fieldtwin.twin.prototype.field_process import (
@@ -140,15 +140,15 @@ class RunSession(AsyncResource):
         self._field: FieldContact | None = None
         self._resolved = ""
         """The file that hands the system to gateway and thread; the prototype has its own, which a gateway cannot read."""
-        self.made_anew = 0
+        self.recreated = 0
         """How often a scenario has reset the simulated devices."""
         self.field_return: FieldReturn | None = None
         """The reconnection to a remote field simulator."""
 
-    def _lent_to_the_thread(self) -> str:
+    def _delegated_to_the_thread(self) -> str:
         """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
         o = self.options
-        delegated = lent_transmitter(o.thread, self.system)
+        delegated = delegated_transmitter(o.thread, self.system)
         if delegated and not o.prototype and not o.allow_writes:
             raise UsageError(
                 f"a thread over {delegated!r} writes into its mailbox",
@@ -166,12 +166,12 @@ class RunSession(AsyncResource):
     def disturbed(self) -> bool:
         """Return whether faults were injected, or the field simulator was away: then the counts of both sides may differ."""
         lost = self.field_return is not None and self.field_return.losses > 0
-        return bool(self.faults) or lost or self.made_anew > 0
+        return bool(self.faults) or lost or self.recreated > 0
 
     @property
     def calm(self) -> bool:
         """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
-        return not self.faults and not self.made_anew
+        return not self.faults and not self.recreated
 
     def summary(self) -> dict[str, Any]:
         """Return the verdict on the run, for `--json` and for printing. Call it after the run."""
@@ -376,7 +376,7 @@ class RunSession(AsyncResource):
             self._nursery.start(self.field_return.run(), "field simulator's return")
         self._nursery.start(self._watch(), "states")
         if self.invariants is not None:
-            self._judging = self._nursery.start(self._judge_invariants(self.invariants), "invariants")
+            self._judging = self._nursery.start(self._check_invariants(self.invariants), "invariants")
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
         if device is not None and self.options.prototype and self.options.commands:
@@ -402,7 +402,7 @@ class RunSession(AsyncResource):
         finally:
             done.cancel()
 
-    async def _judge_invariants(self, invariants: InvariantWatch) -> None:
+    async def _check_invariants(self, invariants: InvariantWatch) -> None:
         """Check the invariants of the system file until the gateway or the PLC ends, or the run is stopped."""
         from fieldtwin.run.benches.control_bench import ControlBench, Where
 
@@ -429,7 +429,7 @@ class RunSession(AsyncResource):
 
     async def _watch(self) -> None:
         while True:
-            self._stood_still()
+            self._was_suspended()
             self._looked_ns = self.clock.monotonic_ns()
             self.states.look(self._looked_ns)
             self._notice_deaths()
@@ -483,7 +483,7 @@ class RunSession(AsyncResource):
         if self._field is None or self.field_status is None or self.field_status.life == self._field.life:
             return
         self._field.life = self.field_status.life
-        self.made_anew += 1
+        self.recreated += 1
         self.oracle.begin_again()
         self.counted_before, self.clients_before = {}, {}
 
@@ -504,11 +504,11 @@ class RunSession(AsyncResource):
             return None
         except FieldtwinError as e:
             self._maybe_lost(client, e)
-            if isinstance(e, ReplyTimeout) and name and not self._stood_still():
+            if isinstance(e, ReplyTimeout) and name and not self._was_suspended():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
             return None  # the process is ending or has ended, which _notice_deaths reports with the reason
 
-    def _stood_still(self) -> bool:
+    def _was_suspended(self) -> bool:
         """Return whether this process was itself stopped, or got no processor time. It then cannot know whether the other
         processes would have answered.
         """
@@ -552,7 +552,7 @@ class RunSession(AsyncResource):
         finally:
             await self._nursery.__aexit__(None, None, None)
 
-    async def _end_judging(self) -> None:
+    async def _end_invariant_checks(self) -> None:
         """Stop checking invariants, because the change of the outputs to safe values at the stop is not a violation."""
         if self._judging is not None:
             self._judging.cancel()
@@ -560,7 +560,7 @@ class RunSession(AsyncResource):
 
     async def _stop_in_order(self) -> None:
         self._notice_deaths()
-        await self._end_judging()
+        await self._end_invariant_checks()
         if self.topside is not None:
             await self.topside.halt()
         await self.refresh()

@@ -32,7 +32,7 @@ class FieldContact:
         self.life = ""
         """The identity of the simulator's process: a restarted field simulator has a different one."""
         self.listening: dict[str, str] = {}
-        self.far_said: dict[str, str] = {}
+        self.reported_endpoints: dict[str, str] = {}
         """The endpoints of buses and remote modems, as the field simulator reports them."""
         self.remarks: list[str] = []
         """Differences from a node's data sheet, each with the device's name."""
@@ -80,7 +80,7 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
     status = await client.ask("get", FieldStatus)
     check_same(system, status)
     contact = FieldContact(client, {}, {})
-    contact.life, contact.listening, contact.far_said = status.life, status.listening, status.far
+    contact.life, contact.listening, contact.reported_endpoints = status.life, status.listening, status.far
     contact.clients_before = status.clients
     contact.remarks = [f"{name}: {text}" for name, device in status.devices.items() for text in device.remarks]
     contact.counted_before = {name: device.counters for name, device in status.devices.items()}

@@ -107,7 +107,10 @@ class FieldReturn:
 
     def _check(self, status: FieldStatus) -> None:
         check_same(self._system, status)
-        was = {**self._contact.listening, **{f"topside end of {d}": url for d, url in self._contact.far_said.items()}}
+        was = {
+            **self._contact.listening,
+            **{f"topside end of {d}": url for d, url in self._contact.reported_endpoints.items()},
+        }
         now = {**status.listening, **{f"topside end of {d}": url for d, url in status.far.items()}}
         elsewhere = [
             f"{name} at {now.get(name, 'nothing')}, not {url}" for name, url in was.items() if now.get(name) != url

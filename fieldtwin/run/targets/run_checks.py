@@ -18,11 +18,11 @@ from fieldtwin.run.virtual.system_check import SystemCheck
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.twin.prototype.group import SystemGroup
 
-MOST_TOLD = 5
+MOST_REPORTED = 5
 TITLE = "the checks of a run in virtual time"
 
 
-class RunJudge:
+class RunChecker:
     """The checks of one scenario's run. Call `attach`, run `watch` as a task, and call `finish` at the end of the scenario."""
 
     def __init__(self, scenario: Scenario, group: SystemGroup, by_chance: tuple[dict[str, Any], ...] = ()) -> None:
@@ -64,7 +64,7 @@ class RunJudge:
             errors += [f"{name}: {error}" if name else error for error in check.summary()["errors"]]
         now_ns = round(next(iter(self._benches.values())).now_s() * NS_PER_S)
         verdict = Verdict.FAILED if errors else Verdict.PASSED
-        expected, got = ("no error", "; ".join(errors[:MOST_TOLD])) if errors else ("", "")
+        expected, got = ("no error", "; ".join(errors[:MOST_REPORTED])) if errors else ("", "")
         result_of_run = CheckResult("judge", TITLE, verdict, now_ns, 0, expected, got, where=self._where)
         ended = verdict if result.verdict is Verdict.PASSED else result.verdict
         reason = f"{TITLE}: {errors[0]}" if errors and result.verdict is Verdict.PASSED else result.reason

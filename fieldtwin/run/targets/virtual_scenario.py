@@ -21,7 +21,7 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
 from fieldtwin.results.trace_about import TraceAbout, write_results
 from fieldtwin.run.targets.progress import Progress
-from fieldtwin.run.targets.run_checks import RunJudge
+from fieldtwin.run.targets.run_checks import RunChecker
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.run.virtual.trace_description import begin_description, described_checks
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
@@ -44,7 +44,7 @@ def run_virtual(
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
     judge = (
-        RunJudge(scenario, group, by_chance.faults if by_chance is not None else ())
+        RunChecker(scenario, group, by_chance.faults if by_chance is not None else ())
         if scenario.form.judge is not None
         else None
     )
@@ -102,7 +102,7 @@ def run_virtual(
     )
 
 
-async def _judged(runner: ScenarioRunner, judge: RunJudge | None, running: VirtualSystems) -> ScenarioResult:
+async def _judged(runner: ScenarioRunner, judge: RunChecker | None, running: VirtualSystems) -> ScenarioResult:
     """Run the scenario, with the checks of a run in addition if it requests them."""
     if judge is None:
         return await runner.run()

@@ -40,12 +40,12 @@ def objection(asked: QuestionMessage) -> str:
         if asked.only_check:
             check(fork, plan)
             return ""
-        return told(answer(fork, plan))
+        return requirement_objection(answer(fork, plan))
     except FieldtwinError as e:
         return str(e)
 
 
-def told(outcome: PlanOutcome) -> str:
+def requirement_objection(outcome: PlanOutcome) -> str:
     """Return why a plan must not be executed: the failure of its fork, or the first requirement that does not hold."""
     if outcome.error:
         return f"the prototype failed: {outcome.error}"

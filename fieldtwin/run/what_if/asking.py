@@ -25,7 +25,7 @@ from fieldtwin.twin.plant.child import command as child_command
 from fieldtwin.twin.site.system import System
 
 TIMEOUT_S = 60.0
-TOLD_WITHIN_S = 12.0
+VALUES_WITHIN_S = 12.0
 """Time in seconds within which a new twin has received every value: a plant repeats unchanged values every ten seconds."""
 LOOK_MS = 100
 MOST_KEPT = 1 << 16
@@ -119,7 +119,7 @@ class Asking:
 
     async def _find_out(self, command: COMMAND, question: Question) -> str:
         assert self._began_ns is not None
-        enough_ns = self._began_ns + round(TOLD_WITHIN_S * NS_PER_S)
+        enough_ns = self._began_ns + round(VALUES_WITHIN_S * NS_PER_S)
         while self.known.unknown and self._clock.monotonic_ns() < enough_ns:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_MS * NS_PER_MS)
         if not self.known.utc_ms:

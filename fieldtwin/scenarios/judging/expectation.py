@@ -42,7 +42,7 @@ class ExpectationInput:
             self.updates[name] = reading.updates if reading is not None else 0
 
 
-async def judge_tag(expect: Expect, watched: ExpectationInput) -> Said:
+async def check_tag(expect: Expect, watched: ExpectationInput) -> Said:
     """Check value, quality and rate of a tag now, and whether its value equals the value that its device held."""
     assert expect.tag is not None
     reading = watched.bench.reading(expect.tag)
@@ -55,7 +55,7 @@ async def judge_tag(expect: Expect, watched: ExpectationInput) -> Said:
             return f"{expect.tag}: {low:g} to {high:g} updates/s", f"{rate:.3g} in {took_s:g} s"
     if reading is None:
         return f"{expect.tag} published", "never published"
-    said = await _judge_value(expect, watched, reading)
+    said = await _check_value(expect, watched, reading)
     return said if said is None or not is_secret(watched.system, expect.tag) else (f"{expect.tag}", SECRET)
 
 
@@ -66,7 +66,7 @@ def is_secret(system: System, name: str) -> bool:
     return found is not None and found.secret
 
 
-async def _judge_value(expect: Expect, watched: ExpectationInput, reading: TagReading) -> Said:
+async def _check_value(expect: Expect, watched: ExpectationInput, reading: TagReading) -> Said:
     assert expect.tag is not None
     # the quality has not turned bad, because the tag never had a value
     if expect.quality is not None and reading.value is None:
@@ -111,7 +111,7 @@ def _near(value: object, truth: object, tolerance: float) -> bool:
     return value == truth
 
 
-def judge_wire(expect: Expect, watched: ExpectationInput) -> Said:
+def check_exchanges(expect: Expect, watched: ExpectationInput) -> Said:
     """Check how often something was requested on a device's bus since the last stimulus, or its rate per second since
     the step began.
     """

@@ -16,7 +16,7 @@ from fieldtwin.scenarios.language.form import Scenario
 
 EXPECTED = "every output of a program reaches its device"
 NUMBER = "refused"
-MOST_TOLD = 10
+MOST_REPORTED = 10
 
 
 class RefusedOutputs:
@@ -45,7 +45,7 @@ class RefusedOutputs:
         allowed = event.where in self._allowed
         self._seen[event.where] += bool(fault)
         if not fault or allowed or (fault == "device" and self._disturbed):
-            if len(self._others) < MOST_TOLD:
+            if len(self._others) < MOST_REPORTED:
                 self._others.setdefault(f"{event.where} {event.data.get('cause')}", got)
         elif self._broken is None:
             place = str(event.data.get("place", ""))

@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Struck, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
-from fieldtwin.scenarios.judging.expectation import ExpectationInput, judge_tag, judge_wire, said
+from fieldtwin.scenarios.judging.expectation import ExpectationInput, check_exchanges, check_tag, said
 from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.last_exchanges import deciding, last_exchanges
 from fieldtwin.scenarios.judging.lateness import Allowance, allowance
@@ -379,7 +379,7 @@ class ScenarioRunner:
                 raise _Broken(
                     Verdict.INCONCLUSIVE, f"at most {KEPT} exchanges in that time", "more; the oldest were dropped"
                 )
-            said = judge_wire(expect, watched)
+            said = check_exchanges(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
             # Too few exchanges prove nothing if the bus was never seen working.
@@ -391,7 +391,7 @@ class ScenarioRunner:
         if expect.updates_per_s is not None:
             await self._until(self.bench.now_s() + max(during_s, 1.0))
         since_s = self.bench.now_s()
-        while (said := await judge_tag(expect, watched)) is not None:
+        while (said := await check_tag(expect, watched)) is not None:
             if expect.updates_per_s is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
             allowed = allowance(self.bench, since_s, within_s)
@@ -404,7 +404,7 @@ class ScenarioRunner:
             end_s = self.bench.now_s() + during_s
             while self.bench.now_s() < end_s:  # the value must stay so
                 await self._tick(end_s)
-                if (said := await judge_tag(expect, watched)) is not None:
+                if (said := await check_tag(expect, watched)) is not None:
                     raise _Broken(Verdict.FAILED, *said, during_s)
             self._looked_all_the_time(end_s - during_s, during_s)
 
@@ -451,7 +451,7 @@ class ScenarioRunner:
         said = self._standing.look() or self._refused.look() or self._whole.look()
         if said is None:
             return
-        verdict = Verdict.INCONCLUSIVE if said.nobody_knows else self._of_lateness(said.asks_lateness)
+        verdict = Verdict.INCONCLUSIVE if said.undecidable else self._of_lateness(said.asks_lateness)
         since_s = self.bench.now_s() - said.bound_s - RECENT_S
         broken = _Broken(verdict, said.expected, said.got, said.bound_s, since_s)
         verdict, expected, got = self._judged_on_time(broken, since_s)

@@ -20,5 +20,5 @@ class Violation:
     since_s: float
     where: str = ""
     asks_lateness: bool = False
-    nobody_knows: bool = False
+    undecidable: bool = False
     """Whether the host was so late that the runner cannot decide whether the rule is broken."""

@@ -187,7 +187,7 @@ class WithinRule:
             if not allowed.in_time(now_s - self._since_s):
                 got = f"so {now_s - self._since_s:.3f} s after it; this host itself was late for {allowed.own_s:.3f} s"
                 return Violation(
-                    self.number, self.text, got, self.names, self.limit_s, self._since_s, self.where, nobody_knows=True
+                    self.number, self.text, got, self.names, self.limit_s, self._since_s, self.where, undecidable=True
                 )
         elif now_s >= self.due_s:
             so = "and unknown at" if then is None else "and not so until"

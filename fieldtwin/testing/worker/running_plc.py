@@ -27,7 +27,7 @@ from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.system import System
 
 BY = "test"
-STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
+PLC_COMMANDS = ("force", "unforce", "pause", "go", "step", "restart", "why")
 """Commands of the PLC's process that a test may use, each with the names of its arguments."""
 
 
@@ -112,9 +112,9 @@ class PlcProcesses:
         return {**row, "value": words.get(str(value), words.get(value, value)), "words": list(words.values())}
 
     async def steer(self, command: str, args: dict[str, Any]) -> dict[str, Any]:
-        """Execute one of the commands in `STEERING`."""
-        if command not in STEERING:
-            raise UsageError(f"not a command for a PLC: {command!r}", expected=", ".join(STEERING))
+        """Execute one of the commands in `PLC_COMMANDS`."""
+        if command not in PLC_COMMANDS:
+            raise UsageError(f"not a command for a PLC: {command!r}", expected=", ".join(PLC_COMMANDS))
         if command == "step":
             return {"scans": await step_and_wait(self._call, int(args["count"]), BY)}
         return await self._call(command, **args, by=BY)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canopen
-from fieldtwin.commissioning.identify.matching import CanClues, Sureness, judge_canopen
+from fieldtwin.commissioning.identify.matching import CanClues, Sureness, rate_canopen
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
@@ -77,9 +77,9 @@ def test_vendor_and_product_of_the_data_sheet_are_certain() -> None:
     entry = sheet.get(0x1000)
     assert entry is not None
     assert isinstance(entry.default, int)
-    same = judge_canopen(profile, sheet, CanClues(Identity(entry.default, 0x2E, 7, 1, 1)))
+    same = rate_canopen(profile, sheet, CanClues(Identity(entry.default, 0x2E, 7, 1, 1)))
     assert same.sureness is Sureness.CERTAIN
-    other = judge_canopen(profile, sheet, CanClues(Identity(entry.default, 0x2E, 8, 1, 1)))
+    other = rate_canopen(profile, sheet, CanClues(Identity(entry.default, 0x2E, 8, 1, 1)))
     assert other.sureness is Sureness.POSSIBLE
 
 
@@ -88,4 +88,4 @@ U32 = st.integers(0, 0xFFFF_FFFF)
 
 @given(st.builds(Identity, U32, st.none() | U32, st.none() | U32, U32, U32))
 def test_no_identity_makes_a_reference_profile_certain(identity: Identity) -> None:
-    assert all(judge_canopen(p, s, CanClues(identity)).sureness < Sureness.CERTAIN for p, s in SHEETS)
+    assert all(rate_canopen(p, s, CanClues(identity)).sureness < Sureness.CERTAIN for p, s in SHEETS)

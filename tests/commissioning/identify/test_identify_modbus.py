@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.cli.device.identify_command import command, known_profiles
-from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
+from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Sureness, rate_modbus, summary
 from fieldtwin.commissioning.identify.modbus import ModbusIdentity, identify_modbus
 from fieldtwin.commissioning.identify.sunspec import next_model
 from fieldtwin.emulators.modbus.bank import CellSpan
@@ -150,7 +150,7 @@ def test_a_chain_of_models_ends(data: bytes, address: int) -> None:
 def test_without_any_reading_no_profile_is_likely() -> None:
     for profile in SHIPPED:
         if profile.protocol == "modbus":
-            assert judge_modbus(profile, ModbusClues(), {}).sureness is Sureness.RULED_OUT
+            assert rate_modbus(profile, ModbusClues(), {}).sureness is Sureness.RULED_OUT
 
 
 def test_an_exception_that_takes_600_ms_is_an_answer() -> None:

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from test_scan_line import exchange, meter
 from uart_line import UartLine
 
-from fieldtwin.commissioning.scan.can_listener import BusHeard
+from fieldtwin.commissioning.scan.can_listener import ObservedBus
 from fieldtwin.commissioning.scan.causes import ScanProbe, SerialEvidence, can_causes, serial_causes, tcp_causes
-from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line, probe_of
+from fieldtwin.commissioning.scan.line import LineCheckOptions, LineReport, look_at_line, probe_of
 from fieldtwin.commissioning.scan.traffic import Heard, LineListener
 from fieldtwin.gateway.connections.can.facts import CanFacts
 from fieldtwin.gateway.connections.serial.line_counters import UartCounters, unpack_counters
@@ -27,7 +27,7 @@ N81 = SerialSettings(9600, "8N1")
 
 
 async def look(line: UartLine, url: str = f"{PORT}?baudrate=9600&frame=8N1", **options: object) -> LineReport:
-    made = LineLook(listen_s=1.0, **options)  # type: ignore[arg-type]
+    made = LineCheckOptions(listen_s=1.0, **options)  # type: ignore[arg-type]
     return await look_at_line(url, made, connector=line, clock=loop())
 
 
@@ -122,7 +122,9 @@ def test_a_bus_with_traffic_and_one_with_errors() -> None:
         peers = PeerBus([node])
         async with closing(peers):
             node.power_on()
-            report = await look_at_line("can:fieldtwin/h:1", LineLook(listen_s=1), connector=peers, clock=loop())
+            report = await look_at_line(
+                "can:fieldtwin/h:1", LineCheckOptions(listen_s=1), connector=peers, clock=loop()
+            )
             assert peers.sent == []
         assert report.healthy
         assert dict(report.facts)["nodes heard"] == "5"
@@ -169,14 +171,14 @@ def test_known_faults_come_first(evidence: SerialEvidence, first: str) -> None:
 @pytest.mark.parametrize(
     ("facts", "heard", "first"),
     [
-        (CanFacts("socketcan", state="bus-off", tx_errors=255), BusHeard(), "the controller is off"),
-        (CanFacts("socketcan", tx_errors=128), BusHeard(), "alone on the bus"),
-        (CanFacts("socketcan"), BusHeard(errors=9), "the bit rate"),
-        (CanFacts("socketcan"), BusHeard(errors=9, frames=9), "termination or noise"),
-        (CanFacts("socketcan"), BusHeard(), "no node sends"),
+        (CanFacts("socketcan", state="bus-off", tx_errors=255), ObservedBus(), "the controller is off"),
+        (CanFacts("socketcan", tx_errors=128), ObservedBus(), "alone on the bus"),
+        (CanFacts("socketcan"), ObservedBus(errors=9), "the bit rate"),
+        (CanFacts("socketcan"), ObservedBus(errors=9, frames=9), "termination or noise"),
+        (CanFacts("socketcan"), ObservedBus(), "no node sends"),
     ],
 )
-def test_faults_of_a_bus(facts: CanFacts, heard: BusHeard, first: str) -> None:
+def test_faults_of_a_bus(facts: CanFacts, heard: ObservedBus, first: str) -> None:
     assert can_causes(facts, heard, 0.0)[0].name == first
     assert can_causes(replace(facts, state="", tx_errors=0), replace(heard, errors=0, frames=5), 0.1) == []
 
@@ -204,11 +206,11 @@ def test_a_host_that_hangs_up_is_found_out_without_sending() -> None:
     async def main() -> None:
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
-        report = await look_at_line(f"tcp://127.0.0.1:{port}", LineLook(listen_s=5))
+        report = await look_at_line(f"tcp://127.0.0.1:{port}", LineCheckOptions(listen_s=5))
         assert report.causes[0].name == "no room for another client"
         server.close()
         await server.wait_closed()
-        report = await look_at_line(f"tcp://127.0.0.1:{port}", LineLook(listen_s=5))
+        report = await look_at_line(f"tcp://127.0.0.1:{port}", LineCheckOptions(listen_s=5))
         assert report.causes[0].name == "no program listens there"
 
     asyncio.run(main())

@@ -12,7 +12,7 @@ from modbus_virtual import VirtualWire
 
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import TCP_UNITS
-from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, likeness, spread_over
+from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, detect_shared_unit_ids, spread_over
 from fieldtwin.commissioning.scan.sweep import SendRequest, UnitAnswer, UnitSweep
 from fieldtwin.emulators.modbus.bank import CellSpan
 from fieldtwin.emulators.modbus.rtu.receiver import with_crc
@@ -177,5 +177,5 @@ def test_the_spread_is_some_of_the_units_each_once(units: set[int]) -> None:
     )
 )
 def test_few_answers_are_never_one_device_for_sure(answers: list[UnitAnswer]) -> None:
-    verdict = likeness(answers, len(answers))
+    verdict = detect_shared_unit_ids(answers, len(answers))
     assert verdict is None or not verdict.one_device

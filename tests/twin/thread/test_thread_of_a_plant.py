@@ -17,7 +17,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.twin.plant.physical import gateway_config, gateway_lost_ms, image_layout
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.twin.thread.place import lent_transmitter, twin_carrier
+from fieldtwin.twin.thread.place import delegated_transmitter, twin_carrier
 from fieldtwin.twin.thread.plant_thread import REFRESH_MS, ImageProcess
 
 PROFILES = Path(__file__).resolve().parents[3] / "profiles" / "systems"
@@ -112,7 +112,7 @@ def test_a_state_is_reported_when_it_changes_and_again_after_a_refusal() -> None
         return [e for e in process.collect() if e.kind == Kind.STATE]
 
     assert [len(states()) for _ in range(3)] == [1, 0, 0]
-    process.tell_again()
+    process.share_again()
     assert [len(states()) for _ in range(2)] == [1, 0]
 
 
@@ -129,12 +129,12 @@ def test_the_last_values_of_a_dead_gateway_are_not_reported_as_good() -> None:
 
 
 def test_a_system_with_one_transmitter_lends_that() -> None:
-    assert lent_transmitter("modem:", OBSERVATORY) == lent_transmitter("modem:modem", OBSERVATORY) == "modem"
-    assert lent_transmitter("tcp://127.0.0.1:7700", OBSERVATORY) == lent_transmitter("", OBSERVATORY) == ""
+    assert delegated_transmitter("modem:", OBSERVATORY) == delegated_transmitter("modem:modem", OBSERVATORY) == "modem"
+    assert delegated_transmitter("tcp://127.0.0.1:7700", OBSERVATORY) == delegated_transmitter("", OBSERVATORY) == ""
     with pytest.raises(UsageError, match="'ctd' is not a transmitter of observatory"):
-        lent_transmitter("modem:ctd", OBSERVATORY)
+        delegated_transmitter("modem:ctd", OBSERVATORY)
     with pytest.raises(UsageError, match="a system with a transmitter"):
-        lent_transmitter("modem:", load_system(str(PROFILES / "lab_vehicle.yaml")))
+        delegated_transmitter("modem:", load_system(str(PROFILES / "lab_vehicle.yaml")))
     for wrong in ("modem:", "modem:modem", "modem:modem@udp://127.0.0.1:1"):
         with pytest.raises(UsageError, match="endpoint of the topside modem is missing"):
             twin_carrier(wrong, OBSERVATORY, WallClock())

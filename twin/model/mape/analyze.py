@@ -63,7 +63,7 @@ class Analyze(DTDigitalThreadProcess):
         for message in self.consumer.drain():
             if isinstance(message, SeenMeasurement) and message.event.kind == Kind.VALUE:
                 name = message.event.name
-                self._wrong[name] = {wrong for wrong, _, is_so, _ in self._weighed(message) if is_so}
+                self._wrong[name] = {wrong for wrong, _, is_so, _ in self._possible_findings(message) if is_so}
                 self._history |= {(name, wrong) for wrong in self._wrong[name]}
 
     def check_statuses(self, status: SeenStatus) -> bool | None:
@@ -112,10 +112,10 @@ class Analyze(DTDigitalThreadProcess):
         self._heard[event.name] = message.arrived_ms
         self._turn(event.name, "stale", "fresh", False, f"{event.name} is received again", message.arrived_ms)
         late = message.arrived_ms - event.t_ms > LATE_MS
-        for wrong, right, is_wrong, text in self._weighed(message):
+        for wrong, right, is_wrong, text in self._possible_findings(message):
             self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
 
-    def _weighed(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
+    def _possible_findings(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
         """Yield each possible finding about a value: its name if the value is wrong, its name if it is right, whether it is
         wrong, and a sentence.
         """

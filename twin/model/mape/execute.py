@@ -148,13 +148,13 @@ class Execute(DTDigitalThreadProcess):
         self.decisions.settled(command, objection, self._clock.utc_ns() // NS_PER_MS)
         if objection:
             self.refused += 1
-            self.share(Kind.REFUSAL, self.name, _told(command, objection))
+            self.share(Kind.REFUSAL, self.name, _with_period(command, objection))
         else:
             self.sent += 1
             self.transmitter.emit(command)
 
 
-def _told(command: COMMAND, objection: str) -> str:
+def _with_period(command: COMMAND, objection: str) -> str:
     """Return the reason with the command's period, unless the reason already contains it."""
     try:
         period_s = decode_period(command)

@@ -145,8 +145,8 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a closed pipe ends a listing with exit code 0.
 
-        Click exits with code 1 when a pipe closes. In `fieldtwin ... | head` the reader has all that it wanted. Commands that
-        give a verdict run to their end, and exit with it.
+        Click exits with code 1 when a pipe closes, but in `fieldtwin ... | head` the reader has received all that it needs.
+        Commands that give a verdict run to their end, and exit with it.
         """
         try:
             result = super().invoke(ctx)
@@ -228,7 +228,7 @@ def main() -> None:
         for other in e.others if isinstance(e, FileInvalid) else ():
             click.echo(f"fieldtwin: {other}", err=True)
         theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
-        sys.exit(theirs if theirs > 0 else e.exit_code)  # negative: a signal ended it
+        sys.exit(theirs if theirs > 0 else e.exit_code)  # a negative exit code means that a signal ended the process
     except OSError as e:
         if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
             _bug(e)

@@ -7,7 +7,8 @@ A command lists its groups in the order in which `--help` shows them:
     @group("Output", click.option("--trace"), json_option)
     def command(replay: ReplayOptions, trace: str, as_json: bool) -> int: ...
 
-Each field of a dataclass such as ``ReplayOptions`` is declared with `option`. This module knows no command and no option.
+Each field of a dataclass such as ``ReplayOptions`` is declared with `option`. This module does not depend on any command or
+option.
 """
 
 from __future__ import annotations
@@ -86,9 +87,9 @@ class GroupedCommand(click.Command):
             record = parameter.get_help_record(ctx)
             if record is not None and isinstance(parameter, click.Option):
                 rows.setdefault(headings.get(parameter.name, _OTHER), []).append(record)
-        rows[_OTHER] = rows.pop(_OTHER, [])  # shown last
+        rows[_OTHER] = rows.pop(_OTHER, [])  # this group is shown last
         lengths = [len(names) for records in rows.values() for names, _ in records]
-        width = max(length for length in lengths if length <= _WIDEST)  # longer ones are on a separate line
+        width = max(length for length in lengths if length <= _WIDEST)  # a longer option is shown on a separate line
         for heading, records in rows.items():
             with formatter.section(heading):
                 formatter.write_dl([(names.ljust(width), text) for names, text in records], col_max=width)

@@ -29,7 +29,7 @@ class NegativeNumbers(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         known = {option for param in self.params for option in (*param.opts, *param.secondary_opts)} | {"--", "--help"}
         words = [a for a in args if a.startswith("-") and a != "-" and not _NEGATIVE.fullmatch(a)]
-        if all(word.partition("=")[0] in known for word in words):  # an unknown option is still an error
+        if all(word.partition("=")[0] in known for word in words):  # any other unknown option is still an error
             ctx.ignore_unknown_options = True
         return super().parse_args(ctx, args)
 
@@ -93,7 +93,7 @@ def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:
 
 
 JSON: dict[str, Any] = {"is_flag": True, "help": "Print data as JSON on stdout."}
-"""The arguments of `json_option`, also for groups of options."""
+"""The arguments of `json_option`, for use in groups of options."""
 json_option = click.option("--json", "as_json", **JSON)
 PROFILES: dict[str, Any] = {
     "multiple": True,
@@ -101,5 +101,5 @@ PROFILES: dict[str, Any] = {
     "help": "A folder of profiles, or with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the "
     "shipped ones.",
 }
-"""The arguments of `profiles_option`, also for groups of options."""
+"""The arguments of `profiles_option`, for use in groups of options."""
 profiles_option = click.option("--profiles", **PROFILES)

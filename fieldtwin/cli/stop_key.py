@@ -19,7 +19,7 @@ class StopKey:
 
     @property
     def listens(self) -> bool:
-        """Return whether there is a keyboard to press `q` on."""
+        """Return whether the program can read keys from a terminal, so that the user can press `q`."""
         return sys.stdin is not None and sys.stdin.isatty()
 
     def pressed(self) -> bool:
@@ -59,7 +59,7 @@ class StopKey:
         try:
             import termios
             import tty
-        except ImportError:  # Windows
+        except ImportError:  # Windows has no terminal attributes
             yield
             return
         descriptor = sys.stdin.fileno()

@@ -31,7 +31,9 @@ class TemplateSearchOptions:
     trust: bool = option("--trust", **TRUST)
 
     def ask(self, *, runs_code: bool = True) -> Ask:
-        """Return how consent is given: by the user at the terminal, or beforehand with --trust, or if no code is run."""
+        """Return the function that obtains consent: it asks the user at the terminal, or consents because of --trust or
+        because no code is run.
+        """
         return lambda template: self.trust or not runs_code or ask_about(template)
 
 

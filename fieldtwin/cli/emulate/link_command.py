@@ -138,7 +138,7 @@ async def _can(near: Endpoint, far: Endpoint, faults: WireFaults) -> None:
 
 
 async def _can_end(endpoint: Endpoint, closing: AsyncExitStack) -> CanConnection:
-    """Join a bus; with ``?listen=1`` run a bus that others join."""
+    """Join a CAN bus; with ``?listen=1`` run a bus that other programs join."""
     if endpoint.param("listen") not in ("1", "true"):
         end = await open_can_end(endpoint, 0)
         closing.push_async_callback(end.aclose)

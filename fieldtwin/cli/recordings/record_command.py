@@ -212,7 +212,7 @@ class _Job:
         return self._summary(file, counters if polled else None, {"frames": file.lines, "lost_here": lost})
 
     def tap(self, near: Endpoint, far: Endpoint) -> int:
-        """Record a line whose two halves this process connects."""
+        """Record a serial line that this process relays between two ports."""
 
         def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
             return LineTap(near, far, sink, say=self._say, clock=self._clock).run
@@ -220,7 +220,7 @@ class _Job:
         return self._line(far, tapped, "tapped", "bytes to the device", "back")
 
     def sniff(self, port: Endpoint) -> int:
-        """Record a line between other devices; one adapter listens to it."""
+        """Record a serial line between other devices, to which one adapter listens."""
         return self._line(
             port,
             lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,

@@ -1,4 +1,4 @@
-"""The tolerances between two runs."""
+"""The options for the tolerances between two runs."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from fieldtwin.twin.site.system import System
 
 SHOWN = 30
 LENGTHS_S = 1.0
-"""A larger difference between the lengths of two runs is reported."""
+"""A difference between the lengths of two runs that is larger than this (seconds) is reported."""
 
 
 def allowed_of(options: ToleranceOptions) -> Allowed:
@@ -44,7 +44,7 @@ def allowed_of(options: ToleranceOptions) -> Allowed:
 
 
 def judged(system: System, old: Path, new: Path, allowed: Allowed) -> RunComparison:
-    """Compare the run in `new` with the run in `old`. Raises `FileInvalid`."""
+    """Compare the run in the file `new` with the run in the file `old`. Raises `FileInvalid`."""
     return compare(
         run_history(system, read_events(old, system)), run_history(system, read_events(new, system)), allowed
     )

@@ -136,7 +136,7 @@ def _decoded(
 
 def _wanted(only: tuple[str, ...], event: TraceEvent, decoded: Decoded) -> bool:
     names = {event.where, event.where.partition(".")[0], *(e.device for e in decoded.exchanges)}
-    told = decoded.text.partition(":")[0]  # a request names its device as well
+    told = decoded.text.partition(":")[0]  # the text of a request already names its device
     return not only or not names.isdisjoint(only) or (event.kind is TraceKind.FRAME and told in only)
 
 

@@ -30,7 +30,7 @@ MAX_TROUBLES = 5
 
 
 def print_mapping(session: RunSession) -> None:
-    """Print once which endpoint stands in for each plant endpoint."""
+    """Print once which endpoint replaces each endpoint of the plant."""
     if not session.options.prototype:
         leave = "writes allowed" if session.options.allow_writes else "read-only"
         stderr.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
@@ -91,7 +91,7 @@ class LiveView:
             try:
                 await self._task
             except asyncio.CancelledError:
-                pass  # requested by the options
+                pass  # the user requested this output with the options
 
     async def _show_table(self) -> None:
         open_ports: set[str] = set()

@@ -26,7 +26,7 @@ instance_option = click.option(
 
 
 def _one_instance(ctx: click.Context, parameter: click.Parameter, named: str) -> str:
-    """Return the instance of --instance or of the argument INSTANCE, which the command does not get."""
+    """Return the instance that --instance or the argument INSTANCE names. The argument is not passed to the command."""
     argument: str = ctx.params.pop("named_instance", "")
     if named and argument and named != argument:
         raise UsageError(f"two instances: {argument!r} and {named!r}", expected="one of them")
@@ -93,7 +93,7 @@ def _call(instance: str, command: str, **args: Any) -> Any:
 
 
 def _act(instance: str, command: str, **args: Any) -> Any:
-    """Send a command that changes the PLC; it is recorded with the user's name."""
+    """Send a command that changes the PLC. The PLC records it with the user's name."""
     import getpass
 
     return _call(instance, command, by=getpass.getuser(), **args)
@@ -240,7 +240,7 @@ def why(tag: str, instance: str, as_json: bool) -> int:
 
 
 def _agreed(system: str, sources: TemplateSearchOptions) -> System:
-    """Return the system whose program is inspected: the program is imported, and nothing is opened."""
+    """Return the system whose program is inspected, after the user has agreed to import its programs. Nothing is opened."""
     from fieldtwin.run.template import system_file
 
     return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)

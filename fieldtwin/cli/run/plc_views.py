@@ -58,7 +58,7 @@ async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
     rows: list[Row] = []
     for at in range(0, len(names), MAX_AT_ONCE):
         rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
-    return sorted(rows, key=lambda row: row["side"])  # which otherwise keep their order
+    return sorted(rows, key=lambda row: row["side"])  # names in the same region keep their order
 
 
 async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
@@ -222,7 +222,9 @@ def without_texts(started_without: Mapping[str, Mapping[str, str]]) -> list[str]
 
 
 def is_now(rows: list[Row], tag: str) -> str:
-    """Return the tag's value before it is forced, with unit and limits; for a tag that is read back, its command."""
+    """Return the present value of a tag that is about to be forced, with unit and limits. For a tag that is read back this is
+    the commanded value.
+    """
     if not rows:
         raise UsageError(f"no tag {tag!r}", expected="a tag without *")
     row = rows[-1]

@@ -60,7 +60,7 @@ def _verdict(applied: bool, changes: int, restart: int, check: bool) -> str:
 def _who() -> str:
     try:
         return f"reload by {getpass.getuser()}"
-    except (KeyError, OSError):  # a user without a name, in a container
+    except (KeyError, OSError):  # in a container the user may have no name
         return f"reload by {os.getuid() if hasattr(os, 'getuid') else 'nobody'}"
 
 

@@ -61,7 +61,7 @@ class PlaceOptions:
     cold: bool = option("--cold", is_flag=True, help="Start the PLC's retained variables with their initial values.")
 
     def check(self) -> None:
-        """Raise `UsageError` unless the user has chosen a place, with options that it has."""
+        """Raise `UsageError` unless the user has chosen either the plant or a prototype, and only options that apply to it."""
         if self.prototype == self.plant:
             raise UsageError(NEITHER if not self.plant else "--plant and --prototype exclude each other")
         if self.prototype and self.allow_writes:
@@ -198,7 +198,8 @@ def command(
     }  # fmt: skip
     systems = systems_of(system, sources, others, OF_A_GROUP, plant=place.plant, virtual=False)
     if systems is not None:
-        from fieldtwin.emulators.faults.schema import load_faults  # here: a plant has no emulators installed
+        # imported here, because a plant has no emulators installed
+        from fieldtwin.emulators.faults.schema import load_faults
         from fieldtwin.run.virtual.group_kinds import LiveRequest, kind_named
 
         return kind_named(systems.kind).run_live(

@@ -40,7 +40,7 @@ class ReplayOptions:
     speed: float = option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
 
     def given(self) -> dict[str, object]:
-        """Return the values by option."""
+        """Return the values that the user gave, by option."""
         return {"--recording": self.recordings, "--speed": self.speed, "--prototype-file": self.prototype_file}
 
 
@@ -77,7 +77,7 @@ def systems_of(
     found = group_file(file, sources.profiles)
     if found is None:
         return None
-    from fieldtwin.twin.prototype.group import read_group  # here: a plant has no emulators installed
+    from fieldtwin.twin.prototype.group import read_group  # imported here, because a plant has no emulators installed
 
     group = read_group(*found, sources.profiles)
     if plant:

@@ -56,7 +56,7 @@ class ServerOptions:
 
 @dataclass(frozen=True)
 class TraceOptions:
-    """How a trace is shown."""
+    """The options for showing a trace."""
 
     at_s: float | None = option(
         "--at", type=Duration(), default=None, metavar="TIME", help="Show this instant of the TRACE first."

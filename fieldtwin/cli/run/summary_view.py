@@ -60,13 +60,13 @@ def print_summary(summary: dict[str, Any]) -> None:
             stdout.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
     _print_refused(summary)
     for one in summary["invariants"]:
-        if one["verdict"] != "failed":  # the failed ones are among the errors
+        if one["verdict"] != "failed":  # the failed checks are among the errors
             said = "holds" if one["verdict"] == "passed" else "not checked"
             text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
             stdout.print(text, soft_wrap=True, markup=False, highlight=False)
     told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
     for error in summary["errors"]:
-        if error in told:  # listed with the device, above
+        if error in told:  # these problems are listed above, with the device
             continue
         stdout.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
     for what in summary["not_judged"]:

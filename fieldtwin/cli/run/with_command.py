@@ -16,7 +16,7 @@ from fieldtwin.console import show_warnings, stderr
 from fieldtwin.gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
-"""Endings of variables that repeat parts of a shorter variable: they are not shown."""
+"""Endings of environment variables that repeat parts of a shorter variable. Such variables are not printed."""
 
 
 @click.command("with", context_settings={"allow_interspersed_args": False})

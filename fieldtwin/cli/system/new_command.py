@@ -119,7 +119,7 @@ def _say(text: str) -> None:
 
 
 def _ask(what: str, choices: tuple[str, ...], asking: bool) -> str:
-    """Ask for one of `choices`; the first is the default."""
+    """Ask the user for one of `choices`; the first is the default."""
     if not asking:
         return choices[0]
     answer: str = click.prompt(what, type=click.Choice(choices), default=choices[0], err=True)
@@ -127,7 +127,7 @@ def _ask(what: str, choices: tuple[str, ...], asking: bool) -> str:
 
 
 def _ask_for_devices(profiles: tuple[Path, ...]) -> list[DeviceWish]:
-    """Ask for devices until the answer is empty. A wrong answer is explained, and asked again."""
+    """Ask for devices until the answer is empty. After an invalid answer, print the error and ask again."""
     from fieldtwin.new_site.devices import site_devices
     from fieldtwin.new_site.wishes import EXAMPLE, parse_device
     from fieldtwin.twin.site.data_files import device_files, search_path

@@ -64,7 +64,7 @@ def _words(options: CampaignOptions) -> tuple[str, ...]:
 
 
 def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -> None:
-    """Print a line for a passed seed, with the faults that took effect; for a failed one everything."""
+    """Print one line for a seed that passed, with the faults that took effect, and the whole result for a seed that failed."""
     if result.verdict is not Verdict.PASSED:
         show(result)
         return

@@ -153,7 +153,7 @@ class DeviceCheck:
                     self.interrupted = True
                     stderr.print("ends after this test case; press Ctrl-C again to end at once", markup=False)
 
-                with suppress(NotImplementedError):  # not on Unix
+                with suppress(NotImplementedError):  # this platform is not Unix
                     asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop)
                 checked: Checked = await task
                 return checked
@@ -185,7 +185,7 @@ class DeviceCheck:
         )
 
     def on_paper(self, checked: Checked) -> int:
-        """Print the frames of a dry run."""
+        """Print the frames of a dry run, which sends nothing."""
         from fieldtwin.cli.test.check_view import print_dry_run
 
         print_dry_run(checked, as_json=self.files.as_json)

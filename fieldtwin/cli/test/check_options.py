@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 IMPACTS = ("observe", "read", "write", "disrupt")
 """The values of `Impact`, in rising order."""
 FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
-"""The number of bases, in the order of `Basis`, that decide the exit code."""
+"""The arguments of --fail-on, each with the number of bases, counted in the order of `Basis`, that then decide the exit code."""
 _FILE = click.Path(dir_okay=False, path_type=Path)
 _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 

@@ -34,7 +34,7 @@ STYLE = {
     Verdict.INCONCLUSIVE: "yellow", Verdict.SKIPPED: "dim",
 }  # fmt: skip
 FINDING = {Basis.ROBUSTNESS: "yellow", Basis.FIELD: "magenta"}
-"""The colours of failures that do not deviate from the standard: never red."""
+"""The colours of failures that do not deviate from the standard. None of them is red."""
 BASIS = {Basis.STANDARD: "default", **FINDING}
 MARK = {
     Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",

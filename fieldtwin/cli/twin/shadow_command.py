@@ -26,7 +26,9 @@ STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "ye
 
 
 class ShadowOutput:
-    """Prints each verdict as it is reached, and changes of the agreed state."""
+    """The console output of a shadow: each verdict as it is reached, and each change of the state on which plant and model
+    agree.
+    """
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
@@ -50,7 +52,7 @@ class ShadowOutput:
             self.line(f"[bold yellow]{where:10}[/]", text or "recovered")
 
     def line(self, word: str, text: str) -> None:
-        """Print a line with the present time; `word` is its label."""
+        """Print a line that begins with the present time and the label `word`."""
         stderr.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
 
 

@@ -163,7 +163,7 @@ def command(
 
 
 class TwinOutput(ShadowOutput):
-    """Prints, in addition, what is simulated, sent and refused."""
+    """The console output of a twin: that of a shadow, and the commands that are simulated, sent and refused."""
 
     def asks(self, command: COMMAND, question: Question) -> None:
         self._say("asks", f"a prototype of period {decode_period(command)} s, {question.horizon_s:g} s ahead")

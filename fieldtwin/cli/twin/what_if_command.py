@@ -155,7 +155,7 @@ def command(
 
 
 def _ahead(seconds: float) -> str:
-    """Return a duration in the form that people use."""
+    """Return a duration as text, in the largest unit of which it contains at least two: ``10 min``, ``90 min``, ``2 h``."""
     for unit, name in ((86_400, "d"), (3600, "h"), (60, "min")):
         if seconds >= 2 * unit:
             return f"{seconds / unit:g} {name}"

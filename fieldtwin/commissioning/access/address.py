@@ -45,7 +45,7 @@ class RawForm:
     """The interpretation of raw addresses.
 
     `type` None is uint16, bool for bits, and for an object it follows from the length; `registers` is the length of
-    text; `count` values follow one another.
+    text; `count` is the number of consecutive values.
     """
 
     type: str | None = None

@@ -28,7 +28,7 @@ def check_plot(path: Path) -> None:
 def _there() -> bool:
     try:
         return find_spec("matplotlib") is not None
-    except ValueError:  # it was removed from the running interpreter
+    except ValueError:  # the module was removed from the running interpreter
         return False
 
 

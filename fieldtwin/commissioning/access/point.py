@@ -53,7 +53,7 @@ OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int3
 
 
 MOST_SILENT = 3
-"""Requests in a row without a reply after which a unit counts as dead for the rest of a reading."""
+"""Number of consecutive requests without a reply after which a unit is not asked again in the same reading."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +96,9 @@ class Point(Protocol):
 
 
 def encoded(tag: Tag, value: Scalar) -> bytes:
-    """Return the bytes of an engineering value as on the bus: registers, or an object's little-endian bytes.
+    """Return the bytes that represent an engineering value on the bus: registers, or the little-endian bytes of an object.
 
-    Raises `NotAllowed` for a value that the tag cannot hold. Bytes are used unchanged.
+    Raises `NotAllowed` for a value that the tag cannot hold. A value of type bytes is returned unchanged.
     """
     if isinstance(value, bytes):
         return value
@@ -173,7 +173,7 @@ class ModbusPoint:
     async def read(
         self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
     ) -> dict[str, PointValue]:
-        """Read as `Point.read`. A tag that is scaled by a second tag reads that tag too.
+        """Read as `Point.read` describes. A tag that is scaled by a second tag reads that tag too.
 
         With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: the tags
         that were requested together keep the answer that they had then.
@@ -212,7 +212,7 @@ class ModbusPoint:
         return found
 
     async def write(self, tag: Tag, data: bytes) -> None:
-        """Write as `Point.write`, with the function that the profile's limits permit."""
+        """Write as `Point.write` describes, with the function that the profile's limits permit."""
         self.requests += 1
         await self.client.execute(self.unit, write_request(tag, data, self._functions))
 
@@ -250,7 +250,7 @@ class ModbusPoint:
         return PointValue(apply_scale(tag, answer.value, by.value if by is not None else None))
 
     def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
-        """Return the gateway's own planner over just these tags; later calls use what was learnt."""
+        """Return the gateway's own planner for these tags only. Later calls use the limits that were learnt."""
         key = tuple(t.name for t in tags)
         if key not in self._plans:
             self._plans[key] = GroupPlan(asked_profile(tags, self._profile), "asked", self.learnt)
@@ -276,7 +276,7 @@ class CanopenPoint:
     async def read(
         self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
     ) -> dict[str, PointValue]:
-        """Read as `Point.read`: one transfer a tag, so `alone` has no effect."""
+        """Read as `Point.read` describes. Each tag is a separate transfer, so `alone` has no effect."""
         answers: dict[str, PointValue] = {} if found is None else found
         for tag in tags:
             assert tag.object is not None

@@ -88,7 +88,7 @@ async def point_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[Point]:
-    """Yield the device, ready for queries; opening sends nothing. Errors as `modbus_at` and `canopen_at`.
+    """Yield the device, ready for queries; opening sends nothing. Raises the same errors as `modbus_at` and `canopen_at`.
 
     The profile's timing is respected: its pause between exchanges, and its response time if that is longer.
     """

@@ -1,6 +1,6 @@
 """Read values of one device repeatedly: their bounded history, and a sparkline of it.
 
-This module must never write, and never reads faster than requested. It does no output.
+This module must never write, and never reads faster than requested. It prints nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class History:
             self.least, self.most = min(self.least, number), max(self.most, number)
 
     def sparkline(self, width: int) -> str:
-        """Return the last `width` samples as blocks between their smallest and largest; a blank for a missing value."""
+        """Return the last `width` samples as blocks between their smallest and largest; a missing value is a blank."""
         return sparkline(list(self.values)[-width:])
 
 

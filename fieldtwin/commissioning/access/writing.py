@@ -20,7 +20,7 @@ _TRUE, _FALSE = ("true", "on", "yes"), ("false", "off", "no")
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One permitted write: no rule known before querying the device forbids it. `warnings` are for the prompt."""
+    """One permitted write: no rule that can be checked without the device forbids it. `warnings` are for the prompt."""
 
     tag: Tag
     value: Scalar
@@ -47,7 +47,7 @@ def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = Fal
     """Return the write of `text` (a number, the name of a profile's value, ``on``, ``hex:0102``) to `tag`.
 
     Raises `NotAllowed` for a write that the profile forbids: read-only, outside the limits; dangerous without `i_know`;
-    a nonvolatile value that is to be restored at once (two writes where one wears).
+    a nonvolatile value that is to be restored at once, because this takes two writes and each write wears the memory.
     """
     if not tag.writable:
         raise NotAllowed(f"{tag.name} is read-only", hint="the profile's `access` defines what may be written")
@@ -141,7 +141,7 @@ async def before(point: Point, write: Write) -> PointValue | None:
 
 
 async def carry_out(point: Point, write: Write, old: PointValue | None) -> Written:
-    """Write, read back, compare. A nonvolatile value that is held already is not written.
+    """Write the value, read it back, and compare. A nonvolatile value that is held already is not written.
 
     Raises `VerifyFailed` when the device acknowledged the write but holds a different value, and the errors of
     connection and device.
@@ -158,7 +158,7 @@ async def carry_out(point: Point, write: Write, old: PointValue | None) -> Writt
 async def restore(point: Point, done: Written) -> Written:
     """Restore the value from before the write, and read it back. If the device holds it already, nothing is written.
 
-    Raises `NotAllowed` where the old value is not known, otherwise as `carry_out`.
+    Raises `NotAllowed` where the old value is not known, otherwise the same errors as `carry_out`.
     """
     tag = done.write.tag
     if done.before is None:

@@ -1,1 +1,1 @@
-"""Dump everything that a device holds into a file, and compare such dumps."""
+"""Read all registers or objects of a device into a file (a dump), and compare such dumps."""

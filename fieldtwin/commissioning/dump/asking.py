@@ -54,7 +54,7 @@ PROBES: tuple[tuple[int, Request[Any]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class AskResult:
-    """The result of a question.
+    """The result of one question to a device.
 
     `us` is the time in microseconds from the question to the last byte of the answer, `requests` the number of requests
     sent.
@@ -66,14 +66,14 @@ class AskResult:
 
 
 class DeviceReader(Protocol):
-    """Asks one device."""
+    """The interface of a reader of one device."""
 
     async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
         """Read a range or an object, without any retry unless `patient`. Raises only errors that end the connection."""
         ...
 
     async def function(self, request: Request[Any]) -> AskResult:
-        """Send that request."""
+        """Send a request with this function code and return the result."""
         ...
 
 

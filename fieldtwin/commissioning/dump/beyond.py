@@ -21,7 +21,9 @@ LENGTHS = (1, 2, 4, 8, 16, 32)
 
 
 def beyond_silence(sweep: Sweep) -> Asking:
-    """Sample the addresses of `sweep` that the device has not answered for. Where it answers, ask on from there."""
+    """Sample the addresses of `sweep` that the device has not answered for. Where the device answers, continue to ask from
+    that address.
+    """
     span, known = sweep.span, sweep.coverage
     sweep.most_silent = SILENT_AGAIN
     for at in coarse_to_fine(span.address, span.end, sweep.stride, LEVELS):

@@ -1,7 +1,7 @@
 """Compare two dumps, or a dump with a profile or an EDS. Differences are named where names are known.
 
-Pure. A difference is one that two devices of one kind, or a device and its profile, should not have; anything else that
-the user should know is a note.
+Pure. A difference is something in which two devices of one kind, or a device and its profile, should agree and do not. Other
+facts that the user should know are notes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 NOT_THERE = 0x0602_0000
 NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)
-"""SDO abort codes that mean "no data now" or "not in this state": the object exists."""
+"""SDO abort codes that mean "no data now" or "not in this state", which show that the object exists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +305,7 @@ def _access(line: Mapping[str, object]) -> str:
 
 
 def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
-    """Add the reads that the profile's driver would send and the device refuses."""
+    """Add a difference for each read that the profile's driver would send and the device refuses."""
     limits = profile.form.limits
     for table, line in dump.maps.items():
         longest = int(line.get("max_read") or 0)

@@ -41,10 +41,12 @@ from fieldtwin.results.subject import who
 DEFAULT_BUDGET_S = 600.0
 ALL_TABLES = tuple(RegisterRange(table, 0, 65536) for table in TABLES)
 NOT_OF_THE_JOB = ("ended", "latency", "resumed")
-"""Lines that every session writes for itself."""
+"""The kinds of lines that each session writes and that do not belong to the job."""
 
 Progress = Callable[[int, int, int], None]
-"""``(done, total, requests)``: addresses (or reads of a later pass) done and in all, and requests sent."""
+"""``(done, total, requests)``: the number of addresses (or reads of a later pass) that are done, the number of all, and the
+number of requests sent.
+"""
 Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 
 
@@ -52,11 +54,11 @@ Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 class DumpJob:
     """The task of a dump.
 
-    For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride`
-    as in `Sweep`; `most` is the longest read to try; `pairs`: the device has pairs of registers only. It makes `passes`
-    passes, one every `every_s` seconds from start to start. `functions`: find out which harmless functions exist.
-    `budget_s`: the time that each table (or the objects) may take for questions without a result, where the device is
-    silent or allows a value to be read only whole. `spacing_s`: the pause after each request, which counts against it.
+    For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride` is that
+    of `Sweep`; `most` is the longest read to try; `pairs`: the device has pairs of registers only. It makes `passes` passes,
+    one every `every_s` seconds from start to start. `functions`: find out which harmless functions exist. `budget_s`: the time
+    that each table (or the objects) may take for questions without a result, where the device is silent or allows a value to
+    be read only whole. `spacing_s`: the pause after each request, which counts against it.
     """
 
     target: DeviceTarget

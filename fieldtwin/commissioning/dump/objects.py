@@ -58,7 +58,7 @@ class _Patience:
         return self._silent >= MOST_SILENT
 
     def note(self, outcome: Outcome) -> None:
-        """Record the outcome of a question."""
+        """Record the outcome of a question, to know whether the node is silent."""
         self._silent = self._silent + 1 if isinstance(outcome, Silent) else 0
         self._heard |= not isinstance(outcome, Silent)
         self._spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
@@ -125,7 +125,7 @@ class ObjectSweep(_Patience):
 
 
 class ListedObjects(_Patience):
-    """Asks for `keys`, one after the other; without retries while the node is silent."""
+    """A sweep that asks for `keys`, one after the other, without retries while the node is silent."""
 
     def __init__(self, keys: Iterable[ObjectKey], budget_us: int | None = None) -> None:
         super().__init__(budget_us)

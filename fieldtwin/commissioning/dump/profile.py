@@ -46,7 +46,8 @@ class ProfileSweep:
                 found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1
             if isinstance(outcome, RefusedRead) and outcome.code in (ILLEGAL_ADDRESS, TOO_LONG):
                 todo[:0] = self.plan.refused(read, outcome.code)
-            elif isinstance(outcome, Silent | Invalid) and heard:  # one register of several may be the reason
+            # one of several registers may be the reason for the refusal
+            elif isinstance(outcome, Silent | Invalid) and heard:
                 todo[:0] = self.plan.refused(read)
             silent = silent + 1 if isinstance(outcome, Silent) else 0
             heard |= not isinstance(outcome, Silent)
@@ -67,7 +68,9 @@ class ProfileSweep:
 
 
 def _let_alone(profile: DeviceProfile, tags: Sequence[Tag]) -> list[RegisterRange]:
-    """Return the registers of tags that are not wanted, so that a read over a gap between two others does not include them."""
+    """Return the registers of tags that must not be read, so that a read over a gap between two other tags does not include
+    them.
+    """
     wanted = [t.registers for t in tags]
     others = [t.registers for t in profile.tags.values() if t.name not in {w.name for w in tags}]
     return [o for o in others if not any(w.overlaps(o) for w in wanted)]

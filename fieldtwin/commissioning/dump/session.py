@@ -32,12 +32,12 @@ REPLY_S = 0.01
 """Assumed response time of a device, for an estimate."""
 _INDEXES = re.compile(r"^(?:0x)?([0-9A-Fa-f]{4})h?(?:\.\.(?:0x)?([0-9A-Fa-f]{4})h?)?$")
 CAN_BITS = 2 * 130
-"""Bits of an SDO request and its reply, stuffed."""
+"""Number of bits of an SDO request and its reply on the bus, with stuff bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The number of requests and the duration of the first pass, if everything can be read and if nearly nothing can.
+    """The number of requests and the duration of the first pass, if everything can be read, and if nearly nothing can be read.
 
     `budgets_s` is the additional time that questions without a result may take, in all tables together. `shorter` names
     what the user can give to make the dump shorter.

@@ -23,7 +23,7 @@ ILLEGAL_FUNCTION = 0x01
 DENSE = 8
 """Number of addresses after a readable one that are all tried before a sweep strides."""
 ROUND = 50
-"""A stride also stops at multiples of this, because manuals like round numbers."""
+"""A sweep that strides also tries multiples of this, because blocks of registers often begin at round numbers."""
 MOST_SILENT = 10
 """Number of consecutive reads without a reply after which a sweep stops trying single addresses."""
 TRUSTED_SILENCE = 2
@@ -99,7 +99,7 @@ class TableMap:
         return sum(end - start for start, end in self.readable)
 
     def add_unit(self, start: int, end: int, size: int) -> None:
-        """Take down that reads from `start` to before `end` take multiples of `size` registers."""
+        """Record that reads from `start` to before `end` must have a multiple of `size` registers."""
         self.units = [u for u in self.units if not (start <= u[0] and u[1] <= end)] + [(start, end, size)]
 
     def reads(self) -> list[RegisterRange]:
@@ -119,7 +119,7 @@ class TableMap:
 class Sweep:
     """An exploration of `span`. `most` is the longest read to try (None: the standard's). `stride` 1 reads every address.
 
-    `found` and `coverage` grow as `asking` runs. `patient` is whether the last yielded question deserves retries.
+    `found` and `coverage` are filled while `asking` runs. `patient` is whether the last yielded question deserves retries.
     `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the pause after
     each.
     """
@@ -158,7 +158,7 @@ class Sweep:
 
     @property
     def halted(self) -> bool:
-        """Return whether the sweep must not ask more here: it was stopped, or the device has become silent."""
+        """Return whether the sweep must stop asking here, because it was stopped or the device has become silent."""
         return bool(self.found.stopped) or self._lost
 
     def asking(self) -> Asking:
@@ -244,7 +244,7 @@ class Sweep:
             if unit := (yield from self.ask_the_length_that_came(edge)):
                 return edge + unit
             if grain == 1 and self.in_words and edge + 2 <= self.span.end and (yield from self.ask(edge, 2)):
-                self.found.borders.append(edge)  # a value of two registers that may not be cut
+                self.found.borders.append(edge)  # two registers form one value, which a read must not cut
                 return edge
             return (yield from self.through_a_void(edge + grain))
         if good > grain and not (yield from self.ask(edge - grain, 2 * grain)):
@@ -316,7 +316,7 @@ class Sweep:
         return max(jump + -jump % grain, probe + grain)
 
     def ask(self, address: int, count: int) -> Trying:
-        """Ask for `count` cells from `address` and take down the outcome. Return whether the device gave them."""
+        """Ask for `count` cells from `address` and record the outcome. Return whether the device returned their values."""
         if self.found.stopped:
             return False
         self.asked.add((address, count))

@@ -1,6 +1,6 @@
 """`identify` of a CANopen node: 1000h, 1008h, 1009h, 100Ah and 1018h, compared with the data sheets of known profiles.
 
-Reads only, one object at a time with a pause after each.
+It only reads, one object at a time, with a pause after each.
 """
 
 from __future__ import annotations

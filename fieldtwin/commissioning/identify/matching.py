@@ -21,12 +21,12 @@ from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 ENOUGH_SIGNS = 6
 """Number of plausible values, out of those that could have been implausible, that make a map likely."""
 TELLING_BYTES = 4
-"""A server id shorter than this is many devices'."""
+"""A server ID shorter than this many bytes is shared by many devices, so it identifies none."""
 _SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")
 
 
 class Sureness(IntEnum):
-    """The certainty with which a profile fits; ordered."""
+    """The certainty with which a profile fits, in rising order."""
 
     RULED_OUT = 0
     POSSIBLE = 1
@@ -51,7 +51,9 @@ class SunSpec:
 
 @dataclass(slots=True)
 class ModbusClues:
-    """A unit's own identification. None: not obtained, for the reason in `silence` (by function, ``"2B"``)."""
+    """The identification that a unit gives of itself. None: the unit gave none, for the reason in `silence` (by function, such
+    as ``"2B"``).
+    """
 
     server_id: bytes | None = None
     objects: dict[int, str] | None = None
@@ -61,7 +63,7 @@ class ModbusClues:
 
 @dataclass(slots=True)
 class CanClues:
-    """A node's own identification."""
+    """The identification that a node gives of itself."""
 
     identity: Identity | None = None
     name: str = ""
@@ -223,7 +225,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, ProfileReading]) -> tup
     for entry in profile.form.identify:
         reading = readings.get(entry.tag)
         if reading is None or (reading.value is None and not reading.refused):
-            continue  # lost in transit: no evidence
+            continue  # the reply was lost in transit, so it is no evidence
         value = reading.value.value if reading.value is not None else None
         if value is None:
             wrong.append(f"{entry.tag} cannot be read: {reading.problem or 'no value'}")

@@ -1,4 +1,6 @@
-"""`identify` of a Modbus unit: its own identification, then whether a known profile's registers are plausible. Reads only."""
+"""`identify` of a Modbus unit: read the unit's own identification, then check whether the registers of known profiles have
+plausible values. It only reads.
+"""
 
 from __future__ import annotations
 

@@ -21,7 +21,9 @@ def text_of(data: bytes) -> str:
 
 
 def common(data: bytes) -> dict[str, str]:
-    """Return the names in model 1, whose registers from its number on are `data`; as far as they go."""
+    """Return the names in model 1 (manufacturer, model, ...). `data` are its registers from its number on, possibly not all of
+    them.
+    """
     return {name: text_of(data[2 * at : 2 * (at + size)]) for name, (at, size) in _FIELDS.items()}
 
 

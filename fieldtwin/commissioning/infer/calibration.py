@@ -1,4 +1,4 @@
-"""Calibrate the model's probabilities by the share of right readings on generated maps whose truth is known.
+"""Calibrate the model's probabilities with the share of right readings on generated register maps whose meaning is known.
 
 The model's arithmetic takes its assumptions for granted, so its probabilities are too high where registers could be
 read in several ways that look the same. Each kind of reading therefore has a curve from the model's probability to the
@@ -20,7 +20,7 @@ UPPER_HALF = "may be its upper half"
 """Part of the reason why a reading is capped that has a neighbour with which it could be one longer number."""
 
 OTHER_HALF = "it may be the upper half of"
-"""The same for a register that never changed, with a neighbour that did."""
+"""Part of the reason why the reading of a register that never changed is capped, if its neighbour did change."""
 
 CURVES: dict[str, Curve] = {
     "single": ((2.31, 0.9359), (8.97, 0.9904)),

@@ -191,7 +191,7 @@ def _float_cost(numbers: Sequence[float], kind: str) -> float:
     decades = 3.2 if -2 <= size <= 5 else 6.0 if -6 <= size <= 9 else 12.0
     powers = [math.frexp(x)[1] for x in numbers if x != 0]
     leaps = [abs(b - a) for a, b in pairwise(powers)]
-    decades += 3.0 * max(0.0, median(leaps) - 1) if leaps else 0.0  # it leaps over powers of two
+    decades += 3.0 * max(0.0, median(leaps) - 1) if leaps else 0.0  # the series jumps over powers of two
     start = decades + (1.0 if first < 0 else 0.3) + _mantissa_cost(first, kind)
     ordered = [_ordered(x, kind) for x in numbers]
     return start + min(walk_cost(ordered), _TEMPER * _real_steps_cost(numbers, bits))

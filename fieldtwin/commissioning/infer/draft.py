@@ -140,7 +140,9 @@ def _flags(reading: Interpretation) -> list[str]:
 
 
 def _states(dumps: Sequence[Dump]) -> list[str]:
-    """Return comments on addresses outside the draft, so that silence is not taken for a refusal."""
+    """Return comments on the addresses that the draft leaves out, so that a reader does not take silent addresses for refused
+    ones.
+    """
     lines = []
     for line in (m for d in dumps for m in d.maps.values() if "counts" in m):
         counts = line["counts"]

@@ -30,7 +30,9 @@ from fieldtwin.gateway.core.files.profile import REGISTERS_OF
 from fieldtwin.gateway.devices.codec import reorder
 
 CERTAIN, LIKELY, GUESS = 0.9997, 0.80, 0.50
-"""`CERTAIN` is a probability of the model; the others are calibrated."""
+"""The smallest probability of each level. `CERTAIN` is compared with the probability of the model, the others with the
+calibrated one.
+"""
 FEWEST_PASSES, FEWEST_VALUES = 6, 4
 """With fewer passes, or fewer different values, no reading is certain."""
 
@@ -165,7 +167,7 @@ def _tiles(words: Sequence[Sequence[int]], start: int) -> list[_Tile]:
     for size in range(2, min(MOST_TEXT_REGISTERS, len(words) - start) + 1):
         last = words[start + size - 1]
         if any(w != last[0] for w in last) or (size == 2 and any(w != words[start][0] for w in words[start])):
-            break  # text does not change
+            break  # a text does not change
         row = [w[0] for w in words[start : start + size]]
         for order in orders_of("string"):
             price = cost([row] * len(last), "string", order)

@@ -21,9 +21,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
 
 FLOCK = 3
-"""Number of floats of one word order at which they support each other."""
+"""If the device has at least this many floats of one word order, they support each other."""
 PRIOR_WEIGHT = 4.0
-"""Weight of the general knowledge about devices, in number of registers seen."""
+"""Weight of the general knowledge about byte orders of devices, expressed as a number of registers of this device."""
 SINGLE_COST = 7.0
 """Cost of a value of one register where the device has pairs only."""
 REGISTER_TABLES, BIT_TABLES = ("holding", "input"), ("coil", "discrete")
@@ -31,7 +31,7 @@ REGISTER_TABLES, BIT_TABLES = ("holding", "input"), ("coil", "discrete")
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The history of cells: per table and address a word (or bit) for each pass. Only cells that every pass has."""
+    """The history of cells: per table and address a word (or bit) for each pass. It contains only cells that every pass has."""
 
     times_s: tuple[float, ...]
     cells: Mapping[str, Mapping[int, Sequence[int]]]
@@ -49,7 +49,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Inference:
-    """Readings in the order of tables and addresses; bits as they were."""
+    """The inferred readings of the registers in the order of tables and addresses, and the bits, unchanged."""
 
     series: Series
     readings: tuple[Interpretation, ...]
@@ -117,7 +117,7 @@ def infer(series: Series) -> Inference:
 def _between(
     address: int, words: Sequence[Sequence[int]], clocks: Sequence[Interpretation]
 ) -> list[tuple[int, Sequence[Sequence[int]]]]:
-    """Return the parts of a run between its clocks."""
+    """Return the parts of a run of registers that are left between the registers of clocks."""
     taken = {r.address - address for r in clocks}
     parts: list[tuple[int, list[Sequence[int]]]] = []
     for i, word in enumerate(words):

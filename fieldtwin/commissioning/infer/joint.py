@@ -1,4 +1,5 @@
-"""Evidence that only neighbouring registers show together: a carry from the low into the high word, and single bits.
+"""Evidence beyond the numbers of one register: a carry from the low word into the high word of a neighbour, and single bits of
+status words.
 
 Pure arithmetic in nats, as `costs` is.
 """

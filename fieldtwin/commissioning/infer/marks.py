@@ -93,7 +93,7 @@ def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
 
 
 def _likeness(reading: Interpretation, numbers: Sequence[float], *, whole: bool) -> list[str]:
-    """Return notes on mere resemblances."""
+    """Return notes for a reading that resembles a counter, a state or a time without proof."""
     if reading.type.startswith("float") or whole:
         for scale in SCALES if whole else (1.0,):
             for (low, high), what, unit in _MAINS:

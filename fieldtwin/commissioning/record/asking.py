@@ -1,7 +1,7 @@
 """Send one arbitrary request to a live device and return the result as a recording keeps it: PDU in, `RecordedExchange` out.
 
-The gateway's own Modbus client sends it, with its silences and its validation of replies. It never retries; a fault of
-the connection is an outcome. This module must never decide which requests are allowed: the caller does, with `changes`.
+The gateway's own Modbus client sends it, with its silences and its validation of replies. It never retries; a fault of the
+connection is a possible outcome. This module must never decide which requests are allowed: the caller does, with `changes`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def frame_for(url: str, unit: int, pdu: bytes) -> bytes | None:
 
 
 class _Sent(Tap):
-    """A tap that notes the time of the last byte of the last sent frame."""
+    """A tap that records the time of the last byte of the latest sent frame."""
 
     def __init__(self, char_time_ns: int) -> None:
         self.t_ns = 0
@@ -70,7 +70,9 @@ class _Sent(Tap):
 
 
 class RecordingClient:
-    """Asks through `client`. Times count from `zero_ns` of `clock`."""
+    """A sender of single requests through `client`, which returns recorded exchanges. Their times count from `zero_ns` of
+    `clock`.
+    """
 
     def __init__(self, client: ModbusClient, clock: Clock, endpoint: Endpoint, sent: _Sent, zero_ns: int) -> None:
         self.client = client

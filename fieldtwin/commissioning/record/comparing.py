@@ -30,7 +30,7 @@ MAX_FRAMES = 1_000_000
 
 Progress = Callable[[int], None]
 Cell = tuple[str, int]
-"""Table and address."""
+"""A register or bit: its table and address."""
 
 
 def cells_written(request: bytes) -> set[Cell]:
@@ -105,7 +105,7 @@ async def _ask_all(
 
 
 class _Kept(Tap):
-    """The frames that passed, as (ns, frame)."""
+    """A tap that keeps the frames on the bus, as (ns, frame)."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[int, CanFrame]] = []

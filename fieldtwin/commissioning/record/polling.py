@@ -46,7 +46,7 @@ class PollCounters:
 
 
 class Round(Protocol):
-    """The requests of a round."""
+    """The interface of a source of requests for each round."""
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
@@ -70,7 +70,7 @@ class ProfileRound:
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
-        """As `Round.asks`."""
+        """Return the requests of the current round, as `Round.asks` describes."""
         return [(self._unit, _request(read)) for plan in self._plans for read in plan.reads]
 
     async def __call__(self, asker: RecordingClient, sink: Sink) -> None:
@@ -118,7 +118,7 @@ class SameRequests:
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
-        """As `Round.asks`."""
+        """Return the requests of the current round, as `Round.asks` describes."""
         return list(self.requests)
 
     async def __call__(self, asker: RecordingClient, sink: Sink) -> None:

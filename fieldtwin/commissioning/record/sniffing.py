@@ -33,7 +33,7 @@ class Directions:
         self._last_ns: int | None = None
 
     def feed(self, data: bytes, t_ns: int) -> list[tuple[Direction, ModbusFrame]]:
-        """Add a chunk received at `t_ns`; return the frames that are now complete, oldest first, including damaged ones."""
+        """Add bytes received at `t_ns`; return the frames that are now complete, oldest first, including damaged ones."""
         found = self.settle(t_ns)
         self._last_ns = t_ns
         return found + [self._told(frame) for frame in self._splitter.feed(data, t_ns)]
@@ -60,7 +60,7 @@ class Directions:
 
 
 class LineSniffer:
-    """Listens at `port` and gives every frame with its direction to `sink`."""
+    """A passive listener at `port` that passes every frame with its direction to `sink`."""
 
     def __init__(
         self, port: Endpoint, sink: LineSink, *, say: Say = lambda text: None,

@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 
 _STUFF = 1.1
-"""Bits on the bus per bit of a frame, with the stuff bits of usual data."""
+"""Number of bits on the bus for each bit of a frame, with the stuff bits that usual data need."""
 
 
 @dataclass(slots=True)
@@ -50,10 +50,10 @@ class ObservedBus:
     bits: float = 0.0
     nodes: dict[int, ObservedNode] = field(default_factory=dict)
     sdo_masters: dict[int, int] = field(default_factory=dict)
-    """Node -> time (ns) of the last SDO request that another master sent to it."""
+    """The time (ns) of the last SDO request that another master sent to each node."""
     nmt_commands: int = 0
     commands: int = 0
-    """RPDOs, by the predefined identifiers."""
+    """The observed RPDOs, by the predefined identifiers."""
     syncs: int = 0
     sync_producers: str = ""
     """The reason to assume more than one SYNC producer; empty without evidence."""
@@ -73,7 +73,7 @@ class ObservedBus:
 
 
 class BusListener:
-    """Feed it every frame that is received."""
+    """A listener that is fed every received frame, and keeps the totals of the observation."""
 
     def __init__(self) -> None:
         self.heard = ObservedBus()

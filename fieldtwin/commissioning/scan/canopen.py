@@ -1,8 +1,8 @@
 """`scan` of a CANopen bus: listen, then read 1000h from each node, then LSS fastscan for nodes without an ID.
 
 The reads are limited in rate. Nothing is sent before the bus has been observed. Nothing is sent at all if traffic was
-heard and the user did not allow sharing the bus. No SDO is sent to a node that exchanges SDOs with another master: two
-clients on one channel ruin each other's transfers.
+heard and the user did not allow sharing the bus. No SDO is sent to a node that exchanges SDOs with another master: two clients
+on one SDO channel disturb each other's transfers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from fieldtwin.gateway.wallclock import WallClock
 
 ALL_NODES = tuple(range(1, cob_id.NODE_MAX + 1))
 ADAPTER_RATES = (125_000, 250_000, 500_000, 1_000_000, 50_000, 20_000, 100_000, 800_000, 10_000)
-"""Bit/s of CiA 301, 5.3, likely ones first."""
+"""The bit rates (bit/s) of CiA 301, 5.3, likely ones first."""
 RATE_LISTEN_S = 1.0
 QUIET_S = 0.5
 """Time in seconds that another master's SDO must have been silent before the scan sends one."""
@@ -55,7 +55,7 @@ class CanScanOptions:
 
 @dataclass(slots=True)
 class CanScan:
-    """The findings of a scan so far. `blocked`: nodes that exchange SDOs with another master, not queried by the scan."""
+    """The findings of a CANopen scan so far. `blocked`: nodes that exchange SDOs with another master, not queried by the scan."""
 
     url: str
     bitrate: int = 0
@@ -69,7 +69,7 @@ class CanScan:
     took_s: float = 0.0
     stopped: bool = False
     conflicts: dict[int, str] = field(default_factory=dict)
-    """By node ID: the reason to assume two nodes with it."""
+    """For each node ID that two nodes seem to have: the reason to assume so."""
     notes: list[str] = field(default_factory=list)
 
     @property

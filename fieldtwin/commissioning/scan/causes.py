@@ -18,10 +18,10 @@ from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2
-"""A share of errors that cannot be chance."""
+"""A share of errors above this cannot be chance."""
 HEALTHY = 0.97
 ENOUGH_TEXT = 12
-"""Fewer readable bytes are chance."""
+"""If fewer readable bytes than this arrived, they may be readable by chance."""
 _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 """The bytes that a receiver gets when the bits of the sender are many times longer than those of the receiver."""
 

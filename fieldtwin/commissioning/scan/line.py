@@ -1,4 +1,5 @@
-"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. It is a thin layer around `causes`.
+"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. This module collects the evidence;
+`causes` finds the causes.
 
 Nothing is sent, except one question if the user requested a probe: only a probe can show an echo. A probe is not sent
 into foreign traffic without permission.
@@ -162,7 +163,7 @@ class _Looker:
             while sweep.asked < 2 and (step := sweep.poll(clock.monotonic_ns())) is not None:
                 if isinstance(step, SendRequest):
                     if sweep.asked > 1:
-                        break  # only one question is sent: it is not repeated if the answer is damaged
+                        break  # only one question is sent, which is not repeated even if the answer is damaged
                     sent = step.data
                     await connection.write(sent)
                     sweep.handed_over(clock.monotonic_ns())

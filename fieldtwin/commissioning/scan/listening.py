@@ -1,8 +1,8 @@
 """Find the settings of a serial line by listening at one setting after another. Nothing is sent. Pure.
 
-A line that carries traffic yields bytes at every setting, so one attempt is enough to detect silence. The setting at
-which the bytes form whole frames is the right one. The parity is known where the port counts its errors; an additional
-stop bit cannot be detected, because a receiver checks only one.
+A line that carries traffic yields bytes at every setting, so listening at one setting is enough to detect a silent line. The
+setting at which the bytes form whole frames is the right one. The parity is known if the port counts parity errors; an
+additional stop bit cannot be detected, because a receiver checks only one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ ENOUGH_BYTES = 400
 
 @dataclass(frozen=True, slots=True)
 class Audition:
-    """The bytes received at `settings`, and the port's error counts meanwhile (None: it has no counters)."""
+    """The result of listening at `settings`: the bytes received, and the errors that the port counted meanwhile (None: it has
+    no counters).
+    """
 
     settings: SerialSettings
     heard: Heard
@@ -89,7 +91,7 @@ def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
 
 
 def worth_hearing(first: SerialSettings, candidates: Sequence[SerialSettings]) -> list[SerialSettings]:
-    """Return `first`, then the others, each once."""
+    """Return the settings at which to listen, each once: `first`, then the other likely ones."""
     return list(dict.fromkeys([first, *candidates]))
 
 

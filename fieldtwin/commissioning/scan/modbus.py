@@ -28,7 +28,7 @@ from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing
 from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
-"""Silence in seconds before each question on a line with another client."""
+"""Silence in ns before each question on a line with another client."""
 QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
 """Default timeout of each reply, in seconds.
 
@@ -71,7 +71,7 @@ class FoundUnit:
 
 @dataclass(slots=True)
 class ModbusScan:
-    """The findings of a scan so far; complete when `stopped` is False."""
+    """The findings of a Modbus scan so far; they are complete if `stopped` is False."""
 
     url: str
     heard: Heard | None = None
@@ -142,7 +142,9 @@ class ModbusScanner:
         return self.result
 
     def _doubt(self) -> None:
-        """Note doubtful units: any exception counts as a unit, but one exception does not prove it."""
+        """Mark doubtful units: the scan counts every exception as an answer of a unit, but a single exception does not prove
+        that the unit exists.
+        """
         failures = [f.answer.unit for f in self.result.units if f.answer.exception == 4]
         if len(failures) >= MANY_FAILURES:
             self.result.notes.append(
@@ -222,7 +224,7 @@ class ModbusScanner:
             if verdict is not None and verdict.sure:
                 break
             best = max(result.auditions, key=lambda a: (a.heard.sure, a.heard.share))
-            if best.heard.share > 0.2:  # the baud rate is right: only the parity is open
+            if best.heard.share > 0.2:  # the baud rate is right, and only the parity is unknown
                 kin = [s for s in siblings(best.settings) if s not in [a.settings for a in result.auditions]]
                 if not kin:
                     break
@@ -402,7 +404,7 @@ class ModbusScanner:
         self.result.units.sort(key=lambda f: f.answer.unit)
 
     async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> SharedUnitIds | None:
-        """Ask all units again whose answers differed. This shows whether one device with a changing register answered, or many
+        """Ask again all units whose answers differed. This shows whether one device with a changing register answered, or many
         devices.
         """
         sweep = UnitSweep(

@@ -11,7 +11,9 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 @dataclass(frozen=True, slots=True)
 class OddReply:
-    """The same mismatched reply, from one unit or from many. `pdu` is empty if it was not a whole frame."""
+    """A reply that does not fit its question, and the units (one or many) that sent it. `pdu` is empty if it was not a whole
+    frame.
+    """
 
     units: tuple[int, ...]
     settings: SerialSettings | None

@@ -39,7 +39,7 @@ def stated_settings(endpoint: Endpoint) -> SerialSettings | None:
 
 
 def with_settings(endpoint: Endpoint, settings: SerialSettings) -> Endpoint:
-    """Return the same port with other settings."""
+    """Return the same port with different settings."""
     kept = tuple((k, v) for k, v in endpoint.params if k not in ("baudrate", "frame"))
     return replace(endpoint, params=(("baudrate", str(settings.baudrate)), ("frame", settings.frame), *kept))
 
@@ -140,7 +140,7 @@ def likely_settings(endpoint: Endpoint) -> list[SerialSettings]:
 
 
 def _open(endpoint: Endpoint, settings: Sequence[SerialSettings]) -> list[SerialSettings]:
-    """Return `settings` with the endpoint's stated values inserted, each once."""
+    """Return `settings`, in which the values that the endpoint states replace the others; equal results occur once."""
     said = dict(endpoint.params)
     baudrate, frame = endpoint.serial.baudrate, endpoint.serial.frame
     return list(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fieldtwin.commissioning.scan.sweep import UnitAnswer
 
 SPREAD = 32
-"""Number of IDs, spread over the whole range, that must give the same answer before they are taken for one device."""
+"""If this many IDs, spread over the whole range, give the same answer, they are taken for one device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class SharedUnitIds:
 def detect_shared_unit_ids(
     answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()
 ) -> SharedUnitIds | None:
-    """Return how likely the units that answered, of `asked`, are one device.
+    """Return whether the units that answered, out of `asked` IDs, are certainly or possibly one device.
 
     `again` are their answers to a second round. None if they are several devices, or fewer than three units.
     """

@@ -43,12 +43,12 @@ class UnitAnswer:
     exception: int
     latency_ns: int
     late: bool = False
-    """The reply came after the timeout, which is too short for this unit."""
+    """Whether the reply came after the timeout, which is then too short for this unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class SendRequest:
-    """The step "write `data` now, which is the request to `unit`, and then call `handed_over`"."""
+    """A step of a sweep: write `data`, which is the request to `unit`, now; then call `handed_over`."""
 
     unit: int
     data: bytes
@@ -56,7 +56,7 @@ class SendRequest:
 
 @dataclass(frozen=True, slots=True)
 class WaitForBytes:
-    """Wait until `until_ns`, unless bytes arrive."""
+    """A step of a sweep: wait until `until_ns`, or until bytes arrive."""
 
     until_ns: int
 
@@ -76,7 +76,7 @@ class _Asked:
 def expected_s(
     units: int, request_chars: int, *, char_time_s: float, timeout_s: float, interval_s: float = 0.0
 ) -> float:
-    """Return the seconds that `units` silent units take."""
+    """Return the time in seconds that a sweep takes for `units` silent units."""
     return units * max(request_chars * char_time_s + timeout_s, interval_s)
 
 
@@ -105,7 +105,7 @@ class UnitSweep:
         self.behind_gateway: set[int] = set()
         """Units that a gateway reported as not answering."""
         self.echo = False
-        """Sent bytes come back."""
+        """Whether the bytes that are sent come back (an echo)."""
         self.foreign = 0
         """Number of good frames of another client or its units."""
         self.other_requests = 0
@@ -166,7 +166,7 @@ class UnitSweep:
         return SendRequest(unit, data)
 
     def handed_over(self, now_ns: int) -> None:
-        """Note that the driver has accepted the question, whose characters are sent from now on."""
+        """Record that the driver has accepted the question, whose characters are sent from now on."""
         if self._now is not None:
             gone_ns = now_ns + len(self._now.sent) * self._char_ns
             self._now.deadline_ns = gone_ns + self._timeout_ns

@@ -1,4 +1,4 @@
-"""Observe a serial line passively: frames, requests and replies. Pure: chunks of bytes and their times in.
+"""Observe a serial line passively: frames, requests and replies. Pure: it is given bytes and the times at which they arrived.
 
 Both directions share one pair of wires, so requests and replies are distinguished by their shape and order. A frame
 counts if its check sum is right. This module does not know the baud rate at which it listens: `baud` compares the
@@ -22,7 +22,7 @@ SURE_FRAMES = 3
 
 @dataclass(slots=True)
 class ObservedUnit:
-    """One unit ID on the line. It is live when it answered."""
+    """A unit ID that was observed on the line. The unit is live if it answered."""
 
     requests: int = 0
     replies: int = 0
@@ -36,7 +36,9 @@ class ObservedUnit:
 
 @dataclass(slots=True)
 class Heard:
-    """The totals. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence between chunks."""
+    """The totals of the observed traffic. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence
+    between chunks.
+    """
 
     framing: Framing
     bytes: int = 0
@@ -83,7 +85,7 @@ class LineListener:
         self._open: ModbusFrame | None = None
 
     def feed(self, data: bytes, t_ns: int) -> None:
-        """Add a chunk received at `t_ns`."""
+        """Add bytes received at `t_ns`."""
         if not data:
             return
         self.settle(t_ns)

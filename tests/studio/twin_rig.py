@@ -55,6 +55,14 @@ class TwinSite:
         """Return the compared variables by name."""
         return {v["name"]: v for v in self.twin()["variables"]}
 
+    def start_twin(self) -> None:
+        """Start the twin with the command line that Studio proposes, and a planner whose command is refused."""
+        program, *arguments = shlex.split(self.proposed[1]["command"])
+        assert program == "fieldtwin"
+        (self.root / "planner.py").write_text(PLANNER)
+        self.start(*arguments, "--plan", "python: planner:Planner")
+        until(lambda: _follows(self), "the twin follows the plant")
+
     def start(self, *arguments: str) -> subprocess.Popen[bytes]:
         """Start ``fieldtwin ARGUMENTS`` until the end of the test."""
         environment = os.environ | {"FIELDTWIN_RUN": str(self.studio.run_root)}
@@ -84,11 +92,7 @@ def twin_site(root: Path, *, follow: bool = True) -> Iterator[TwinSite]:
         until(lambda: _runs(site), "the plant has a digital thread")
         site.proposed = site.twins()["start"]
         if follow:
-            program, *arguments = shlex.split(site.proposed[1]["command"])
-            assert program == "fieldtwin"
-            (root / "planner.py").write_text(PLANNER)
-            site.start(*arguments, "--plan", "python: planner:Planner")
-            until(lambda: _follows(site), "the twin follows the plant")
+            site.start_twin()
         yield site
 
 

@@ -92,8 +92,9 @@ function Model({ store, follower }) {
       <dt>Statuses</dt><dd>${status.agreed} of ${status.statuses} agree</dd>
       <dt>Twinning</dt>
       <dd>
-        ${status.twinning_rate_hz ? `${status.twinning_rate_hz.toFixed(1)} reports/s` : "too few reports"}${status.lag_ms ? `, lag ${lag(status.lag_ms.median)}, 95 % ${lag(status.lag_ms.p95)}` : ""}
+        ${status.twinning_rate_hz ? `${status.twinning_rate_hz.toFixed(1)} reports/s` : "too few reports"}
       </dd>
+      <dt>Lag</dt><dd>${status.lag_ms ? `${lag(status.lag_ms.median)} median, ${lag(status.lag_ms.p95)} p95` : "unknown"}</dd>
       <dt>Instance</dt><dd class="mono">${follower.instance}</dd>
     </dl>
   </section>`;
@@ -156,7 +157,9 @@ const Wrong = ({ status }) => {
   </p>`;
 };
 
-const LONGEST_TEXT = 12; // of a message's bytes in hexadecimal
+const LONGEST_TEXT = 8; // of a message's bytes in hexadecimal
+// Reasons of a verdict that may last have a line of their own. Those of changes that are on the way would move the rows all the time.
+const STAYS = ["deviates", "unknown"];
 const VERDICTS = { agrees: "good", deviates: "bad", "on the way": "accent", unknown: "" };
 
 function Variables({ follower }) {
@@ -174,18 +177,17 @@ function Variables({ follower }) {
     <div class="scroll short" role="group" tabindex="0" aria-label="Variables of the model and the plant">
       <table class="list variables">
         <thead>
-          <tr><th>Variable</th><th class="number">Model</th><th class="number">Plant</th><th class="number">Difference</th><th>Unit</th><th class="number">Age</th><th>Verdict</th></tr>
+          <tr><th>Variable</th><th class="number">Model</th><th class="number">Plant</th><th class="number">Difference</th><th class="number">Age</th><th>Verdict</th></tr>
         </thead>
         <tbody>
           ${shown.map(
             (v) => html`<tr key=${v.name} data-variable=${v.name}>
-              <td>${v.name}</td>
+              <td>${v.name} <span class="soft">${v.unit}</span>${STAYS.includes(v.verdict) && v.reason && html`<div class="soft">${v.reason}</div>`}</td>
               <td class="number">${held(v.model, v.model_quality, v.model_reason)}</td>
               <td class="number">${v.plant_quality === null ? "–" : held(v.plant, v.plant_quality, v.plant_reason)}</td>
               <td class="number">${v.difference === null ? "" : number(v.difference)}</td>
-              <td>${v.unit}</td>
               <td class="number">${age(v.model_age_s)}</td>
-              <td class="verdict"><span class="chip ${VERDICTS[v.verdict]}">${v.verdict}</span> <span class="soft">${v.reason}</span></td>
+              <td class="verdict"><span class="chip ${VERDICTS[v.verdict]}" title=${v.reason}>${v.verdict}</span></td>
             </tr>`,
           )}
         </tbody>

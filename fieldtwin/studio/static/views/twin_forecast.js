@@ -11,6 +11,7 @@ const AGAIN_MS = 1000;
 const LEAST_HISTORY_S = 60;
 const HEIGHT = 240;
 const DASH = [7, 5];
+const BEFORE_GAP_S = 0.001;
 
 /** Seconds relative to the fork: "+1:30", "-0:20". */
 const relative = (s) => (Math.abs(s) < 0.0005 ? "0" : `${s < 0 ? "−" : "+"}${clock(Math.abs(s) * 1e9).replace(/\.?0+$/, "").replace(/:$/, ":00")}`);
@@ -27,7 +28,8 @@ export function ForecastChart({ store, run }) {
     let timer = 0;
     const fetchAll = async () => {
       try {
-        const found = await Promise.all(asked.series.map(async (tag) => [tag, await get(`${store.path}/tags/${tag}/history?from_ns=${from}&to_ns=${to}&points=2000`)]));
+        const tags = asked.series.filter((name) => store.tagOf(name)); // a program's variable has no history
+        const found = await Promise.all(tags.map(async (tag) => [tag, await get(`${store.path}/tags/${tag}/history?from_ns=${from}&to_ns=${to}&points=2000`)]));
         if (current) setHistory(Object.fromEntries(found));
         if (current) setError("");
       } catch (e) {
@@ -61,7 +63,10 @@ function columns(tags, history, run, now) {
       { points: ahead, end: ahead.length ? run.asked.horizon_s : -Infinity },
     ];
   });
-  const times = [...new Set(lines.flatMap(({ points, end }) => [...points.map(([t]) => t), ...(Number.isFinite(end) ? [end] : [])]))].sort((a, b) => a - b);
+  // A line is drawn up to the last of its points, so the value before a gap needs one at the end of its time.
+  const gaps = lines.flatMap(({ points }) => points.filter(([, v]) => v === null).map(([t]) => t - BEFORE_GAP_S));
+  const ends = lines.map(({ end }) => end).filter(Number.isFinite);
+  const times = [...new Set([...lines.flatMap(({ points }) => points.map(([t]) => t)), ...gaps, ...ends])].sort((a, b) => a - b);
   const values = lines.map(({ points, end }) => {
     let n = -1;
     return times.map((t) => {
@@ -86,6 +91,7 @@ function Chart({ store, run, unit, tags, history, from }) {
       {
         width: place.current.clientWidth,
         height: HEIGHT,
+        padding: [20, null, null, null],
         cursor: { drag: { x: false, y: false } },
         scales: { x: { time: false, range: () => [from, horizon] } },
         axes: [{ ...axis, values: (_, ticks) => ticks.map(relative) }, { ...axis, label: unit, size: 70 }],
@@ -122,7 +128,7 @@ const line = (label, stroke, unit) => ({
   value: (_, v) => (v === null || v === undefined ? "–" : `${number(v)} ${unit}`),
 });
 
-/** Draw a vertical line with a label on one side of it. */
+/** Draw a vertical line with a label above the plot, on one side of the line. */
 function mark(u, at, text, side, colour) {
   const { ctx, bbox } = u;
   const scale = uPlot.pxRatio ?? devicePixelRatio;
@@ -136,9 +142,9 @@ function mark(u, at, text, side, colour) {
   ctx.lineTo(x, bbox.top + bbox.height);
   ctx.stroke();
   ctx.font = `${12 * scale}px sans-serif`;
-  ctx.textBaseline = "top";
+  ctx.textBaseline = "bottom";
   ctx.textAlign = side;
-  ctx.fillText(text, x + (side === "right" ? -5 : 5) * scale, bbox.top + 3 * scale);
+  ctx.fillText(text, x + (side === "right" ? -5 : 5) * scale, bbox.top - 3 * scale);
   ctx.restore();
 }
 

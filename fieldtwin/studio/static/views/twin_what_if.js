@@ -135,7 +135,7 @@ function Forecast({ store, run }) {
     html`<ul class="requirements">
       ${result.requirements.map(
         (r) => html`<li><span class="chip ${r.met ? "good" : "bad"}">${r.met ? "met" : "not met"}</span> ${r.kind === "require" ? "always" : "at the end"} <code>${r.text}</code>
-          ${!r.met && html` <span class="bad-text">from ${number(r.at_s)} s on: ${r.seen}</span>`}</li>`,
+          ${!r.met && html` <span class="bad-text">from ${number(r.at_s)} s on, with ${r.seen}</span>`}</li>`,
       )}
     </ul>`}
     ${result?.not_taken.length > 0 && html`<p class="soft">Started without the present state of: ${result.not_taken.join(", ")}.</p>`}

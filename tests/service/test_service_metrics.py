@@ -27,6 +27,7 @@ from fieldtwin.twin.thread.status import PlantThreadStatus
 THREAD = PlantThreadStatus(
     carrier="tcp", connected=True, links=1, origin="plant", sent_through=7, waiting=0, resent=0, duplicates=0, silent="",
     trouble="", place="tcp://127.0.0.1:1", written=7, dropped=3, store_trouble="", commands_taken=0, commands_refused=0,
+    since_ms=0, received={},
 )  # fmt: skip
 
 

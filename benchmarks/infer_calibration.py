@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-for folder in (ROOT, ROOT / "tests" / "unit"):
+for folder in (ROOT, ROOT / "tests" / "rigs" / "devices"):
     sys.path.insert(0, str(folder))
 
 from infer_corpus import Map, corpus  # noqa: E402

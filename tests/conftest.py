@@ -14,7 +14,9 @@ import pytest
 from hypothesis import settings
 
 TESTS = Path(__file__).parent
-sys.path[:0] = [str(TESTS), str(TESTS / "rigs"), str(TESTS / "system")]  # set-ups that tests of several folders import
+RIGS = sorted(folder for folder in (TESTS / "rigs").iterdir() if folder.is_dir() and folder.name != "__pycache__")
+"""The folders of set-ups that tests of several folders import."""
+sys.path[:0] = [str(folder) for folder in (TESTS, *RIGS, TESTS / "system")]
 
 # The time per example depends on the host's load. In CI, the examples are the same each time.
 settings.register_profile("fieldtwin", deadline=None, derandomize=bool(os.environ.get("CI")))

@@ -17,12 +17,12 @@ def test_index_every_schema_of_the_paper_is_looked_at() -> None:
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| ")][1:]
     schemas = {word for row in rows for word in re.findall(r"\b[A-Z][A-Za-z0-9]{3,}\b", row)}
     assert len(schemas) >= 50
-    tests = "\n".join(p.read_text(encoding="utf-8") for p in HERE.glob("test_schema_*.py"))
+    tests = "\n".join(p.read_text(encoding="utf-8") for p in HERE.rglob("test_schema_*.py"))
     assert {name for name in schemas if not re.search(rf"\b{name}\b|_{name}_", tests)} == set()
 
 
 def test_index_every_row_of_the_prose_has_a_test() -> None:
-    names = re.findall(r"^def test_prose_(\d+)_", "\n".join(p.read_text() for p in HERE.glob("test_prose*.py")), re.M)
+    names = re.findall(r"^def test_prose_(\d+)_", "\n".join(p.read_text() for p in HERE.rglob("test_prose*.py")), re.M)
     assert {int(number) for number in names} == set(range(1, PROSE_ROWS + 1))
 
 
@@ -38,7 +38,7 @@ def test_index_every_ruling_is_named_by_a_test_that_shows_it() -> None:
     rulings = {int(number) for number in re.findall(r"^\*\*(\d+)\. ", page[page.index("## Rulings") :], re.M)}
     assert rulings == set(range(1, RULINGS + 1))
     shown: set[int] = set()
-    for path in HERE.glob("test_*.py"):
+    for path in HERE.rglob("test_*.py"):
         if path != Path(__file__):
             functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
             shown |= {n for f in functions if f.name.startswith("test_") for n in rulings_named(ast.unparse(f))}

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from modbus_pki import make_pki
 from procs import CHECKOUT, Asking, alive, fieldtwin, free_port, run_to_end, wait_for
-from wires.modbus_pki import make_pki
 
 pytestmark = pytest.mark.timeout(180)
 LISTENING = "0A"

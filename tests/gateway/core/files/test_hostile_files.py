@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-CHILD = Path(__file__).parents[3] / "rigs" / "hostile_readers.py"
+CHILD = Path(__file__).parents[3] / "rigs" / "files" / "hostile_readers.py"
 LARGE = 1 << 30
 
 

@@ -26,7 +26,7 @@ from fieldtwin.scenarios.bench import Bench, Can, Stopped, TagReading
 class MemberTrace(Trace):
     """The events of one system's bench, under its name in the common trace.
 
-    `later_ns`: its start after that of the first system.
+    `later_ns`: the time by which this system started later than the first one.
     """
 
     def __init__(self, whole: Trace, member: str, later_ns: Callable[[], int]) -> None:
@@ -72,7 +72,7 @@ class NetworkBench:
         self.topside: TopsideController | None = None
         self.faults = faults
         self._where: dict[str, str] = {}
-        """For each fault: its system, or the acoustic channel."""
+        """By fault ID: the system into which the fault was injected, or the acoustic channel."""
 
     @property
     def can(self) -> frozenset[Can]:
@@ -91,7 +91,7 @@ class NetworkBench:
     # -- Bench ----------------------------------------------------------------------------------------------------------
 
     def now_s(self) -> float:
-        """Return the time of the first system, which began first."""
+        """Return the time in seconds since the start of the first system, which began before the others."""
         return next(iter(self.parts.values())).bench.now_s()
 
     async def sleep_until_s(self, t_s: float) -> None:

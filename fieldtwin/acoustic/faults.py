@@ -25,7 +25,7 @@ from fieldtwin.twin.prototype.field_status import ActiveFaultStatus
 MOST = 1_000
 MOST_AT_RANDOM = 500
 RARER = 2.5
-"""How much longer the mean time between two random losses is than that between two faults of a system."""
+"""The mean time between two random losses is this many times that between two faults of a system."""
 SHORTEST_S, LONGEST_S = 0.5, 60.0
 """The shortest and the longest random loss, in seconds."""
 _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})

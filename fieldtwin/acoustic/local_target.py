@@ -69,7 +69,7 @@ class _Tidy:
 
 
 def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
-    """Return a function that returns how much later than the first the bench of a system began."""
+    """Return a function that returns the time by which the bench of a system began later than the first one."""
     known: list[int] = []
 
     def later_ns() -> int:

@@ -16,7 +16,7 @@ from fieldtwin.reports.drawing.svg import CHAR, EDGE, LINE, document
 from fieldtwin.reports.markup import Markup, el
 
 WIDE, HIGH, LOW = 760.0, 420.0, 120.0
-"""The area for the places, in px: its width, its greatest and its smallest height."""
+"""The area of the drawing in which the places lie, in px: its width, its greatest and its smallest height."""
 AROUND = 110.0
 """The margin for the labels of places at the edge, in px."""
 

@@ -59,7 +59,7 @@ class Network(SystemGroup):
 
     @property
     def places(self) -> dict[str, tuple[float, ...]]:
-        """Positions of all modems in the acoustic channel."""
+        """Return the positions of all modems in the acoustic channel."""
         places = {name: member.at_m for name, member in self.members.items()}
         return places | ({SHIP: tuple(self.ship.at_m)} if self.ship is not None else {})
 
@@ -193,7 +193,7 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
 
 
 def _files(folder: Path) -> list[Path]:
-    """Return the system files in `folder`, and in its folder of systems."""
+    """Return the system files in `folder`, and in its subfolder `systems`."""
     return [p for place in (folder, folder / "systems") for p in sorted(place.glob("*.yaml")) if "." not in p.stem]
 
 

@@ -46,7 +46,7 @@ class NetworkOptions:
     """Whether each system's bus traffic is written to ``capture.jsonl`` in its run directory."""
     commands: Sequence[Scripted] = ()
     faults: tuple[dict[str, Any], ...] = ()
-    """The faults of the systems and of the acoustic channel, under the network's names."""
+    """The faults of the systems and of the acoustic channel. Their targets are names of the network, such as SYSTEM.DEVICE."""
     thread: str = ""
     """The address on which each system's thread listens, at a free port. Empty for none."""
 

@@ -19,7 +19,7 @@ from fieldtwin.run.processes.topside import Scripted, script
 MOST_CLIENTS = 4
 FIRST_S = 1.0
 BASE_S = 10
-"""The usual command of the topside modem: a period of 10 s, commanded 1 s after the start."""
+"""The default command of the topside modem: a period of 10 s, commanded 1 s after the start."""
 ENDLESS_S = 20.0
 """The time in seconds over which the commands of a run without an end are spread."""
 

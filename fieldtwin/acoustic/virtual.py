@@ -94,11 +94,11 @@ class VirtualNetwork(AsyncResource):
         }
 
     def _later(self, name: str) -> Callable[[], int]:
-        """Return how much later than the first a system began."""
+        """Return the time by which a system began later than the first one."""
         return lambda: self.systems[name].run.started_ns - next(iter(self.systems.values())).run.started_ns
 
     async def _board(self) -> None:
-        """Open the topside modem and its controller."""
+        """Open the topside modem and create its controller."""
         clock, net = VirtualClock(self._loop), MemoryNet(self._loop)
         ship = TopsideModem(self.network, self.medium, clock)
         endpoint = await ship.open(net)

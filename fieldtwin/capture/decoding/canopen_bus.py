@@ -28,12 +28,12 @@ _PDO_AREA = range(0x180, 0x580)
 
 
 class CanopenBusDecoder:
-    """The nodes of one bus and the open transfers between them and their master."""
+    """The decoder of one bus: its nodes, and the open transfers between them and their master."""
 
     def __init__(self, bus: str, devices: Iterable[DeviceConfig]) -> None:
         self.bus = bus
         self.nodes = {d.address: NodeMap(d) for d in devices}
-        """The known nodes, with what was learnt about their PDOs so far."""
+        """The known nodes, with the PDO mappings that were learnt so far."""
         self._sdo: dict[int, SdoWatch] = {}
         self._lss = LssWatch(bus)
         self._pdos: dict[int, Pdo] = {}
@@ -79,7 +79,7 @@ class CanopenBusDecoder:
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 
     def pending(self) -> list[DecodedExchange]:
-        """Return the requests whose reply may still come. Changes nothing."""
+        """Return the requests whose reply may still come. The call has no side effects."""
         open_ = [(node, watch.open) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "pending") for node, t in open_ if t] + self._lss.pending()
 

@@ -79,7 +79,9 @@ class DecodedExchange:
     reply_text: str = ""
     value: Scalar | None = None
     secrets: frozenset[str] = frozenset()
-    """Its secret tags; if "" is among them, its raw words are secret too. Checks still know the values."""
+    """The secret tags of the exchange. If "" is among them, its raw register words are secret too. Checks of a scenario can
+    still compare the values.
+    """
     transaction: int | None = None
 
     @property
@@ -129,7 +131,7 @@ class DecodedExchange:
         }
 
     def writes(self, tag: str = "") -> bool:
-        """Return whether the exchange writes, as `reads` does."""
+        """Return whether the exchange writes, and if given, whether it writes `tag` (a name without its device)."""
         return any(s.access == "write" for s in self.spans) and (not tag or tag in self.tags)
 
 

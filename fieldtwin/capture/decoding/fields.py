@@ -22,7 +22,7 @@ class FieldSpan:
 
 
 class FieldReader:
-    """Cut bytes into fields from left to right. No byte is skipped or taken twice."""
+    """Divides bytes into fields from left to right. No byte is skipped or taken twice."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -59,6 +59,6 @@ class FieldReader:
         return self.take(self.left, name, value, note)
 
     def embed(self, spans: list[FieldSpan], size: int) -> None:
-        """Take the next `size` bytes as the given fields, whose offsets begin with 0 there."""
+        """Take the next `size` bytes as the given fields, whose offsets are relative to the first of these bytes."""
         self.spans += [FieldSpan(s.offset + self._at, s.length, s.name, s.value, s.note) for s in spans]
         self._at += size

@@ -24,26 +24,26 @@ _ANSWERED = {
     lss.FASTSCAN: lss.SLAVE_FOUND,
     lss.IDENTIFY_NON_CONFIGURED: lss.NON_CONFIGURED_FOUND,
 }
-"""Requests that are answered, and the command of the answer."""
+"""The command of each request that is answered, and the command of its answer."""
 _MAY_BE_SILENT = (lss.FASTSCAN, lss.IDENTIFY_NON_CONFIGURED, lss.SWITCH_SELECTIVE[3])
-"""Services for which silence is an answer: no node matches."""
+"""Services for which no reply is a valid result: no node matches."""
 
 
 class LssWatch:
-    """The LSS traffic of one bus."""
+    """The decoder of the LSS traffic of one bus."""
 
     def __init__(self, bus: str) -> None:
         self.bus = bus
         self._open: DecodedExchange | None = None
 
     def feed(self, data: bytes, reply: bool, t_ns: int) -> tuple[str, list[DecodedExchange]]:
-        """Add a frame of either identifier."""
+        """Add a frame with one of the two LSS identifiers."""
         if not data:
             return "LSS without data", []
         return self._reply(data, t_ns) if reply else self._request(data, t_ns)
 
     def pending(self) -> list[DecodedExchange]:
-        """Return the request whose reply may still come. Changes nothing."""
+        """Return the request whose reply may still come. The call has no side effects."""
         return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
 
     def finish(self) -> list[DecodedExchange]:

@@ -20,7 +20,7 @@ MAX_OPEN = 64
 """Maximum number of open requests on an MBAP connection; an older one counts as unanswered."""
 
 STRAY_SHOWN = 32
-"""Bytes of a stray frame that its text shows; the exchange has all of them."""
+"""The largest number of bytes of a stray frame that its text shows; the exchange contains all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class ModbusConnectionDecoder:
         return done
 
     def pending(self) -> list[DecodedExchange]:
-        """Return the requests whose reply may still come, the oldest first. Changes nothing."""
+        """Return the requests whose reply may still come, the oldest first. The call has no side effects."""
         size = self._replies.pending
         text = f"pending, {_bytes(size)} of a reply so far" if size else "pending"
         return [self._exchange(opened, None, "pending", text) for opened in self._open.values()]
@@ -171,7 +171,7 @@ class ModbusConnectionDecoder:
         return Expected(opened.frame.unit, opened.asked.function, opened.asked.reply_bytes)
 
     def _settle(self, texts: list[str], done: list[DecodedExchange]) -> None:
-        """Conclude the reply at a new request: remaining bytes are a complete reply, or noise."""
+        """End the reply when a new request begins: the bytes so far are a complete reply, or noise."""
         self._judge(self._replies.flush(self._expected()), texts, done)
 
     def _judge(self, frames: Iterable[ModbusFrame], texts: list[str], done: list[DecodedExchange]) -> None:
@@ -191,7 +191,7 @@ class ModbusConnectionDecoder:
             texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
 
     def _older(self, answered: _Open) -> list[DecodedExchange]:
-        """End older requests: the gateway sends one request at a time, so it has given up the older ones."""
+        """End older requests as unanswered: the gateway sends one request at a time, so it no longer waits for the older ones."""
         older = [t for t, o in self._open.items() if o.frame.t_ns <= answered.frame.t_ns]
         self._given_up.extend(older)
         return [self._unanswered(self._open.pop(t)) for t in older]

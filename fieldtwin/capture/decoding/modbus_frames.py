@@ -48,7 +48,7 @@ _READS = (1, 2, 3, 4, 23)
 
 
 class Splitter(ABC):
-    """A splitter of one direction. `feed` returns complete frames, `flush` the incomplete rest."""
+    """Divides the bytes of one direction into frames. `feed` returns complete frames, `flush` the incomplete rest."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -74,7 +74,7 @@ class Splitter(ABC):
 
     @abstractmethod
     def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
-        """Take frames off the front."""
+        """Remove the complete frames at the beginning of the buffer, and return them."""
 
     def _cut(self, size: int) -> tuple[int, bytes]:
         """Remove the first `size` bytes; return them and the time of the last one."""
@@ -94,7 +94,7 @@ class Splitter(ABC):
 
 
 class RtuSplitter(Splitter):
-    """RTU (SL 2.5.1)."""
+    """Divides the bytes of Modbus RTU into frames (SL 2.5.1)."""
 
     def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         found: list[ModbusFrame] = []
@@ -203,7 +203,7 @@ def _ascii_frame(t_ns: int, raw: bytes) -> ModbusFrame:
 
 
 class MbapSplitter(Splitter):
-    """Modbus TCP (TG 3.1.3). After an invalid header the rest of the received bytes is noise."""
+    """Divides the bytes of Modbus TCP into frames (TG 3.1.3). After an invalid header the rest of the received bytes is noise."""
 
     def _split(self, expected: Expected | None, settled: bool) -> list[ModbusFrame]:
         found = []

@@ -55,7 +55,9 @@ class DecodedRequest:
 
 @dataclass(frozen=True, slots=True)
 class DecodedReply:
-    """A reply, decoded with its request. `read`: as `DecodedRequest.written`. `detail` describes the rest of the reply."""
+    """A reply, decoded with its request. `read` is the data that was read, in the form of `DecodedRequest.written`. `detail`
+    describes the rest of the reply.
+    """
 
     read: bytes = b""
     exception: int | None = None
@@ -112,7 +114,7 @@ def _write(function: int, address: int, count: int, written: bytes, echoes: int)
 
 
 def _other(function: int, pdu: bytes) -> DecodedRequest:
-    """Decode a request that addresses no register by number, or is not in the standard."""
+    """Decode a request that addresses no register by number, or whose function is not in the standard."""
     spans: tuple[TouchedSpan, ...] = ()
     if function == 0x18 and len(pdu) == 3:
         spans = (TouchedSpan("read", "holding", int.from_bytes(pdu[1:3])),)
@@ -155,7 +157,7 @@ def parse_reply(asked: DecodedRequest, request: bytes, pdu: bytes) -> DecodedRep
 
 
 def words(span: TouchedSpan, data: bytes) -> tuple[int, ...]:
-    """Return registers as numbers, bits as 0 and 1, from `DecodedRequest.written` or `DecodedReply.read`."""
+    """Return the data of `DecodedRequest.written` or `DecodedReply.read` as numbers: register values, or 0 and 1 for bits."""
     return tuple(data) if span.table in BIT_TABLES else _words(data)
 
 

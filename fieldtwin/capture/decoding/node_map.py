@@ -44,7 +44,7 @@ class Pdo:
 
 
 class NodeMap:
-    """One node of a bus."""
+    """The tags, objects and PDOs of one node, as far as they are known."""
 
     def __init__(self, config: DeviceConfig) -> None:
         self.name = config.name
@@ -72,7 +72,7 @@ class NodeMap:
     def value(
         self, index: int, subindex: int, data: bytes, t_ns: int
     ) -> tuple[dict[str, Scalar | None], Scalar | None]:
-        """Return tags by name, and the value: the tag's, or by the EDS's type, or in hex."""
+        """Return tags by name, and the value of the object: that of its tag, else decoded by its type in the EDS, else in hex."""
         tags = self.tags.of_object(index, subindex, data, t_ns)
         if tags:
             return tags, next(iter(tags.values()))
@@ -93,7 +93,9 @@ class NodeMap:
         return f"{number} {name}".rstrip()
 
     def said(self, index: int, subindex: int, data: bytes, t_ns: int) -> str:
-        """Return the value as text: a tag with its unit, and identifiers and mappings of a PDO in their usual notation."""
+        """Return the value of an object as text: a tag with its unit, and identifiers and mappings of a PDO in their usual
+        notation.
+        """
         word = int.from_bytes(data, "little")
         if len(data) == 4 and index in _PARAMETERS:
             if index not in _MAPPINGS and subindex == 1:

@@ -32,10 +32,10 @@ class Transfer:
     aborted_by: str = ""
     answered: bool = False
     segments: dict[int, bytes] = field(default_factory=dict)
-    """The segments of the current sub-block, not yet acknowledged."""
+    """The segments of the current sub-block that are not acknowledged yet."""
     in_segments: bool = False
     last: int = 0
-    """The number of the sub-block's last segment if it ends the transfer; else 0."""
+    """The number of the sub-block's last segment, if that segment ends the transfer; else 0."""
     last_sent: bool = False
     """True when the client of a segmented download has sent its last segment."""
 
@@ -63,7 +63,7 @@ class Seen:
 
 
 class SdoWatch:
-    """Fed with the data of each frame on the node's two SDO identifiers, in order."""
+    """The decoder of a node's SDO transfers. It is given the data of each frame on the node's two SDO identifiers, in order."""
 
     def __init__(self) -> None:
         self.open: Transfer | None = None

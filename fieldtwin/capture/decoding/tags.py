@@ -21,7 +21,7 @@ _KEPT_PLANS = 1024
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """The content of a span: tags with their offset and size in registers (or bits), blocks passed on, mailboxes."""
+    """The content of a span: tags with their offset and size in registers (or bits), messages, and mailboxes."""
 
     tags: tuple[tuple[Tag, int, int], ...]
     blocks: tuple[tuple[str, int, int], ...]
@@ -57,7 +57,7 @@ class TagMap:
         return any(_touches(tag, span) for tag in self._secrets)
 
     def secrets(self, spans: Iterable[TouchedSpan]) -> frozenset[str]:
-        """Return `Exchange.secrets` of an exchange that touches `spans`."""
+        """Return the secret tags of an exchange that touches `spans`, for `DecodedExchange.secrets`."""
         if not self._secrets:
             return frozenset()
         found = {tag.name for span in spans for tag in self._secrets if _touches(tag, span)}

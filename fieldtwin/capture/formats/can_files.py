@@ -61,7 +61,7 @@ def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFram
 def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
     """Yield python-can's messages of a file.
 
-    Any exception is reported as a fault of the file: the readers raise parsing errors.
+    Any exception becomes a `FileInvalid`, because the readers raise exceptions of any class for an invalid file.
     """
     number = 0
     try:

@@ -30,9 +30,9 @@ COLUMN_WIDTH = 11
 ROWS_PER_PROGRESS = 1000
 
 PSI_IN_DBAR = 1.4503773773
-"""psi in a dbar (10 kPa)."""
+"""The number of psi in one dbar (10 kPa)."""
 T68_IN_T90 = 1.00024
-"""IPTS-68 from ITS-90, as oceanography has it (Saunders 1990, WOCE Newsletter 10)."""
+"""The factor from ITS-90 to IPTS-68 that oceanography uses (Saunders 1990, WOCE Newsletter 10)."""
 
 Progress = Callable[[int, int], None]
 """Called with the bytes read and the total, both of the file on disk (compressed, if it is)."""
@@ -70,7 +70,9 @@ TIME_COLUMNS = (
     ("timeJ", 86_400.0),
     ("timeSCP", 86_400.0),
 )
-"""Column and seconds in one of its units: elapsed time first, then dates, then days of the year."""
+"""The columns that can provide the time, the best first, each with the number of seconds in its unit: elapsed time, then
+dates, then days of the year.
+"""
 
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 _NAME = re.compile(r"name (\d+) = ([^:]*)")
@@ -109,7 +111,9 @@ class CnvHeader:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """The use of the columns: index and divisor; `time`: index and factor, None if the header's interval is used."""
+    """The columns that an import reads: index and divisor for each signal; `time`: index and factor, None if the interval in
+    the header gives the times.
+    """
 
     signals: tuple[tuple[int, float], ...]
     time: tuple[int, float] | None
@@ -191,7 +195,7 @@ class _Lines:
 
 
 def read_header(lines: _Lines) -> CnvHeader:
-    """Read up to and with ``*END*``."""
+    """Read the header, up to and including the line ``*END*``."""
     header = CnvHeader()
     for line in lines:
         if line.startswith("*END*"):

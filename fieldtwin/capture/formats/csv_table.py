@@ -159,7 +159,7 @@ def _chosen(names: list[str], columns: Mapping[str, str], time_at: int) -> dict[
 
 
 class _Clock:
-    """Seconds since the first row, for any format of the time column."""
+    """Converts the time column, in any of its formats, to seconds since the first row."""
 
     def __init__(self, path: Path, name: str, line: int, row: list[str], at: int) -> None:
         self._path, self._at = path, at

@@ -28,7 +28,9 @@ class Fragments:
         self._open: dict[Hashable, _Packet] = {}
 
     def add(self, key: Hashable, offset: int, data: bytes, *, more: bool) -> bytes | None:
-        """Add a fragment of the packet `key` (addresses, protocol, identification); return a complete payload."""
+        """Add a fragment of the packet `key` (addresses, protocol, identification). Return the payload if the packet is
+        complete now.
+        """
         packet = self._open.get(key)
         if packet is None:
             if len(self._open) >= MAX_PACKETS:

@@ -48,7 +48,7 @@ def unpacked(raw: io.BufferedReader, path: Path) -> BinaryIO | None:
 
 
 class _Limited(io.RawIOBase):
-    """The unpacked bytes, counted."""
+    """A reader of the unpacked bytes that counts them and refuses more than the limit."""
 
     def __init__(self, packed: gzip.GzipFile | bz2.BZ2File, raw: io.BufferedReader, path: Path) -> None:
         self._packed, self._path = packed, path

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
 
 MAX_PACKET = 262_144
-"""Bytes of a packet; the largest snapshot length that libpcap allows."""
+"""The largest number of bytes of a packet: the largest snapshot length that libpcap allows."""
 MAX_BLOCK = MAX_PACKET + 65_536
 MAX_INTERFACES = 1024
 
@@ -35,7 +35,7 @@ _INTERFACE, _OBSOLETE, _SIMPLE, _ENHANCED = 1, 2, 3, 6
 _TSRESOL, _TSOFFSET = 9, 14
 
 Packet = tuple[int, int, bytes]
-"""(time in ns since 1970, 0 if the file has none; link type; bytes)"""
+"""A packet of a file: (time in ns since 1970, 0 if the file has none; link type; bytes)."""
 
 
 def is_packet_file(head: bytes) -> bool:

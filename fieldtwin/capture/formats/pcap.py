@@ -99,7 +99,7 @@ def _endpoint(text: str) -> Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet of a pcap file: when, in nanoseconds, and its bytes from the link layer on."""
+    """One packet of a pcap file: its time in nanoseconds, and its bytes from the link layer on."""
 
     t_ns: int
     data: bytes

@@ -46,11 +46,11 @@ class _Asked:
 
     @property
     def width(self) -> int:
-        """Registers of a value."""
+        """Return the number of registers of a value."""
         return 2 if "32-bit" in self.kind else 1
 
     def exchange(self, number: int, cells: dict[int, str], failed: str) -> RecordedExchange:
-        """Return the poll with these values, or this failure."""
+        """Return the poll as an exchange with these values, or with this failure."""
         registers = self.count * self.width
         address = self.start - 1 if self.start else 0
         request = struct.pack(">BHH", self.function, address, registers)

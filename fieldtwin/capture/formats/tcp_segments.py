@@ -21,7 +21,7 @@ _IP4, _IP6 = 0x0800, 0x86DD
 _TCP, _UDP = 6, 17
 _SEQUENCES = 1 << 32
 _PLAIN_IP4 = b"\x08\x00\x45"
-"""An EtherType, and an IPv4 header without options."""
+"""The EtherType of IPv4, followed by the first byte of an IPv4 header without options."""
 
 MAX_WAITING = 64
 """Maximum number of segments that wait for an earlier one; beyond it the capture counts as having lost the earlier one."""
@@ -29,7 +29,7 @@ MAX_WAITING_BYTES = 65_536
 MAX_CONVERSATIONS = 1024
 
 Side = tuple[bytes, int]
-"""Address (4 or 16 bytes) and port."""
+"""One side of a conversation: IP address (4 or 16 bytes) and port."""
 
 
 class Segments:
@@ -112,11 +112,11 @@ class Conversation:
     last_ns: int = 0
     ended: bool = False
     state: object = None
-    """State that the caller keeps for the conversation."""
+    """An object of the caller that belongs to this conversation; this module does not use it."""
 
 
 OnData = Callable[[Conversation, Side, bytes, int, int], None]
-"""(conversation, the sending side, bytes, time in ns, bytes lost just before)"""
+"""Called with (conversation, the sending side, bytes, time in ns, number of bytes lost just before)."""
 OnEnd = Callable[[Conversation], None]
 
 
@@ -134,7 +134,7 @@ class PacketCounters:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """One direction of a connection, by the addresses and ports of its packets."""
+    """One direction of a connection, found by the addresses and ports of its packets."""
 
     conversation: Conversation
     sender: Side
@@ -211,7 +211,7 @@ class Conversations:
             self._paths[data[26:38]] = _Path(conversation, sender, segments[sender], segments[other])
 
     def finish(self) -> None:
-        """Conclude the capture."""
+        """End the capture: pass on the data that still wait for a missing segment."""
         self._fragments.finish()
         self.counters.fragments = self._fragments.given_up
         for key in list(self._open):

@@ -19,10 +19,10 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange
 MOST_WORDS = 1_000_000
 """Maximum number of values of both sides that are kept; a longer dialogue is compared position by position."""
 LEAST_DIFFERENT = 2
-"""Different values that a shifted match must show."""
+"""The smallest number of different values that a shifted match must contain."""
 
 Cell = tuple[int, str, int]
-"""Unit, table and address."""
+"""A register or bit of a device: unit ID, table and address."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class Dialogue:
         return self._words >= MOST_WORDS
 
     def add(self, recorded: RecordedExchange, other: RecordedExchange) -> None:
-        """Take one pair."""
+        """Add one pair of exchanges."""
         self._pairs.append((recorded, other))
         both = _values(recorded), _values(other)
         if both[0] is None or both[1] is None or len(both[0][1]) != len(both[1][1]):
@@ -131,7 +131,7 @@ class Dialogue:
         self._words += 2 * len(values)
 
     def rest(self, recorded: RecordedExchange) -> None:
-        """Take a recorded exchange that follows the last one that was asked again."""
+        """Add a recorded exchange that follows the last one whose request was repeated."""
         if (found := _values(recorded)) is None:
             return
         span, values = found
@@ -152,7 +152,7 @@ class Dialogue:
         return [Aligned(self._expected(recorded, other, seen), other) for recorded, other in self._pairs]
 
     def _shift_all(self, differ: set[tuple[int, bytes]]) -> bool:
-        """Find the position of each cell that is read by a request of `differ`. Whether any is shifted."""
+        """Find the position of each cell that is read by a request of `differ`. Return whether any cell is shifted."""
         established: dict[bytes, set[int]] = {}
         unclear = []
         for (unit, _, _), series in self._cells.items():

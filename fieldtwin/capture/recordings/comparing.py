@@ -107,7 +107,7 @@ class Comparison:
     after_left_out: int = 0
     """Number of differing exchanges that read a cell set by an omitted write."""
     not_compared: int = 0
-    """How many repeated exchanges could not be compared, because the recording has no value at the matching position."""
+    """Number of repeated exchanges that could not be compared, because the recording has no value at the matching position."""
     shifts: list[Shift] = field(default_factory=list)
     extra: int = 0
     latency: list[LatencyRow] = field(default_factory=list)
@@ -121,7 +121,7 @@ class Comparison:
 
     @property
     def met(self) -> bool:
-        """Return whether one side can replace the other."""
+        """Return whether the comparison is passed, so that one side can replace the other."""
         if not self.compared or not all(row.alike for row in self.latency):
             return False
         return self.alike >= self.least * (self.compared + self.not_compared)
@@ -135,7 +135,7 @@ class Comparison:
 
 
 class Comparer:
-    """A comparison that is given pairs, one after the other; `result` may be called after the last."""
+    """Compares pairs of exchanges that it is given one after the other. Call `result` after the last pair."""
 
     def __init__(self, rules: Rules | None = None, profile: DeviceProfile | None = None) -> None:
         self._rules, self._profile = rules or Rules(), profile
@@ -188,7 +188,7 @@ class Comparer:
         self._result.not_compared += 1
 
     def shifted(self, shifts: Iterable[Shift]) -> None:
-        """Add the positions at which the dialogue continued the recorded one."""
+        """Record the positions at which the live dialogue continued the recorded one."""
         self._result.shifts += shifts
 
     def result(self) -> Comparison:

@@ -29,12 +29,12 @@ from fieldtwin.gateway.core.values import Scalar
 
 TRANSFERS = ("SDO upload", "SDO download")
 RARE = 5
-"""Number of messages of a kind that is needed to judge their rate."""
+"""The smallest number of messages of a kind from which their rate is compared."""
 OFTEN = Tolerance(0.005, 0.5)
 """Permitted difference of the mean time between messages, in seconds."""
 
 Frames = Iterable[tuple[int, CanFrame]]
-"""(time in ns, frame)"""
+"""The frames of a log, each with its time: (time in ns, frame)."""
 
 
 @dataclass(slots=True)
@@ -52,7 +52,9 @@ class _Kind:
 
 
 class _Side:
-    """The content of one log: transfers in order, and the kinds of messages counted on the way."""
+    """The content of one log: its transfers in order, and the kinds of messages, which are counted while the transfers are
+    read.
+    """
 
     def __init__(self, frames: Frames, nodes: frozenset[int], uploads: int) -> None:
         self.kinds: dict[tuple[int, str], _Kind] = {}

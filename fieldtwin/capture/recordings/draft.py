@@ -45,7 +45,9 @@ class _Unit:
 
 
 class Drafts:
-    """Notes exchanges, of any length; `texts` are the profiles by unit."""
+    """Collects the facts about each unit from exchanges, of which there may be any number. `texts` returns the drafted
+    profiles by unit.
+    """
 
     def __init__(self) -> None:
         self.units: dict[int, _Unit] = {}

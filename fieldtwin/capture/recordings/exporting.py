@@ -52,7 +52,7 @@ def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, frami
     """Write the recording, log or capture at `path` as `out`, and return the number of records. `out` must not exist.
 
     With `profile`, a table of exchanges has a column for each tag. `framing` (mbap or rtu) is how exchanges are framed in a
-    pcap file. `url`: of a capture with several endpoints this one.
+    pcap file. `url` selects one endpoint of a capture that has several.
     """
     kind = out.suffix.lower()
     if kind not in TARGETS:

@@ -1,4 +1,6 @@
-"""Guess the framing of a line from its bytes: RTU, ASCII or Modbus TCP, by the most bytes in whole frames. Pure."""
+"""Guess the framing of a line from its bytes: RTU, ASCII or Modbus TCP, whichever finds the most bytes in complete frames.
+Pure.
+"""
 
 from __future__ import annotations
 

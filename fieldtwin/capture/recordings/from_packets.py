@@ -29,7 +29,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250
 MAX_SERVERS = 256
 EVERY = 4096
-"""Packets between two reports of progress."""
+"""Number of packets between two reports of progress."""
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 
 Progress = Callable[[int, int], None]
@@ -77,7 +77,9 @@ class _Server:
 
 
 class PacketImport:
-    """Imports `source` to `out` (``.jsonl``; of several servers ``NAME.HOST-PORT.jsonl``). `ports`: only these are Modbus."""
+    """Imports the capture `source` as the recording `out` (``.jsonl``; if there are several servers, ``NAME.HOST-PORT.jsonl``
+    each). If `ports` are given, only conversations with these ports are taken for Modbus.
+    """
 
     def __init__(self, source: Path, out: Path, ports: Collection[int] = ()) -> None:
         self._source, self._out, self._ports = source, out, ports

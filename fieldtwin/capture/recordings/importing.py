@@ -148,7 +148,7 @@ def _captured(path: Path) -> Iterator[Captured]:
 
 
 def _framing(path: Path, endpoint: Endpoint) -> str:
-    """Return the framing according to the bytes, else that of the endpoint."""
+    """Return the framing that the bytes show; if they show none, that of the endpoint."""
     if endpoint.scheme in ("udp", "tls"):
         return framing_of(endpoint)
     chunks = (
@@ -232,7 +232,7 @@ def _lines(source: IO[bytes], path: Path) -> Iterator[str]:
 
 
 class _New:
-    """A recording that gets its name only when it is complete; until then it is ``NAME.part``."""
+    """A file that gets its name only when it is complete; until then it is ``NAME.part``."""
 
     def __init__(self, out: Path, head: bytes = b"") -> None:
         if out.exists():

@@ -50,7 +50,7 @@ class ModbusConversation:
         return self._catch_up()
 
     def finish(self) -> list[RecordedExchange]:
-        """Conclude the conversation."""
+        """End the conversation."""
         if self.pairer is None and not self.foreign and self._seen and self._known_port:
             self._settle(self._framing_of_port())
             return [*self._catch_up(), *self.finish()]
@@ -75,7 +75,9 @@ class ModbusConversation:
         return [e for side, data, t_ns in seen for e in self.pairer.feed(side != self.server, data, t_ns)]
 
     def _decide(self) -> None:
-        """Decide by the first bytes of each side, joined, because a frame may arrive in parts."""
+        """Recognise the framing and the client by the first bytes of each side. The bytes are joined, because a frame may
+        arrive in parts.
+        """
         for side in self._conversation.sides:
             data = b"".join(d for who, d, _ in self._seen if who == side)
             if len(data) >= 8 and is_mbap(data):

@@ -30,7 +30,7 @@ _DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Bad:
-    """Bytes that became no part of an exchange, and why. `sent`: towards the device."""
+    """Bytes that do not belong to an exchange, and the reason. `sent`: towards the device."""
 
     t_ns: int
     sent: bool
@@ -58,7 +58,7 @@ OnBad = Callable[[Bad], None]
 
 
 class Pairer(ABC):
-    """One connection or line. `zero_ns` is the time that exchanges count from."""
+    """The pairer of one connection or line. `zero_ns` is the time from which the times of exchanges count."""
 
     def __init__(self, zero_ns: int, on_bad: OnBad | None = None) -> None:
         self.counters = PairCounters()
@@ -95,7 +95,9 @@ class Pairer(ABC):
 
 
 class MbapPairer(Pairer):
-    """Modbus TCP: replies belong to requests by transaction id, in any order. `datagrams`: a chunk holds whole frames."""
+    """The pairer for Modbus TCP: a reply belongs to the request with the same transaction ID, and replies may come in any
+    order. `datagrams`: each chunk holds whole frames.
+    """
 
     def __init__(self, zero_ns: int, on_bad: OnBad | None = None, *, datagrams: bool = False) -> None:
         super().__init__(zero_ns, on_bad)
@@ -187,7 +189,7 @@ class _Asked:
 
 
 class SerialPairer(Pairer):
-    """A serial line, also one carried over TCP: one request at a time. `framing` is rtu or ascii.
+    """The pairer for a serial line, also one carried over TCP: there is one request at a time. `framing` is rtu or ascii.
 
     Both directions are known here; `HalfDuplexPairer` is for lines without known directions.
     """

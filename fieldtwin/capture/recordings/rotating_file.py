@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 MAX_PARTS = 9999
 MB = 1_000_000
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""Of the last two each system has one."""
+"""The flags with which a new file is opened. Of the last two flags, each operating system has one."""
 
 
 class RotatingFile:

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, encode_exch
 
 
 class ExchangeSink:
-    """Exchanges into `file`."""
+    """Writes exchanges to `file`."""
 
     def __init__(self, file: RotatingFile) -> None:
         self.file = file
@@ -57,7 +57,7 @@ class CanLogSink(Tap):
 
 
 class LineSink:
-    """Bytes of a line into `file`, byte for byte, as a capture has them: monotonic nanoseconds, direction, hex."""
+    """Writes the bytes of a line to `file`, in the form of a capture: monotonic nanoseconds, direction, bytes in hex."""
 
     def __init__(self, file: RotatingFile, endpoint: Endpoint, clock: Clock, words: str) -> None:
         self.file = file

@@ -76,7 +76,7 @@ class NetworkBench:
 
     @property
     def can(self) -> frozenset[Can]:
-        """The abilities that all parts have; commands come from the topside modem."""
+        """Return the abilities that all parts have. The topside modem of the network sends commands."""
         can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
         return can | ({Can.SEND_COMMAND} if self.topside is not None else frozenset())
 

@@ -35,7 +35,7 @@ class AcousticFaults:
     """The active faults. `start_ns` is when the run began; `from` and `until` count from then."""
 
     def __init__(self, places: Collection[str], seed: int) -> None:
-        """`places`: the names of the modems in the channel."""
+        """Create the faults of a channel. `places` are the names of the modems in it."""
         self.start_ns = 0
         self._places = places
         self._seed = seed

@@ -38,7 +38,7 @@ class AcousticMember(GroupMember):
 
     @property
     def profile(self) -> DeviceProfile:
-        """The profile of the modem."""
+        """Return the profile of the modem."""
         return self.prototype.devices[self.modem].profile
 
 

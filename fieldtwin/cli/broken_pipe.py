@@ -27,7 +27,7 @@ class _Pipe(io.FileIO):
 
 
 def to_nowhere(*numbers: int) -> None:
-    """Drop everything that is written to these file descriptors from now on."""
+    """Redirect these file descriptors to the null device, so that everything that is written to them is dropped."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for number in numbers:
         os.dup2(nowhere, number)
@@ -35,13 +35,15 @@ def to_nowhere(*numbers: int) -> None:
 
 
 def survive_broken_stderr() -> None:
-    """Continue without stderr when its reader goes away."""
+    """Let the program continue without stderr when the reader of stderr has closed its end."""
     if (wrapped := _wrapped(sys.stderr, 2)) is not None:
         sys.stderr = wrapped
 
 
 def survive_broken_stdout() -> None:
-    """Continue without stdout when its reader goes away: the exit code carries the verdict."""
+    """Let the program continue without stdout when the reader of stdout has closed its end, because the exit code still gives
+    the verdict.
+    """
     if (wrapped := _wrapped(sys.stdout, 1)) is not None:
         sys.stdout = wrapped
 

@@ -25,5 +25,5 @@ class Explanation:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """All spellings that find the entry, in lower case."""
+        """Return all spellings by which a user can look up this entry, in lower case."""
         return tuple(dict.fromkeys(word.lower() for word in (self.id, *self.also)))

@@ -23,7 +23,7 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 
 
 class Control(StrEnum):
-    """The program that controls the devices."""
+    """The kind of program that the user wants to control the devices."""
 
     NONE = "none"
     PYTHON = "python"

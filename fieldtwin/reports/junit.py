@@ -24,7 +24,7 @@ MOST_TEXT = 20_000
 
 
 class Flavour(Enum):
-    """The reader for which a file is written."""
+    """The program that reads the JUnit file, because programs expect different forms."""
 
     COMMON = "common"
     """pytest's dialect: test cases have properties."""

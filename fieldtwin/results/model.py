@@ -153,7 +153,7 @@ class ScenarioResult:
 
     @property
     def why(self) -> str:
-        """The reason, with the actual value of the deciding check."""
+        """Return the reason of the verdict, with the actual value of the check that decided it."""
         got = next((check.got for check in self.checks if check.verdict is self.verdict and check.got), "")
         return f"{self.reason}: {got}" if got and got not in self.reason else self.reason
 
@@ -231,7 +231,7 @@ class Report:
 
     @property
     def systems(self) -> list[System]:
-        """The systems of all scenarios, each once; `system` first."""
+        """Return the systems of all scenarios, each once; `system` first."""
         every = [self.system, *(scenario.system for scenario in self.scenarios)]
         found: dict[SystemKey, System] = {}
         for one in every:

@@ -35,7 +35,7 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """``unit 1 on tcp://127.0.0.1:502``."""
+        """Return the name of the tested device: ``unit 1 on tcp://127.0.0.1:502``."""
         return f"{'node' if self.protocol == 'canopen' else 'unit'} {self.address} on {self.endpoint}"
 
     def as_json(self) -> dict[str, Any]:

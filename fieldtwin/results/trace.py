@@ -89,17 +89,17 @@ class Trace:
 
     @property
     def events(self) -> list[TraceEvent]:
-        """The latest events, oldest first."""
+        """Return the latest events, oldest first."""
         return [TraceEvent(*noted) for noted in self._kept]
 
     @property
     def count(self) -> int:
-        """Number of events so far."""
+        """Return the number of events so far."""
         return self._hashed + len(self._pending)
 
     @property
     def dropped(self) -> int:
-        """Number of events that are no longer in memory; the hash and the sink have them."""
+        """Return the number of events that are no longer in memory. The hash covers them, and the sink has written them."""
         return self.count - len(self._kept)
 
     def listen(self, listener: Callable[[TraceEvent], None], *kinds: TraceKind) -> None:

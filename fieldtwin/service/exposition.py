@@ -31,7 +31,9 @@ class Family:
             self.samples.append((self.name, labels, value))
 
     def add_histogram(self, bounds: Sequence[float], counts: Sequence[int], total: float, **labels: str) -> None:
-        """Add a histogram: `bounds` are upper ends, the last of `counts` is above all; counts are not cumulative."""
+        """Add a histogram. `counts` holds the observations in each interval (not cumulative); `bounds` are the upper bounds of
+        the intervals, and the last interval has none.
+        """
         seen = 0
         for bound, count in zip((*bounds, float("inf")), counts, strict=True):
             seen += count

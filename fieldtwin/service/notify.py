@@ -48,7 +48,7 @@ class Notifier:
         self._send("READY=1", _status(status))
 
     def alive(self, status: str) -> None:
-        """Feed the watchdog."""
+        """Tell systemd's watchdog that the service is alive (WATCHDOG=1)."""
         self._send("WATCHDOG=1", _status(status))
 
     def status(self, status: str) -> None:

@@ -28,7 +28,7 @@ class NotPassed(Exception):
 
 
 class ScenarioFile(pytest.File):
-    """One file."""
+    """A scenario file that pytest has collected."""
 
     def collect(self) -> Iterator[ScenarioItem]:
         made: ScenarioItem = ScenarioItem.from_parent(self, name=case_of(self.path))
@@ -36,7 +36,7 @@ class ScenarioFile(pytest.File):
 
 
 class ScenarioItem(pytest.Item):
-    """Its only test."""
+    """The test of a scenario file: it runs the scenario."""
 
     def runtest(self) -> None:
         config = self.config

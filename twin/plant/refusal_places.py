@@ -54,7 +54,7 @@ class RefusalPlaces:
             self._tell(asdict(entry.status()))
 
     async def run(self) -> None:
-        """Look up lines until cancelled."""
+        """Look up the program line of each waiting entry, until cancelled."""
         try:
             while True:
                 await self._wake.wait()

@@ -47,7 +47,7 @@ class _Lease:
 
 
 class FieldLeases:
-    """The lease on `faults`, at most one."""
+    """Manages the lease on `faults`. There is at most one lease at a time."""
 
     def __init__(self, faults: FieldFaults) -> None:
         self._faults = faults

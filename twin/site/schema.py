@@ -104,7 +104,7 @@ class IdentityForm(SiteModel):
 
 
 class DeviceForm(SiteModel):
-    """A device of the system."""
+    """An entry of `devices` in a system file: one device of the system."""
 
     profile: str = Field(examples=["eastron-sdm630"])
     bus: Name = Field(examples=["line1"])

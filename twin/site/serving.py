@@ -32,7 +32,7 @@ WORDS = {"read": READ_FUNCTIONS, "write": WRITE_FUNCTIONS}
 
 @dataclass(frozen=True)
 class Serving:
-    """Both sections, as the file states them."""
+    """The sections `serve` and `bridge` of a system file, resolved, with the addresses that the file states."""
 
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()

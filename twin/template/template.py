@@ -223,7 +223,7 @@ class BillOfMaterials(Document):
 
 
 class Generic(Document):
-    """Any other document."""
+    """A document of any other kind."""
 
     __slots__ = ()
     kind = "generic"

@@ -108,7 +108,9 @@ class ThreadEnd:
         return await self._store.forget(self._origin, first + (self.out.through - first) // 2)
 
     async def run(self) -> None:
-        """Keep the thread up. Raises `FieldtwinError` only if the store cannot be read at the start, and `Unwelcome`."""
+        """Exchange events with the other side until cancelled, and open a new link whenever one is lost. Raises
+        `FieldtwinError` only if the store cannot be read at the start, and `Unwelcome`.
+        """
         if self._origin:
             first, last = await self._store.span(self._origin)
             self.out = OutgoingLog(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)

@@ -57,7 +57,7 @@ class Link(ABC):
 
 
 class Carrier(ABC):
-    """The opener of links, one at a time."""
+    """The factory of links to the other side. Only one link is open at a time."""
 
     name: str
 

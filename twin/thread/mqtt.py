@@ -98,7 +98,7 @@ Side = EdgeNode | HostApplication
 
 
 class MqttLink(Link):
-    """A session with the broker."""
+    """A link of a thread: one session with the broker."""
 
     ack_delay_ns = ACK_DELAY_NS
 

@@ -9,7 +9,7 @@ import msgspec
 
 
 class ReceivedLog(msgspec.Struct, frozen=True, kw_only=True):
-    """A log that this end receives."""
+    """The status of a log that this end receives."""
 
     through: int
     """Number of the last event up to which every event is stored, or recorded as lost."""
@@ -18,7 +18,7 @@ class ReceivedLog(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One end of a thread."""
+    """The status of one end of a thread."""
 
     carrier: str
     connected: bool

@@ -32,7 +32,7 @@ MOST_WAITING = 8
 
 
 class StreamLink(DatagramLink):
-    """A link over a byte stream."""
+    """A link over a byte stream, such as a TCP connection."""
 
     ack_delay_ns = ACK_DELAY_NS
 

@@ -41,11 +41,11 @@ class Operator(DTDigitalThreadProcess):
     """The process of a digital twin that decides which command is sent; a shadow has none."""
 
     def command(self, command: COMMAND) -> None:
-        """Command the physical twin."""
+        """Send a command to the physical twin."""
         self.share(Kind.COMMAND, command.name or self.name, command)
 
     def command_period(self, period_s: int) -> None:
-        """Command a period in seconds. Raises `Desync` if it does not fit into 16 bits."""
+        """Send a command with a sample period in seconds. Raises `Desync` if it does not fit into 16 bits."""
         self.command(encode_period(period_s))
 
 

@@ -39,7 +39,7 @@ Frames = Iterable[tuple[int, CanFrame]]
 
 @dataclass(slots=True)
 class _Kind:
-    """All messages of one kind of one node."""
+    """The statistics of all messages of one kind of one node."""
 
     count: int = 0
     first_ns: int = 0

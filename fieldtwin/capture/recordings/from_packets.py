@@ -37,7 +37,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """One file that was written."""
+    """One file that the import has written."""
 
     path: Path
     endpoint: str
@@ -63,7 +63,7 @@ class PacketSummary:
 
 
 class _Server:
-    """The recording of one server."""
+    """The recording of one server while the capture is imported."""
 
     def __init__(self, path: Path, endpoint: str, header: RecordingHeader) -> None:
         self.endpoint = endpoint

@@ -60,13 +60,13 @@ class ScanProgress:
 
 
 def phase_line(progress: PhaseProgress) -> str:
-    """``likely settings: up to 30 s``."""
+    """Return the name of a phase of the scan with its longest duration: ``likely settings: up to 30 s``."""
     about = f": up to {duration(progress.total_s)}" if progress.total_s >= 1 else ""
     return f"{progress.phase}{about}"
 
 
 def duration(seconds: float) -> str:
-    """``12 s``, ``4 min``, ``1 h 20 min``."""
+    """Return a duration as text: ``12 s``, ``4 min``, ``1 h 20 min``."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

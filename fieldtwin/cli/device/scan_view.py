@@ -73,7 +73,7 @@ def _with_the_same_answer(units: Sequence[FoundUnit]) -> list[list[FoundUnit]]:
 
 
 def unit_ranges(units: Sequence[int]) -> str:
-    """``1-9, 11, 17-247`` of ascending unit ids."""
+    """Return ascending unit IDs as text with ranges: ``1-9, 11, 17-247``."""
     spans: list[list[int]] = []
     for unit in units:
         if spans and spans[-1][-1] == unit - 1:

@@ -25,7 +25,7 @@ Asking = Generator["ObjectKey", Outcome, None]
 
 @dataclass(frozen=True, slots=True)
 class ObjectKey:
-    """An object of a node."""
+    """The address of an object of a node: index and subindex."""
 
     index: int
     subindex: int

@@ -41,7 +41,7 @@ class Taken:
 
 @dataclass(frozen=True, slots=True)
 class RefusedRead:
-    """The device answered with this exception."""
+    """A read that the device refused, with the exception that it answered."""
 
     code: int
     us: int = 0
@@ -166,7 +166,7 @@ class Sweep:
         yield from self.walk(self.span.address)
 
     def resume(self) -> None:
-        """Forget the silence so far: the device has answered again."""
+        """Reset the count of unanswered reads, because the device has answered again."""
         self._lost, self._silent = False, 0
 
     def walk(self, at: int) -> Asking:

@@ -38,7 +38,7 @@ FEWEST_PASSES, FEWEST_VALUES = 6, 4
 
 
 class Level(Enum):
-    """The verbal level of a probability."""
+    """A probability in words."""
 
     CERTAIN = "certain"
     LIKELY = "likely"

@@ -42,7 +42,7 @@ class ObservedNode:
 
 @dataclass(slots=True)
 class ObservedBus:
-    """The totals of the observation."""
+    """The traffic that was observed on a bus: its nodes, and the totals of its frames."""
 
     frames: int = 0
     errors: int = 0

@@ -50,7 +50,7 @@ class LineVerdict:
 
     @property
     def fits(self) -> tuple[SerialSettings, ...]:
-        """All settings at which the bytes make sense."""
+        """Return all settings with which the bytes form valid frames."""
         return (self.settings, *self.others)
 
 

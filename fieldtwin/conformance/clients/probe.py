@@ -36,7 +36,7 @@ TIMEOUT_S = 2.0
 
 
 class Probe(Protocol):
-    """A source of published values."""
+    """A source of the values that the program under test publishes."""
 
     on_shown: OnShown
 

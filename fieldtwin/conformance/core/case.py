@@ -134,14 +134,14 @@ class About:
 
     @property
     def bases(self) -> str:
-        """``standard``, or ``standard; TCP: robustness`` if a failure weighs differently on some transports."""
+        """Return the basis as text: ``standard``, or ``standard; TCP: robustness`` if it differs on some transports."""
         return "; ".join(
             [self.basis.value, *(f"{e.wire}: {e.basis.value}" for e in self.elsewhere if e.basis is not self.basis)]
         )
 
     @property
     def sources(self) -> str:
-        """`clause`, followed by the sources on other transports: ``SL 2.4.1; TCP: TG 4.4.1.3``."""
+        """Return `clause` followed by the sources on other transports: ``SL 2.4.1; TCP: TG 4.4.1.3``."""
         return "; ".join([self.clause, *(f"{e.wire}: {e.clause}" for e in self.elsewhere)])
 
     def on_wire(self, traits: frozenset[str]) -> Self:

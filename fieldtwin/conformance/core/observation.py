@@ -110,7 +110,7 @@ class ValuePublished:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The program under test ended by itself."""
+    """Raised when the program under test ended unexpectedly."""
 
     t_ns: int
     status: int

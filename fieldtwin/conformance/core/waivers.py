@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.files.yaml_file import YamlFile, load, validate
 
 
 class WaiverForm(BaseModel):
-    """One waiver, as written in the file."""
+    """One waiver, in the form of a file of waivers."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -49,7 +49,7 @@ class FaultBar:
 
 @dataclass(frozen=True, slots=True)
 class FrameLine:
-    """A frame in the window, in words."""
+    """A frame in the shown part of a run, described in words."""
 
     t_ns: int
     bus: str

@@ -15,7 +15,7 @@ SLACK_S = 0.005
 
 
 class HostLateness:
-    """The latest `KEPT` delays of the host."""
+    """The measured delays of the host, of which the latest `KEPT` are kept."""
 
     def __init__(self) -> None:
         self._own: deque[tuple[float, float]] = deque(maxlen=KEPT)

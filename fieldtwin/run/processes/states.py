@@ -73,7 +73,7 @@ class StateWatch:
 
     @property
     def programs(self) -> list[str]:
-        """The programs that have named states."""
+        """Return the programs that have named states."""
         return list(self._words)
 
     @property

@@ -47,7 +47,7 @@ class Scripted:
 
 
 def script(periods: tuple[int, ...], duration_s: float) -> list[Scripted]:
-    """Spread commands over a run of `duration_s` seconds."""
+    """Return the commands with times that spread them over a run of `duration_s` seconds."""
     if len(periods) == len(SCRIPT_TIMES):
         return [Scripted(part * duration_s, p) for part, p in zip(SCRIPT_TIMES, periods, strict=True)]
     return [Scripted((i + 0.5) * 0.85 * duration_s / len(periods), p) for i, p in enumerate(periods)]
@@ -134,7 +134,7 @@ class TopsideController:
             pass
 
     def send(self, period_s: int) -> None:
-        """Command a period."""
+        """Send a command with this sample period (s) to the plant."""
         self._driver.consumer.observe(encode_period(period_s))
         self._news.set()
         self.commands_sent.append(period_s)

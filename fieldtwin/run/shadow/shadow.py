@@ -97,7 +97,9 @@ class Shadowing:
         return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived, insists=False)
 
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
-        """Shadow the plant until `stop`, or for `for_s` seconds. Raises `FieldtwinError` for a store that cannot be used."""
+        """Receive and analyze the plant's events until `stop`, or for `for_s` seconds. Raises `FieldtwinError` for a store
+        that cannot be used.
+        """
         system, clock = self._system, self.clock
         store = await open_knowledge(self._store)
         server = ControlServer({"ready": self._ready, "get": self._get, "status": self._status})

@@ -19,7 +19,7 @@ from fieldtwin.twin.prototype.group import SystemGroup
 
 
 class OneRunning:
-    """The running system, under the empty name."""
+    """A single running system, as a group whose only member has an empty name."""
 
     def __init__(self, bench: VirtualBench) -> None:
         self.bench = bench

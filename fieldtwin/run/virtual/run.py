@@ -113,7 +113,7 @@ class VirtualRun:
 
     @property
     def scripted(self) -> list[Scripted]:
-        """The commands of the run, with their times; empty if nothing in the group could send them."""
+        """Return the commands of the run with their times; empty if no part of the group can send commands."""
         return self._kind.scripted(self.group, self.options.commands, self.options.duration_s)
 
     @property

@@ -52,7 +52,9 @@ class LastKnown:
 
     @property
     def unknown(self) -> str:
-        """The values that a fork needs and that are still unknown: the state of a program, or every tag. Empty if none."""
+        """Return a description of the values that a fork needs and that are still unknown: the state of a program, or every
+        tag. Empty if none.
+        """
         silent = sorted(self._programs - self._when_ms.keys())
         if silent:
             return f"the state of {', '.join(silent)}"

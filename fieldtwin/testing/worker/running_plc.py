@@ -120,7 +120,7 @@ class PlcProcesses:
         return await self._call(command, **args, by=BY)
 
     def send(self, period_s: int) -> None:
-        """Command a period at the remote end."""
+        """Send a command with this sample period (s) at the remote end of the transmitter."""
         if self._topside is None:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         self._topside.send(period_s)

@@ -179,7 +179,7 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
         raise file.error((*loc, "system"), e.message, expected=e.expected, hint=near or e.hint) from e
     other = path.parent / said.prototype if said.prototype is not None else None
     if other is not None and not other.is_file():
-        raise file.error((*loc, "prototype"), f"no file {said.prototype!r}", expected="one beside this file")
+        raise file.error((*loc, "prototype"), f"no file {said.prototype!r}", expected="a file in the same folder")
     prototype = load_prototype(system, other)
     modems = [n for n, d in prototype.devices.items() if d.form.model == "mailbox"]
     if said.modem not in modems:

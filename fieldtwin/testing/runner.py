@@ -124,7 +124,9 @@ class WorkerProcess:
         hint = ""
         if "No module named" in last:  # only the plugin is installed in this environment
             last, hint = last.splitlines()[-1], f"; --fieldtwin-command or {COMMAND_VARIABLE} sets the command"
-        return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
+        return FieldtwinUnavailable(
+            f"{shlex.join(self.command)} test-host {ended}: {last or 'it printed nothing'}{hint}"
+        )
 
     def close(self) -> None:
         """End the process, and with it everything that it runs."""

@@ -212,7 +212,9 @@ class PlcForm(SiteModel):
         default="end", description="start: a scan's outputs change at the next cycle"
     )
     tasks: dict[Name, TaskForm] = Field(default={}, description="default: one, every cycle_ms")
-    programs: dict[Name, ProgramForm] = Field(default={}, description="none: another controller commands, or nobody")
+    programs: dict[Name, ProgramForm] = Field(
+        default={}, description="none: a different controller commands, or no controller"
+    )
 
 
 class ServedTagForm(SiteModel):

@@ -305,7 +305,7 @@ def _copy_rows(lines: _Lines, header: CnvHeader, plan: _Plan, writer: RecordingW
             origin = t
         t = round(t - origin, 6)
         if t < last_t:
-            raise lines.invalid("time goes back", expected=f"{last_t} s or later", got=f"{t} s")
+            raise lines.invalid("the time decreases", expected=f"{last_t} s or later", got=f"{t} s")
         values = [_value(cells[index], header.bad_flag, lines) / divisor for index, divisor in plan.signals]
         bad += sum(map(math.isnan, values))
         writer.row(t, values)

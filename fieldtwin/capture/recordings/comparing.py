@@ -335,7 +335,7 @@ def _outcome(exchange: RecordedExchange | None) -> str:
             exchange.error or "", "the connection was lost"
         )
     if not exchange.reply:
-        return "nobody answers a broadcast"
+        return "no unit answers a broadcast"
     asked = parse_request(exchange.request)
     answer = parse_reply(asked, exchange.request, exchange.reply)
     if answer.exception is not None:

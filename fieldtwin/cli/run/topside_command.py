@@ -83,7 +83,7 @@ def _transmitter(system: System, name: str) -> str:
             hint="an HMI or SCADA reads and commands other systems through `serve:` in the system file",
         )
     if name and name not in transmitters:
-        raise UsageError(f"{name!r} is no transmitter", expected=", ".join(transmitters))
+        raise UsageError(f"{name!r} is not a transmitter", expected=", ".join(transmitters))
     if not name and len(transmitters) != 1:
         raise UsageError("which transmitter?", expected="--device with one of " + ", ".join(transmitters))
     return name or transmitters[0]

@@ -134,7 +134,7 @@ def told_of(variables: dict[str, Any], undeclared: int) -> str:
     heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
     good = sum(variable["quality"] == "good" for variable in heard)
     more = f"; {undeclared} values of tags that it does not declare" if undeclared else ""
-    return f"{len(variables)}, {len(heard)} of them heard of, {good} good{more}"
+    return f"{len(variables)}, {len(heard)} of them received, {good} good{more}"
 
 
 def _count(number: int, word: str) -> str:

@@ -197,10 +197,10 @@ def _of_garbage(e: SerialEvidence) -> list[LikelyCause]:
     if heard.frames and heard.share > MANY:
         if heard.glitches >= max(2, heard.frames // 4):
             causes.append(
-                LikelyCause("direction control", 85, f"{heard.glitches} stray bytes besides {heard.frames} good frames",
+                LikelyCause("direction control", 85, f"{heard.glitches} stray bytes and {heard.frames} good frames",
                       "the transceiver is switched too early or too late: rs485=1, or an adapter that switches by itself")
             )  # fmt: skip
-        damaged = f"{heard.bad_frames} damaged besides {heard.frames} good frames"
+        damaged = f"{heard.bad_frames} damaged and {heard.frames} good frames"
         causes.append(
             LikelyCause("termination or noise", 70, damaged, "check 120 ohms at both ends only, bias resistors, shield")
         )
@@ -361,7 +361,7 @@ def can_causes(facts: CanFacts, heard: ObservedBus, load: float) -> list[LikelyC
             LikelyCause("termination or noise", 60, why, "60 ohms between CAN-H and CAN-L when everything is off")
         )
     elif heard.errors or (facts.rx_errors >= 96 and heard.frames):
-        why = f"{heard.errors} error frames besides {heard.frames} good ones"
+        why = f"{heard.errors} error frames and {heard.frames} good ones"
         found.append(
             LikelyCause(
                 "termination or noise", 80, why, "60 ohms between CAN-H and CAN-L when everything is off; short stubs"

@@ -211,7 +211,7 @@ def answers_at_once(seen: Observation) -> Finding | None:
         )
     if later_s + later_gap_s - at_once_s - gap_s < 0.25 * delay_s:
         return failed(f"{said}, and equally soon when the frame came {delay_s:.2f} s later: it waits out its timeout")
-    return inconclusive(f"{said}, and later when the frame came later: it backs off, or its timeout begins anew")
+    return inconclusive(f"{said}, and later when the frame came later: it backs off, or its timeout starts again")
 
 
 def _gap_after(seen: Observation, told: ReplySent) -> Iterator[tuple[float, float]]:

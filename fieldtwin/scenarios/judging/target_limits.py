@@ -10,7 +10,7 @@ from fieldtwin.scenarios.language.about import impacts
 from fieldtwin.scenarios.language.form import Scenario, needs_of
 
 NO_FRESH_START = (
-    "`start: fresh` begins PLC, simulation and devices anew, which is possible only where the devices are simulated "
+    "`start: fresh` resets PLC, simulation and devices, which is possible only where the devices are simulated "
     "and the PLC is fieldtwin's"
 )
 

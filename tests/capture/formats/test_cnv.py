@@ -151,7 +151,7 @@ REFUSED = {
     "a letter": (cnv(end="        2.5        x.1       4.25        1.5          0\r\n"), FIRST_ROW + 3, "not a number"),
     "a column too few": (cnv(end="        2.5       20.1       4.25\r\n"), FIRST_ROW + 3, "expected 5 columns; got 3"),
     "cut in a row": (cnv()[:-20], FIRST_ROW + 2, "different number of columns"),
-    "time goes back": (cnv(rows=[(1, 2, 3, 1.0), (1, 2, 3, 0.5)]), FIRST_ROW + 1, "time goes back"),
+    "time goes back": (cnv(rows=[(1, 2, 3, 1.0), (1, 2, 3, 0.5)]), FIRST_ROW + 1, "the time decreases"),
     "a bad time": (cnv(rows=[(1, 2, 3, -9.99e-29)]), FIRST_ROW, "no time"),
     "no rows": (cnv(rows=[]), FIRST_ROW - 1, "no rows"),
     "no end": (cnv().partition(b"*END*")[0], FIRST_ROW - 2, "END"),

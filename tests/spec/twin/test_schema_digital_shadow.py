@@ -245,7 +245,7 @@ def test_DigitalShadow_what_the_system_does_not_declare_is_no_part_of_its_model_
     assert rig.shadow.describe()["undeclared"] == 1
     seen = rig.shadow.describe()
     assert told_of(seen["variables"], seen["undeclared"]) == (
-        "3, 0 of them heard of, 0 good; 1 values of tags that it does not declare"
+        "3, 0 of them received, 0 good; 1 values of tags that it does not declare"
     )
 
 

@@ -14,13 +14,14 @@ from asyncio import events
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from contextlib import suppress
-from contextvars import Context
+from contextvars import Context, copy_context
 from heapq import heapify, heappop, heappush
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
 from fieldtwin.emulators.virtual.interrupts import Interrupts
+from fieldtwin.emulators.virtual.scheduled_call import ScheduledCall
 from fieldtwin.emulators.virtual.waiting import waits_at
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Bug
@@ -66,8 +67,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.now_ns = start_ns
         self.callbacks = 0
         """The number of callbacks that have run."""
-        self._ready: deque[asyncio.Handle] = deque()
-        self._timers: list[tuple[int, int, asyncio.TimerHandle | asyncio.Future[None]]] = []
+        self._ready: deque[ScheduledCall] = deque()
+        self._timers: list[tuple[int, int, ScheduledCall | asyncio.Future[None]]] = []
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
         self._tasks = 0
@@ -84,9 +85,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_soon(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        handle = asyncio.Handle(callback, args, self, context)
-        self._ready.append(handle)
-        return handle
+        call = ScheduledCall(callback, args, copy_context() if context is None else context)
+        self._ready.append(call)
+        return call  # type: ignore[return-value]  # it has the methods of a handle
 
     def call_later(
         self, delay: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
@@ -102,9 +103,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """Schedule a callback as `call_at` does, with a time in ns. A time in the past is due now, after the ready callbacks."""
-        timer = asyncio.TimerHandle(when_ns / NS_PER_S, callback, args, self, context)
-        self._set_timer(when_ns, timer)
-        return timer
+        call = ScheduledCall(callback, args, copy_context() if context is None else context, when_ns / NS_PER_S)
+        self._set_timer(when_ns, call)
+        return call  # type: ignore[return-value]  # it has the methods of a timer handle
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
         """Return a future that is done at `when_ns`, for a clock's sleep.
@@ -122,14 +123,11 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
-    def _set_timer(self, when_ns: int, due: asyncio.TimerHandle | asyncio.Future[None]) -> None:
+    def _set_timer(self, when_ns: int, due: ScheduledCall | asyncio.Future[None]) -> None:
         self._sequence += 1
         heappush(self._timers, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, due))
         if self._sequence >= self._compact_at:
             self._compact()
-
-    def _timer_handle_cancelled(self, handle: asyncio.TimerHandle) -> None:
-        """Do nothing: a cancelled timer stays in the heap until its time comes or the heap is compacted."""
 
     def _compact(self) -> None:
         """Remove the timers that are no longer needed.
@@ -203,13 +201,20 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         """Run all ready callbacks and those that they schedule, then advance to the next timer's instant."""
         ready, pop, run = self._ready, self._ready.popleft, 0
         while ready and not self._stopping:
-            handle = pop()
-            if handle._cancelled:
+            call = pop()
+            if call.is_cancelled:
                 continue
-            handle._run()
+            try:
+                call.context.run(call.callback, *call.args)
+            except (SystemExit, KeyboardInterrupt):
+                raise
+            except BaseException as e:  # an unhandled error, as in every loop of asyncio
+                self.call_exception_handler(
+                    {"message": f"Exception in callback {call}", "exception": e, "handle": call}
+                )
             run += 1
             if run == STUCK_AFTER:
-                raise Deadlock("virtual time stands still: callbacks schedule each other without end", got=str(handle))
+                raise Deadlock("virtual time stands still: callbacks schedule each other without end", got=str(call))
         self.callbacks += run
         if not self._stopping:
             self._advance()
@@ -219,8 +224,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
-            if isinstance(due, asyncio.TimerHandle):
-                if due.cancelled():
+            if isinstance(due, ScheduledCall):
+                if due.is_cancelled:
                     continue
                 ready.append(due)
             elif due.done():
@@ -344,9 +349,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     remove_signal_handler: Any = _way_out("remove_signal_handler")
 
 
-def _is_over(due: asyncio.TimerHandle | asyncio.Future[None]) -> bool:
+def _is_over(due: ScheduledCall | asyncio.Future[None]) -> bool:
     """Return whether the timer is no longer needed."""
-    return due.cancelled() if isinstance(due, asyncio.TimerHandle) else due.done()
+    return due.is_cancelled if isinstance(due, ScheduledCall) else due.done()
 
 
 def culprit() -> str:

@@ -39,9 +39,13 @@ class ProgramSource:
         return sha256(content).hexdigest() == self.digest
 
 
-def sources(programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = ()) -> list[ProgramSource]:
-    """Return the files of `programs`, which were just created. `before`: the sources of the programs that they
-    replace."""
+def sources(
+    programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = (), *, modules: bool = True
+) -> list[ProgramSource]:
+    """Return the files of `programs`, which were just created, and of the `modules` in their folders.
+
+    `before`: the sources of the programs that they replace.
+    """
     imported = {source.path: source.digest for source in before if not source.compiled}
     found = []
     for bound in programs:
@@ -49,7 +53,7 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[ProgramSource] = 
         path = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None) or ""
         digest = imported.get(path) or _digest(path)
         found.append(ProgramSource(bound.name, path, digest, bool(made.source_path)))
-        if path and not made.source_path:
+        if modules and path and not made.source_path:
             found += [ProgramSource(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
     return found
 

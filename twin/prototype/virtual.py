@@ -124,7 +124,7 @@ class VirtualPrototype(AsyncResource):
         alarm = alarm_if_free(max(VIRTUAL_STUCK_MS, config.stuck_ms))
         if alarm is not None:
             self._stack.callback(alarm.close)
-        self.plc = TaskRunner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change)
+        self.plc = TaskRunner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change, modules=False)
         self._stack.callback(self.plc.close)
         self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:

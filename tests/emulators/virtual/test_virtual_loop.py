@@ -11,7 +11,9 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Coroutine
+from contextvars import ContextVar, copy_context
 from datetime import UTC, date
 from time import perf_counter
 from typing import Any
@@ -322,9 +324,46 @@ def test_an_uncaught_error_is_kept() -> None:
 
         loop.call_soon(bad)
         await asyncio.sleep(0)
-        return [str(context["exception"]) for context in loop.unhandled]
+        return [f"{context['message']}: {context['exception']}" for context in loop.unhandled]
 
-    assert run(main) == ["in a callback"]
+    [error] = run(main)
+    assert re.fullmatch(r"Exception in callback .*\.bad\(\) at .*test_virtual_loop\.py:\d+: in a callback", error)
+
+
+def test_a_cancelled_callback_is_not_called_and_its_arguments_are_released() -> None:
+    class Held:
+        pass
+
+    async def main(loop: VirtualLoop) -> list[bool]:
+        called: list[Held] = []
+        held = Held()
+        alive = weakref.ref(held)
+        calls = [loop.call_soon(called.append, held), loop.call_later(1, called.append, held)]
+        for call in calls:
+            call.cancel()
+        del held
+        released = alive() is None
+        await asyncio.sleep(2)
+        return [released, not called, *(call.cancelled() for call in calls)]
+
+    assert all(run(main))
+
+
+def test_a_timer_has_its_time_and_its_context() -> None:
+    variable: ContextVar[str] = ContextVar("variable", default="")
+
+    async def main(loop: VirtualLoop) -> str:
+        seen: list[str] = []
+        context = copy_context()
+        context.run(variable.set, "of the context")
+        timer = loop.call_later(0.25, lambda: seen.append(variable.get()), context=context)
+        assert timer.when() == loop.time() + 0.25
+        assert timer.get_context() is context
+        assert not timer.cancelled()
+        await asyncio.sleep(1)
+        return seen[0]
+
+    assert run(main) == "of the context"
 
 
 def test_it_is_closed_once_and_runs_alone() -> None:

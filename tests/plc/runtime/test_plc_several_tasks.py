@@ -129,6 +129,7 @@ def test_a_changed_module_that_a_program_imports_from_its_folder_is_known(
     importlib.import_module("gains_of_the_pump")
     rig = Rig(tmp_path, FAST_AND_SLOW, ("Fast", "Slow"))
     assert changed(rig.runner.sources) == []
+    assert {Path(s.path).stem for s in sources(rig.runner.programs, modules=False)} == {rig.module}
     helper.write_text("GAIN = 2\n")
     assert [(s.program, Path(s.path).name) for s in changed(rig.runner.sources)] == [
         ("fast", helper.name), ("slow", helper.name),

@@ -190,3 +190,23 @@ def test_the_guide_is_tried_with_an_emulated_device_and_the_role_view_only_looks
         page.sees(".outcome", "The list is not complete.")
         assert not page.elements("main button.primary, main button.danger")
         assert page.complaints() == []
+
+
+def test_a_typed_unit_id_is_that_of_the_next_steps_and_a_refused_function_does_not_answer(tmp_path: Path) -> None:
+    (tmp_path / "heat.yaml").write_text(PROFILE.replace("unit: 3", "unit: 17"))
+    with studio(folder=tmp_path) as running, browser() as page:
+        with running.client() as client:
+            step = {"step": "emulate", "what": "heat.yaml", "on": "pty:line"}
+            assert client.post("/commissioning/jobs", json={"step": step}).status_code == 200
+        until(lambda: (tmp_path / "line").exists(), "the emulated device listens")
+        opened(page, running)
+        page.type("#field-endpoint", "rtu:line")
+        go_to(page, "Identify")
+        page.type("[name=address]", "17")
+        page.click("form button.primary", "Identify")
+        page.sees(".outcome .chip", "f")  # findings: no shipped profile fits
+        go_to(page, "Dump")
+        page.sees("#command-line", "fieldtwin dump rtu:line --unit 17")
+        play(page, "Dump", "done", ranges="holding:0..1", passes="1")
+        page.sees(".outcome .mono", "07h, 08h, 0Bh, 0Ch")  # 11h and 2Bh are refused
+        assert "11h" not in page.text(".outcome")

@@ -195,7 +195,9 @@ function CommandStep({ step, ctx, choices, change, mayOperate, again }) {
       setAsking(false);
       await post("/commissioning/jobs", { step: confirmed ? { ...request, confirmed: true } : request });
       const outs = fields.filter((f) => f.kind === "out" || f.name === "resume").map((f) => f.name);
+      const address = Number(values.address || NaN); // a typed unit ID or node ID is also that of the next steps
       change((old) => ({
+        ...(step.needsPort && Number.isInteger(address) ? { address } : {}),
         forms: { ...old.forms, [step.id]: Object.fromEntries(Object.entries(old.forms[step.id] ?? {}).filter(([name]) => !outs.includes(name))) },
       }));
       again();

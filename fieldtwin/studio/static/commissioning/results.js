@@ -76,6 +76,8 @@ function stated(r) {
   };
 }
 
+const answering = (r) => (r.functions ?? []).filter((f) => f.hex !== undefined); // the others were refused, or silent
+
 const Dump = ({ r }) => html`
   <p>${r.values} values in ${r.passes} ${r.passes === 1 ? "pass" : "passes"}.</p>
   <${Table}
@@ -83,7 +85,7 @@ const Dump = ({ r }) => html`
     rows=${(r.maps ?? []).map((m) => [html`<strong>${m.map}</strong>`, m.readable.join(", "), m.refused.join(", "), m.silent.join(", "), m.not_asked.join(", "), m.max_read ?? ""])}
     empty="Nothing was read."
   />
-  ${r.functions?.length > 0 && html`<h3>Functions that answer</h3><p class="mono">${r.functions.map((f) => `${f.function.toString(16).toUpperCase().padStart(2, "0")}h`).join(", ")}</p>`}`;
+  ${answering(r).length > 0 && html`<h3>Functions that answer</h3><p class="mono">${answering(r).map((f) => `${f.function.toString(16).toUpperCase().padStart(2, "0")}h`).join(", ")}</p>`}`;
 
 const Infer = ({ r }) => html`<${Table}
   head=${["At", "Type", "Last value", "Sure", "Remarks"]}

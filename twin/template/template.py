@@ -111,7 +111,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 def parse_manifest(text: bytes, where: str) -> Manifest:
-    """Read ``template.json``. Raises `FileInvalid` for anything that a package could not hold, before any file is read."""
+    """Read ``template.json``. Raises `FileInvalid` for a manifest that no valid package can have, before any file is read."""
     try:
         version = msgspec.json.decode(text).get("fieldtwin_template")
     except (msgspec.MsgspecError, AttributeError, RecursionError) as e:

@@ -15,7 +15,7 @@ from fieldtwin.console import stderr
 
 
 class ScanProgress:
-    """``with ScanProgress(stoppable) as show:``; call it with each `PhaseProgress`."""
+    """The progress bar of a scan: ``with ScanProgress(stoppable) as show:``; call `show` with each `PhaseProgress`."""
 
     def __init__(self, stoppable: bool) -> None:
         self._hint = "q stops and keeps the results" if stoppable else "Ctrl-C stops and keeps the results"

@@ -27,7 +27,7 @@ class RuleOptions:
         default="20ms/50%",
         show_default=True,
         metavar="AMOUNT",
-        help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
+        help="Tolerance of the median and 90th percentile of latencies: a time or a share, whichever is larger; `any`: no limit.",
     )
     least: float = option(
         "--least",

@@ -133,7 +133,7 @@ def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[Path, 
 
 
 def _end(text: str) -> Endpoint:
-    """Return one side of a tap; a plain path is a serial port."""
+    """Return the endpoint of one side of a relay (`--tap`); a plain path is a serial port."""
     return Endpoint.parse(text if ":" in text else f"rtu:{text}")
 
 

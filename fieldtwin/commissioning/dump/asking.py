@@ -66,7 +66,7 @@ class AskResult:
 
 
 class DeviceReader(Protocol):
-    """The interface of a reader of one device."""
+    """The interface through which a dump reads one device, of either protocol."""
 
     async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
         """Read a range or an object, without any retry unless `patient`. Raises only errors that end the connection."""

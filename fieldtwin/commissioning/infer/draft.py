@@ -105,7 +105,7 @@ def _seen(reading: Interpretation) -> str:
 
 
 def _tag(reading: Interpretation) -> list[str]:
-    """Return the lines of one value. One of unknown type is a plain number for each of its registers."""
+    """Return the lines of the draft for one value. For a value of unknown type each of its registers becomes a plain number."""
     if reading.level is Level.UNKNOWN and reading.type != "uint16":
         return [
             f'  {reading.table}_{a}: {{at: "{reading.table}:{a}", type: uint16}}  # {doubts(reading)}'

@@ -114,6 +114,6 @@ def _same_bits(settings: SerialSettings, others: list[SerialSettings]) -> tuple[
 
 
 def describe(verdict: LineVerdict) -> str:
-    """Return one line for the user."""
+    """Return one line for the user: the settings that were found, others that fit as well, and the reason."""
     also = f" (or {', '.join(name_of(o) for o in verdict.others)})" if verdict.others else ""
     return f"{name_of(verdict.settings)}{also}: {verdict.why}"

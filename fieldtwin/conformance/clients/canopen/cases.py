@@ -94,7 +94,7 @@ CASES: tuple[CanopenCase, ...] = (
     DOWN(_case("CO-016b", "segment of a block download lost", REQUIRED, "7.2.4; CN #205", READ, plays.honest, completes,
           "does not receive the second segment", "send again from there, renumbered from 1").on(strikes=1, misses=2)),
     _case("CO-022", "slow segments", ROBUST, OWN, READ, plays.slow_segments, judges.accepts,
-          "takes 0.35 timeouts for each of five steps", "start the timeout anew at each step, and take the value").on(
+          "takes 0.35 timeouts for each of five steps", "start the timeout again at each step, and take the value").on(
           holds_good=True),
     _case("CO-023", "response after the client's timeout", ROBUST, OWN, READ, plays.late, judges.late_same_shape,
           "answers after 1.5 timeouts", "discard it, never pair it with the next request").on(strikes=1),
@@ -119,12 +119,12 @@ CASES: tuple[CanopenCase, ...] = (
     _case("CO-035", "unexpected boot-up", ROBUST, OWN, READ, plays.boots, reconfigures,
           "boots without a command", "configure and start it again").on(strikes=1, trail_s=RESTART_S),
     _case("CO-036a", "heartbeat lost", ROBUST, "7.2.8", READ, plays.honest, notices,
-          "sends no heartbeat for 4 s; all else goes on", "notice it; go on").on(
+          "sends no heartbeat for 4 s; everything else continues", "notice it; go on").on(
           strikes=1, mutes="heartbeat", framings=("heartbeat",)),
     _case("CO-036b", "node lost and back", ROBUST, "7.2.8", CUT, plays.honest, judges.survives,
           "sends nothing at all for 4 s", "go on asking, without a flood of requests").on(strikes=1, mutes="all"),
     _case("CO-037", "late heartbeat", ROBUST, "7.2.8", READ, plays.honest, is_unmoved,
-          "sends one heartbeat 0.2 s late; all else goes on", "report no loss within its consumer time").on(
+          "sends one heartbeat 0.2 s late; everything else continues", "report no loss within its consumer time").on(
           strikes=1, beat_late_s=0.2, framings=("heartbeat",)),
     _case("CO-038", "restart while timed out", FIELD, "CN #636", CUT, plays.honest, reconfigures,
           "sends nothing at all for 4 s, then boots", "configure and start it again; go on monitoring it").on(

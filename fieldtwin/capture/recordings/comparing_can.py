@@ -1,4 +1,5 @@
-"""As `comparing`, for CANopen nodes by a log of the bus: SDO transfers one by one, unrequested messages by kind.
+"""Compare CANopen nodes by logs of their bus, as `comparing` compares exchanges: SDO transfers one by one, unrequested
+messages by kind.
 
 The times of a node's own messages (PDOs, heartbeats) vary: the same messages, of the same length and about as often,
 are equal; their contents are signals, which a replay reads at its own clock. Pure.

@@ -185,7 +185,9 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
 
 
 def map_line(dump: Dump, table: Table, found: dict[str, Any]) -> dict[str, Any]:
-    """Return `found`, the line about the limits of a table, with the state of each address by the reads of `dump`."""
+    """Return `found`, the line of a dump file about the limits of a table, extended by the state of each address that the
+    reads of `dump` show.
+    """
     states = describe(
         table,
         dump.coverage.get(table) or Coverage(),

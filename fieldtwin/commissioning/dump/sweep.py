@@ -287,8 +287,8 @@ class Sweep:
     def _probe(self, at: int, *, strided: bool) -> Trying:
         """Return whether `at` can be read.
 
-        As long as no register was readable, the device may have pairs only: a pair is read too, and first if not every
-        address is read.
+        As long as no register was readable, the device may permit reads of two registers only. Therefore a pair of registers
+        is also read, and it is read first if the sweep does not read every address.
         """
         grain = self.found.grain
         readable = self.coverage.states[at] == READABLE

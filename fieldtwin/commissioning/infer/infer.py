@@ -117,7 +117,7 @@ def infer(series: Series) -> Inference:
 def _between(
     address: int, words: Sequence[Sequence[int]], clocks: Sequence[Interpretation]
 ) -> list[tuple[int, Sequence[Sequence[int]]]]:
-    """Return the parts of a run of registers that are left between the registers of clocks."""
+    """Return the parts of a block of consecutive registers that do not belong to a clock."""
     taken = {r.address - address for r in clocks}
     parts: list[tuple[int, list[Sequence[int]]]] = []
     for i, word in enumerate(words):

@@ -307,7 +307,9 @@ def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
 
 
 def plant_of(wire: Endpoint) -> Endpoint:
-    """Return the endpoint that states the framing and the serial settings of `wire`: of a line, or `wire` itself."""
+    """Return the serial line that `wire` represents (a virtual or real port, or a line over TCP), with its framing and serial
+    settings; for any other connection, `wire` itself.
+    """
     if wire.scheme not in ("pty", "rtu+tcp", *SERIAL_SCHEMES):
         return wire
     settings = tuple((name, value) for name, value in wire.params if name not in LINE_PARAMS)

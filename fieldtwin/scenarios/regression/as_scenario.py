@@ -198,7 +198,8 @@ def _looks(system: System, history: RunHistory, wanted: ScenarioOptions, begin_n
 
 
 def _slack(changes: list[ValueChange], history: RunHistory, *, counts: bool = False) -> float:
-    """Return how far a field may drift meanwhile: its largest step, at least two for one that `counts` in its device.
+    """Return the tolerance for a field whose value may change between its recording and its check: its largest step, at least
+    two for a field that `counts` in its device.
 
     0 for a field that only commands change: its value is known exactly.
     """

@@ -66,7 +66,7 @@ class HonestNode:
         return self._server.in_sub_block
 
     def poisoned(self, request: bytes, poison: int) -> bytes:
-        """Return an expedited upload response with another word."""
+        """Return an expedited upload response whose value is `poison` instead of the object's value."""
         return (
             bytes((0x43 | (4 - self._size) << 2,))
             + request[1:4]

@@ -36,8 +36,8 @@ class Deaf:
 
 @dataclass(frozen=True, slots=True)
 class Unplug:
-    """The move: remove the port for `out_s` seconds and restore it under its name; then a different process holds it for
-    `held_s` seconds.
+    """A step of a hostile server: remove the port for `out_s` seconds and restore it under its name; then a different process
+    holds it for `held_s` seconds.
     """
 
     out_s: float

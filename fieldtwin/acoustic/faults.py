@@ -85,7 +85,7 @@ class AcousticFaults:
 
 
 def check_water_fault(places: Collection[str], spec: FaultSpec) -> None:
-    """Raise `WrongAim` for a fault that does not apply to the acoustic channel, or a modem that is not in it."""
+    """Raise `WrongAim` if the fault does not apply to the acoustic channel, or if its modem is not in the channel."""
     if spec.kind is not Drop:
         raise WrongAim("name", f"fault {spec.kind.name!r} does not exist on the acoustic channel", expected=Drop.name)
     for key in sorted(spec.aim.model_fields_set - _AIMS):

@@ -18,7 +18,9 @@ Labels = Mapping[str, str]
 
 @dataclass(slots=True)
 class Family:
-    """A metric with its samples; `samples` are name, labels and value as they are written."""
+    """A metric with its samples; `samples` are the name, the labels and the value of each sample, in the form in which they
+    are written.
+    """
 
     name: str
     kind: Kind

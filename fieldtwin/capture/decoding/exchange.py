@@ -110,7 +110,9 @@ class DecodedExchange:
         return not self.problem
 
     def reads(self, tag: str = "") -> bool:
-        """Return whether the exchange reads, and if given, whether it reads `tag` (a name without its device)."""
+        """Return whether the exchange reads values and, if `tag` (a name without its device) is given, whether it reads that
+        tag.
+        """
         return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
 
     def describe(self) -> dict[str, Any]:

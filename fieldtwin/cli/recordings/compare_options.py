@@ -46,7 +46,9 @@ class RuleOptions:
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """The requests to a live device, and the confirmation of writes. `most` None: every request of the recording."""
+    """The options for the requests to a live device and for the confirmation of writes. `most` None: every request of the
+    recording.
+    """
 
     most: int | None = option(
         "--most", type=click.IntRange(1), default=None, help="With a live device: send only this many requests."

@@ -25,7 +25,7 @@ LONGEST_TEXT = 256
 
 @dataclass(slots=True)
 class CanIdentity:
-    """The findings about a node."""
+    """The result of `identify` for a node: what the node reported of itself, and the profiles that may fit."""
 
     url: str
     node: int

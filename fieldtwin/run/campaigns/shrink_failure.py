@@ -12,7 +12,7 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, broken_by, run_seed, schedule
 from fieldtwin.run.campaigns.shrink import as_scenario, same_failure, shrunk_run
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.scenarios.judging.runner import fault_id
+from fieldtwin.scenarios.judging.fault_effects import fault_id
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
 _KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")

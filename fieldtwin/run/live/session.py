@@ -8,7 +8,6 @@ the other processes show its consequences, and the run fails. The thread's proce
 from __future__ import annotations
 
 import asyncio
-import os
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -18,52 +17,52 @@ import msgspec
 
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import stderr
-from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, StoppedGateway
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
+from fieldtwin.run.live.child_configs import (
+    field_config,
+    gateway_config,
+    run_record,
+    thread_config,
+    transmitter_of_thread,
+)
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
+from fieldtwin.run.live.scheduling_watch import SchedulingWatch
 from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.children import Child
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
-from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, write_record
+from fieldtwin.run.processes.run_record import SYSTEM_FILE, write_record
 from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.thread_return import ThreadReturn
 from fieldtwin.run.processes.topside import TopsideController, script
-from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.instance import Instance, capture_path
-from fieldtwin.twin.plant.mapping import mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
-from fieldtwin.twin.thread.place import MODEM, delegated_transmitter
+from fieldtwin.twin.thread.place import MODEM
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
 if TYPE_CHECKING:
     from fieldtwin.run.benches.invariant_watch import InvariantWatch
     from fieldtwin.run.live.bridge_cable import BridgeCable
-    from fieldtwin.twin.prototype.field_process import FieldConfig
     from fieldtwin.twin.prototype.file import Prototype
 
-MODEM_EVERY_S = 1.0
-"""Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
 WATCH_S = 0.02
 ANSWERS_WITHIN_S = 5.0
 """Time in seconds after which a process that has not answered counts as stopped, or as one that gets no processor time."""
-STILL_S = 3.0
-"""If more time than this (seconds) lies between two checks, this process was itself stopped or got no processor time."""
 ORACLE_S = 1.0
 INVARIANTS_S = 0.1
 """Period in seconds of the checks of the system file's invariants."""
@@ -87,7 +86,7 @@ class RunSession(AsyncResource):
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
         self.twin = PhysicalTwin(self.system)
-        self.delegated = self._delegated_to_the_thread()
+        self.delegated = transmitter_of_thread(options, self.system)
         self._prototype: Prototype | None = None
         if options.prototype and not options.field_host:
             from fieldtwin.twin.prototype.field_process import (
@@ -95,7 +94,7 @@ class RunSession(AsyncResource):
             )
 
             # errors in the files are reported before anything starts
-            self._prototype = resolve(self._field_config(Path()), self.system).prototype
+            self._prototype = resolve(field_config(options, self.system, Path()), self.system).prototype
         self.faults = options.faults
         if options.fault_file is not None:
             from fieldtwin.emulators.faults.schema import load_faults
@@ -130,10 +129,7 @@ class RunSession(AsyncResource):
         self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # the times at which gateway and PLC last answered
-        self._looked_ns = 0
-        """The time of this process's last check of the others."""
-        self._still_ns = -(1 << 62)
-        """The time when this process last noticed that it had been stopped."""
+        self._scheduling = SchedulingWatch(self.clock, ANSWERS_WITHIN_S, self.note_error)
         self.stopped = asyncio.Event()
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
@@ -144,23 +140,6 @@ class RunSession(AsyncResource):
         """How often a scenario has reset the simulated devices."""
         self.field_return: FieldReturn | None = None
         """The reconnection to a remote field simulator."""
-
-    def _delegated_to_the_thread(self) -> str:
-        """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
-        o = self.options
-        delegated = delegated_transmitter(o.thread, self.system)
-        if delegated and not o.prototype and not o.allow_writes:
-            raise UsageError(
-                f"a thread over {delegated!r} writes into its mailbox",
-                expected="--allow-writes",
-                got=f"--thread {o.thread}",
-            )
-        if delegated and o.commands:
-            raise UsageError(
-                f"the topside end of {delegated!r} belongs to the digital twin", expected="--commands none",
-                hint="`fieldtwin twin ... --command 1` commands over the thread",
-            )  # fmt: skip
-        return delegated
 
     @property
     def disturbed(self) -> bool:
@@ -218,38 +197,18 @@ class RunSession(AsyncResource):
         config.write_bytes(plc.to_json())
         await self._start_child("plc", "fieldtwin.plc", config)
         self._resolved = write_resolved(self.instance.path(SYSTEM_FILE), self.system)
-        gateway = ControllerConfig(
-            system=str(self.system.path.resolve()),
-            run_dir=str(run_dir),
-            allow_writes=self.options.prototype or self.options.allow_writes,
-            mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
-            profiles=tuple(str(p.resolve()) for p in self.options.profiles),
-            capture=str(self.capture.resolve()) if self.capture else "",
-            delegated=(self.delegated,) if self.delegated else (),
-            resolved=self._resolved,
-        )
+        gateway = gateway_config(
+            self.options, self.system, run_dir,
+            mapping=self.mapping, capture=self.capture, delegated=self.delegated, resolved=self._resolved,
+        )  # fmt: skip
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         if self.options.thread:
             await self._start_thread(run_dir)
         self.started_ns = self.clock.monotonic_ns()
-        write_record(run_dir, self._record())
+        write_record(run_dir, run_record(self.options, self.system, self.capture, self.started_ns, self.clock.utc_ns()))
         await self._put_faults_in()
         self._start_watching()
-
-    def _record(self) -> RunRecord:
-        o = self.options
-        return RunRecord(
-            system=self.system.name,
-            path=str(self.system.path.resolve()),
-            prototype=o.prototype,
-            allow_writes=o.prototype or o.allow_writes,
-            started_utc_ns=self.clock.utc_ns(),
-            started_ns=self.started_ns,
-            pid=os.getpid(),
-            capture=str(self.capture.resolve()) if self.capture else "",
-            field_elsewhere=bool(o.field_host),
-        )
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:
@@ -258,17 +217,8 @@ class RunSession(AsyncResource):
 
     async def _start_thread(self, run_dir: Path) -> None:
         """Start the plant's side of the digital thread, which observes the process image."""
-        o = self.options
-        config = PlantThreadConfig(
-            resolved=self._resolved,
-            run_dir=str(run_dir),
-            place=o.thread,
-            store=o.thread_store or str(run_dir / "knowledge.sqlite"),
-            prototype=o.prototype,
-            mapping=mapping_to_json(self.mapping) if o.prototype else None,
-            every_ms=round(
-                1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.delegated else 0)
-            ),
+        config = thread_config(
+            self.options, run_dir, mapping=self.mapping, delegated=self.delegated, resolved=self._resolved
         )
         client = await self._start_child(
             "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
@@ -295,25 +245,6 @@ class RunSession(AsyncResource):
         self._stack.push_async_callback(self.thread_return.end)
         self._nursery.start(self.thread_return.run(), "thread's process")
 
-    def _field_config(self, run_dir: Path) -> FieldConfig:
-        from fieldtwin.twin.prototype.field_process import FieldConfig
-
-        o = self.options
-        listen = dict(o.listen)
-        if o.can:
-            listen |= {name: f"can:{o.can}" for name, bus in self.system.buses.items() if bus.endpoint.is_can}
-        return FieldConfig(
-            system=str(self.system.path.resolve()),
-            run_dir=str(run_dir),
-            prototype=str(o.prototype_file.resolve()) if o.prototype_file else "",
-            profiles=tuple(str(p.resolve()) for p in o.profiles),
-            recordings={d: str(Path(p).resolve()) for d, p in o.recordings.items()},
-            speed=o.speed,
-            listen=listen,
-            seed=o.seed,
-            water=o.water,
-        )
-
     def _write(self, name: str, config: msgspec.Struct) -> Path:
         path = self.instance.path(name)
         path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
@@ -336,7 +267,8 @@ class RunSession(AsyncResource):
             self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
             resolved = write_resolved(self.instance.path("prototype.pickle"), self.system, self._prototype)
-            config = self._write("field.json", msgspec.structs.replace(self._field_config(run_dir), resolved=resolved))
+            field = msgspec.structs.replace(field_config(self.options, self.system, run_dir), resolved=resolved)
+            config = self._write("field.json", field)
             client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
             self._field = await contact_local(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
@@ -429,9 +361,7 @@ class RunSession(AsyncResource):
 
     async def _watch(self) -> None:
         while True:
-            self._was_suspended()
-            self._looked_ns = self.clock.monotonic_ns()
-            self.states.look(self._looked_ns)
+            self.states.look(self._scheduling.look())
             self._notice_deaths()
             await asyncio.sleep(WATCH_S)
 
@@ -504,19 +434,9 @@ class RunSession(AsyncResource):
             return None
         except FieldtwinError as e:
             self._maybe_lost(client, e)
-            if isinstance(e, ReplyTimeout) and name and not self._was_suspended():
+            if isinstance(e, ReplyTimeout) and name and not self._scheduling.was_suspended():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
             return None  # the process is ending or has ended, which _notice_deaths reports with the reason
-
-    def _was_suspended(self) -> bool:
-        """Return whether this process was itself stopped, or got no processor time. It then cannot know whether the other
-        processes would have answered.
-        """
-        gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
-        if self._looked_ns and gap_s > STILL_S:
-            self._still_ns = self.clock.monotonic_ns()
-            self.note_error(f"run: this process was not scheduled for {gap_s:.1f} s")
-        return self.clock.monotonic_ns() - self._still_ns < (STILL_S + ANSWERS_WITHIN_S) * NS_PER_S
 
     def _maybe_lost(self, client: ControlClient, error: FieldtwinError) -> None:
         if self.field_return is not None and client is self.field_return.client and is_loss(error):

@@ -7,7 +7,7 @@ pass.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,10 +20,12 @@ from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Struck, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
+from fieldtwin.scenarios.judging.broken import Broken, RuleBroken, too_late, wanted
 from fieldtwin.scenarios.judging.expectation import ExpectationInput, check_exchanges, check_tag, said
+from fieldtwin.scenarios.judging.fault_effects import fault_id, without_effect
 from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.last_exchanges import deciding, last_exchanges
-from fieldtwin.scenarios.judging.lateness import Allowance, allowance
+from fieldtwin.scenarios.judging.lateness import allowance
 from fieldtwin.scenarios.judging.refused import RefusedOutputs
 from fieldtwin.scenarios.judging.standing import Standing
 from fieldtwin.scenarios.judging.target_limits import refusal
@@ -51,47 +53,6 @@ LATE_SHARE = 0.1
 """If the host was late by more than this part of the time that a check is about, the check has proved nothing."""
 
 
-@dataclass
-class _Broken(Exception):
-    """A check that does not hold: the verdict, the expected and the actual value.
-
-    `bound_s` is the time that it is about, 0 for none; `since_s` is the time from which the host's lateness counts, if
-    that is not the step's start.
-    """
-
-    verdict: Verdict
-    expected: str
-    got: str
-    bound_s: float = 0.0
-    since_s: float | None = None
-
-
-class _RuleBroken(Exception):
-    """A rule of the whole run does not hold, during a step or after the last."""
-
-    def __init__(self, rule: CheckResult) -> None:
-        self.rule = rule
-
-
-def _wanted(what: str, within_s: float) -> str:
-    """Return the condition for which a step waits, as text: ``ctd.pressure > 3 within 2 s``, or ``... now`` if it may take no
-    time.
-    """
-    return f"{what} within {within_s:g} s" if within_s else f"{what} now"
-
-
-def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _Broken:
-    """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has failed."""
-    if allowed.exhausted:
-        return _Broken(
-            Verdict.INCONCLUSIVE, expected, f"{got}; this host itself was late for more than {allowed.any_s:.3f} s"
-        )
-    if allowed.applies:
-        waited = f"; also not in {allowed.any_s:.3f} s more, the lateness of this host" if allowed.any_s else ""
-        return _Broken(Verdict.FAILED, expected, got + waited)
-    return _Broken(Verdict.FAILED, expected, got, bound_s)
-
-
 def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
     """Return the result ERROR for a part of the system that failed with `error`, `t_ns` after the run's start."""
     text, where = "every part of the system runs", getattr(error, "place", "")
@@ -105,12 +66,6 @@ def last_reaction_s(scenario: Scenario) -> float:
     plc = scenario.system.plc
     cycles_ms = [task.interval_ms for task in plc.tasks.values() if task.interval_ms is not None]
     return min(LAST_REACTION_MOST_S, 2 * max(cycles_ms, default=plc.cycle_ms) / 1000 + LAST_WRITE_S)
-
-
-def fault_id(n: int, step: Step) -> str:
-    """Return the id of the fault that step `n` (from 0) injects."""
-    assert step.fault is not None
-    return str(step.fault.get("id") or f"step {n + 1}")
 
 
 @dataclass(frozen=True)
@@ -202,7 +157,7 @@ class ScenarioRunner:
                 await self._until(self._by_chance.until_s)
             await self._until(self.bench.now_s() + last_reaction_s(self.scenario))
             return await self._hold_to_the_end()
-        except _RuleBroken as broken:
+        except RuleBroken as broken:
             self.results.append(broken.rule)
             return broken.rule.verdict, f"{broken.rule.number}: {broken.rule.text}: {broken.rule.got}"
         except NothingKnown as e:
@@ -220,32 +175,10 @@ class ScenarioRunner:
         except FieldtwinError as e:
             self.results.append(gone(e, self._now_ns()))
             return (Verdict.ERROR, str(e)) if verdict is Verdict.PASSED else (verdict, reason)
-        steps = {fault_id(n, step): n for n, step in enumerate(self.scenario.form.steps) if step.fault is not None}
-        for one in self.faults:
-            if one.struck or one.optional:
-                continue
-            where = self.scenario.line("steps", steps[one.id]) if one.id in steps else ""
-            text, now_ns = f"{one.name} strikes {one.on}", self._now_ns()
-            got = "never took effect, so it tested nothing; if this is acceptable, set optional: true"
-            self.results.append(
-                CheckResult(
-                    f"fault {one.id}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, where=where, vacuous=True
-                )
-            )
+        for result, why in without_effect(self.scenario, struck, self._now_ns()):
+            self.results.append(result)
             if verdict is Verdict.PASSED and self._by_chance is None:
-                verdict, reason = Verdict.INCONCLUSIVE, f"fault {one.id}: {text}: {got}"
-        effect = Counter[str]()
-        for one in struck:
-            if one.is_set:
-                effect[one.on] += one.struck
-        for tag in (tag for tag, times in effect.items() if not times):
-            text, now_ns = f"set: {tag} takes effect", self._now_ns()
-            got = "no effect: the device has not sent the value since it was set"
-            self.results.append(
-                CheckResult(f"set {tag}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, vacuous=True)
-            )
-            if verdict is Verdict.PASSED and self._by_chance is None:
-                verdict, reason = Verdict.INCONCLUSIVE, f"{text}: {got}"
+                verdict, reason = Verdict.INCONCLUSIVE, why
         return verdict, reason
 
     # -- steps ----------------------------------------------------------------------------------------------------------
@@ -260,11 +193,11 @@ class ScenarioRunner:
             self._look_at_all()
             await self._do(n, word, step)
             self._look_at_all()
-        except _Broken as broken:
+        except Broken as broken:
             verdict, expected, got = self._judged_on_time(broken, since_s)
             if self._by_chance is not None:
                 verdict, got = Verdict.SKIPPED, f"not checked under random faults: {got}"
-        except _RuleBroken as broken_rule:
+        except RuleBroken as broken_rule:
             rule = broken_rule
             verdict, got = Verdict.INCONCLUSIVE, f"not finished: {rule.rule.number} was violated first"
         except UsageError as e:
@@ -297,7 +230,7 @@ class ScenarioRunner:
             return tuple(self.scenario.expression(step.expect.that, "steps", n, "expect", "that").names)
         return (step.expect.wire or step.expect.tag or "",)
 
-    def _judged_on_time(self, broken: _Broken, since_s: float) -> tuple[Verdict, str, str]:
+    def _judged_on_time(self, broken: Broken, since_s: float) -> tuple[Verdict, str, str]:
         """Return the verdict on a broken check.
 
         If the host was late by a large part of the time that it is about, it is INCONCLUSIVE.
@@ -342,11 +275,11 @@ class ScenarioRunner:
                 waited_s = self.bench.now_s() - since_s
                 unknown = f"unknown after {waited_s:g} s: " if truth is None else ""
                 got = unknown + self._knowledge.of_expression(expression)
-                raise _too_late(_wanted(expression.text, within_s), got, self._bound(expression, within_s), allowed)
+                raise too_late(wanted(expression.text, within_s), got, self._bound(expression, within_s), allowed)
             await self._tick(deadline_s)
         # otherwise the reaction was in time as soon as its value was known
         if self.bench.now_s() - unknown_until_s > TICK_S:
-            self._met(_wanted(expression.text, within_s), since_s, within_s, [expression])
+            self._met(wanted(expression.text, within_s), since_s, within_s, [expression])
 
     def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:
         """Accept a check that was met. If it took longer than its own time, the lateness of this host must be the reason."""
@@ -357,7 +290,7 @@ class ScenarioRunner:
         late = f"met after {took_s:.3f} s; this host itself was late for {allowed.own_s:.3f} s"
         if not allowed.in_time(took_s):
             got = f"{late}, and {allowed.any_s:.3f} s of total lateness were measured: the host or the system may be the cause"
-            raise _Broken(Verdict.INCONCLUSIVE, expected, got)
+            raise Broken(Verdict.INCONCLUSIVE, expected, got)
         if allowed.own_s:
             self._remark = f"{late}, which was subtracted"
 
@@ -376,16 +309,16 @@ class ScenarioRunner:
             dropped = self._dropped
             await self._until(self.bench.now_s() + max(within_s, during_s))
             if self._dropped != dropped:
-                raise _Broken(
+                raise Broken(
                     Verdict.INCONCLUSIVE, f"at most {KEPT} exchanges in that time", "more; the oldest were dropped"
                 )
             said = check_exchanges(expect, watched)
             if said is not None:
-                raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
+                raise Broken(Verdict.FAILED, *said, max(within_s, during_s))
             # Too few exchanges prove nothing if the bus was never seen working.
             if not self._whole.requests[expect.wire]:
                 got = f"no exchange with {expect.wire} was recorded since the start"
-                raise _Broken(Verdict.INCONCLUSIVE, f"exchanges with {expect.wire}", got)
+                raise Broken(Verdict.INCONCLUSIVE, f"exchanges with {expect.wire}", got)
             return
         assert expect.tag is not None
         if expect.updates_per_s is not None:
@@ -393,19 +326,19 @@ class ScenarioRunner:
         since_s = self.bench.now_s()
         while (said := await check_tag(expect, watched)) is not None:
             if expect.updates_per_s is not None:
-                raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
+                raise Broken(Verdict.FAILED, *said, max(within_s, during_s))
             allowed = allowance(self.bench, since_s, within_s)
             deadline_s = since_s + within_s + allowed.any_s
             if self.bench.now_s() >= deadline_s:
-                raise _too_late(*said, max(within_s, during_s), allowed)
+                raise too_late(*said, max(within_s, during_s), allowed)
             await self._tick(deadline_s)
-        self._met(_wanted(expect.tag, within_s), since_s, within_s)
+        self._met(wanted(expect.tag, within_s), since_s, within_s)
         if expect.updates_per_s is None:
             end_s = self.bench.now_s() + during_s
             while self.bench.now_s() < end_s:  # the value must stay so
                 await self._tick(end_s)
                 if (said := await check_tag(expect, watched)) is not None:
-                    raise _Broken(Verdict.FAILED, *said, during_s)
+                    raise Broken(Verdict.FAILED, *said, during_s)
             self._looked_all_the_time(end_s - during_s, during_s)
 
     async def _throughout(self, expression: Expression, during_s: float) -> None:
@@ -414,18 +347,18 @@ class ScenarioRunner:
             await self._tick(end_s)
             if (truth := expression.truth(self._knowledge.look)) is not True:
                 got = ("unknown: " if truth is None else "") + self._knowledge.of_expression(expression)
-                raise _Broken(
+                raise Broken(
                     Verdict.FAILED, f"{expression.text} for {during_s:g} s", got, self._bound(expression, during_s)
                 )
         self._looked_all_the_time(end_s - during_s, during_s)
 
     def _looked_all_the_time(self, since_s: float, during_s: float) -> None:
-        """Raise `_Broken` if this host was late while a lasting condition had to be checked: the condition may have been false
+        """Raise `Broken` if this host was late while a lasting condition had to be checked: the condition may have been false
         for a while.
         """
         late_s = self.bench.host_late_s(since_s)
         if during_s and late_s > LATE_SHARE * during_s:
-            raise _Broken(
+            raise Broken(
                 Verdict.INCONCLUSIVE,
                 f"looked at for {during_s:g} s",
                 f"this host was {late_s * 1000:.0f} ms late by itself",
@@ -447,16 +380,16 @@ class ScenarioRunner:
         self._look_at_all()
 
     def _look_at_all(self) -> None:
-        """Check the rules of the whole run. Raises `_RuleBroken`."""
+        """Check the rules of the whole run. Raises `RuleBroken`."""
         said = self._standing.look() or self._refused.look() or self._whole.look()
         if said is None:
             return
         verdict = Verdict.INCONCLUSIVE if said.undecidable else self._of_lateness(said.asks_lateness)
         since_s = self.bench.now_s() - said.bound_s - RECENT_S
-        broken = _Broken(verdict, said.expected, said.got, said.bound_s, since_s)
+        broken = Broken(verdict, said.expected, said.got, said.bound_s, since_s)
         verdict, expected, got = self._judged_on_time(broken, since_s)
         since_ns, now_ns = round(said.since_s * NS_PER_S), self._now_ns()
-        raise _RuleBroken(
+        raise RuleBroken(
             CheckResult(
                 said.number,
                 said.expected,

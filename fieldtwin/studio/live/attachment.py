@@ -89,7 +89,8 @@ class Attachment:
         self.frames: FrameLog | None = None
         self._clock = clock
         tags = {f"{d.name}.{t.name}": t for d in system.devices.values() for t in d.profile.tags.values()}
-        self._secrets = {name for name, tag in tags.items() if tag.secret}
+        self.secrets = {name for name, tag in tags.items() if tag.secret}
+        """The tags whose values no client may see."""
         self.history = TagHistory(tags)
         self._seen_change: int | None = None
         """The number of the latest change that was read, None before the first answer."""
@@ -97,7 +98,7 @@ class Attachment:
         """Whether the changes that the gateway remembers from an earlier observation have been read."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
-        self._plc_values = PlcValues(found.dir)
+        self._plc_values = PlcValues(found.dir, self.secrets)
         self._buckets_ns = 0
         """When the distribution of scan times was read."""
         self._nursery = Nursery()
@@ -135,7 +136,7 @@ class Attachment:
         """Return the statuses, as data for JSON."""
         gateway = msgspec.to_builtins(self.gateway) if self.gateway is not None else None
         if gateway is not None:
-            for name in self._secrets & gateway["tags"].keys():
+            for name in self.secrets & gateway["tags"].keys():
                 gateway["tags"][name] |= {"value": SECRET}
         frames = self.frames
         return {
@@ -151,7 +152,7 @@ class Attachment:
 
     def point(self, name: str, t_ns: int, value: Any, quality: str, reason: str) -> Point:
         """Return a change of a tag, without the value of a secret."""
-        return Point(t_ns, SECRET if name in self._secrets else value, quality, reason)
+        return Point(t_ns, SECRET if name in self.secrets else value, quality, reason)
 
     async def _repeat(self, what: str, read: Callable[[], Awaitable[None]], every_s: float) -> None:
         while True:

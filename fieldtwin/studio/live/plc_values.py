@@ -6,7 +6,7 @@ memory: reading it costs the PLC nothing, however many tags there are. The PLC i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack
 from math import isfinite
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 
 from msgspec import structs
 
+from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.runtime.config import PlcConfig
@@ -25,10 +26,14 @@ CONFIG = "plc.json"
 
 
 class PlcValues:
-    """The process image of a run. `read` opens it when it is first needed; `close` gives it back."""
+    """The process image of a run. `read` opens it when it is first needed; `close` gives it back.
 
-    def __init__(self, run_dir: Path) -> None:
+    `secrets` are the tags whose values are masked.
+    """
+
+    def __init__(self, run_dir: Path, secrets: Collection[str]) -> None:
         self._config = run_dir / CONFIG
+        self._secrets = secrets
         self._stack = ExitStack()
         self._readers: tuple[RegionReader, RegionReader] | None = None
 
@@ -43,11 +48,11 @@ class PlcValues:
         Raises `FileInvalid` or `Unreachable` if the image cannot be read.
         """
         inputs, outputs = (reader.snapshot() for reader in self._readers or self._open())
-        values = {tag: _plain(outputs.values[n]) for tag, n in outputs.shape.index.items()}
+        values = {tag: self._shown(tag, outputs.values[n]) for tag, n in outputs.shape.index.items()}
         return WholePlcStatus(
             **structs.asdict(brief),
             inputs={
-                tag: _input(brief, inputs.value(n)).describe(now_ns) | {"value": _plain(inputs.values[n])}
+                tag: _input(brief, inputs.value(n)).describe(now_ns) | {"value": self._shown(tag, inputs.values[n])}
                 for tag, n in inputs.shape.index.items()
             },
             outputs=values,
@@ -58,6 +63,9 @@ class PlcValues:
                 if about["role"] != "input"
             },
         )
+
+    def _shown(self, tag: str, value: Any) -> Any:
+        return SECRET if tag in self._secrets else _plain(value)
 
     def _open(self) -> tuple[RegionReader, RegionReader]:
         config = PlcConfig.load(self._config)

@@ -68,6 +68,7 @@ class ScenarioRunner:
     def __init__(self) -> None:
         self._run: _Run | None = None
         self._count = 0
+        self._starting = asyncio.Lock()
 
     async def __aenter__(self) -> ScenarioRunner:
         return self
@@ -85,17 +86,20 @@ class ScenarioRunner:
         """Start a scenario. Raises `EndpointBusy` while another one runs."""
         if target not in TARGETS:
             raise UsageError("the target", expected=" or ".join(TARGETS), got=repr(target[:40]))
-        if self._run is not None and self._run.is_running:
-            raise EndpointBusy("a scenario is running already", got=self._run.path, hint="stop it, or wait for its end")
-        folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
-        trace = folder / f"{case_of(Path(path))}.jsonl" if target == "virtual" else None
-        files = ["--progress", str(folder / PROGRESS), "--html", str(folder / REPORT)]
-        files += ["--trace", str(trace)] if trace is not None else []
-        run = await ChildRun.started(["test", path, "--target", target, "--json", *files], _result)
-        if self._run is not None:
-            self._run.forget()
-        self._count += 1
-        self._run = _Run(self._count, path, target, run, folder, trace)
+        async with self._starting:  # of two requests at the same instant, the second finds the first running
+            if self._run is not None and self._run.is_running:
+                raise EndpointBusy(
+                    "a scenario is running already", got=self._run.path, hint="stop it, or wait for its end"
+                )
+            folder = Path(tempfile.mkdtemp(prefix="fieldtwin-scenario-"))
+            trace = folder / f"{case_of(Path(path))}.jsonl" if target == "virtual" else None
+            files = ["--progress", str(folder / PROGRESS), "--html", str(folder / REPORT)]
+            files += ["--trace", str(trace)] if trace is not None else []
+            run = await ChildRun.started(["test", path, "--target", target, "--json", *files], _result)
+            if self._run is not None:
+                self._run.forget()
+            self._count += 1
+            self._run = _Run(self._count, path, target, run, folder, trace)
 
     @property
     def trace(self) -> Path | None:

@@ -78,7 +78,7 @@ def _plant(attachment: Attachment, name: str) -> _Plant | None:
 def _compared(attachment: Attachment, status: TwinStatus, name: str, variable: VariableStatus) -> Compared:
     plant = _plant(attachment, name)
     verdict, reason = _verdict(attachment, variable, plant)
-    secret = _is_secret(attachment, name)
+    secret = name in attachment.secrets
     is_program = name in attachment.system.plc.programs
     return Compared(
         name=name,
@@ -130,9 +130,3 @@ def _difference(model: Any, plant: Any) -> float | None:
 
 def _words(reason: str) -> str:
     return reason.replace("_", " ")
-
-
-def _is_secret(attachment: Attachment, name: str) -> bool:
-    device, _, tag = name.rpartition(".")
-    config = attachment.system.devices.get(device)
-    return config is not None and tag in config.profile.tags and config.profile.tags[tag].secret

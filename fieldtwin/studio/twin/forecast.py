@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shlex
 import tempfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
+from fieldtwin.gateway.core.errors import EndpointBusy, NotAllowed, UsageError
 from fieldtwin.studio.child_run import ChildRun
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.twin.followers import short_system
@@ -56,6 +58,7 @@ class Forecaster:
         self._began_ns = 0
         self._command = ""
         self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._starting = asyncio.Lock()
 
     async def __aenter__(self) -> Forecaster:
         return self
@@ -85,25 +88,32 @@ class Forecaster:
         }
 
     async def start(self, attachment: Attachment, asked: AskWhatIf) -> None:
-        """Ask a question. Raises `UsageError` for a question that is too large, `EndpointBusy` while another one is answered."""
-        _check(asked)
-        if self._run is not None and self._run.is_running:
-            raise EndpointBusy("a forecast is running already", got=self._instance, hint="stop it, or wait for its end")
-        arguments = ["what-if", short_system(attachment.record), "--from", f"instance:{attachment.name}"]
-        arguments += ["--horizon", f"{asked.horizon_s:g}s"]
-        for command in asked.commands:
-            arguments += ["--command", f"{command.period_s}@{command.at_s:g}s"]
-        if asked.faults:
-            arguments += ["--faults", FAULT_FILE]
-        arguments += [part for text in asked.require for part in ("--require", text)]
-        arguments += [part for text in asked.finally_ for part in ("--finally", text)]
-        self._command = shlex.join(["fieldtwin", *arguments])
-        if asked.faults:
-            arguments[arguments.index(FAULT_FILE)] = str(self._fault_file(asked.faults))
-        arguments += ["--json", *(part for name in asked.series for part in ("--series", name))]
-        self._began_ns = attachment.now_ns()
-        self._run = await ChildRun.started(arguments, _outcome)
-        self._instance, self._asked = attachment.name, msgspec.to_builtins(asked)
+        """Ask a question.
+
+        Raises `UsageError` for a question that is too large, `NotAllowed` for one about a secret tag, and `EndpointBusy` while
+        another question is answered.
+        """
+        _check(asked, attachment.secrets)
+        async with self._starting:  # of two questions at the same instant, the second finds the first running
+            if self._run is not None and self._run.is_running:
+                raise EndpointBusy(
+                    "a forecast is running already", got=self._instance, hint="stop it, or wait for its end"
+                )
+            arguments = ["what-if", short_system(attachment.record), "--from", f"instance:{attachment.name}"]
+            arguments += ["--horizon", f"{asked.horizon_s:g}s"]
+            for command in asked.commands:
+                arguments += ["--command", f"{command.period_s}@{command.at_s:g}s"]
+            if asked.faults:
+                arguments += ["--faults", FAULT_FILE]
+            arguments += [part for text in asked.require for part in ("--require", text)]
+            arguments += [part for text in asked.finally_ for part in ("--finally", text)]
+            self._command = shlex.join(["fieldtwin", *arguments])
+            if asked.faults:
+                arguments[arguments.index(FAULT_FILE)] = str(self._fault_file(asked.faults))
+            arguments += ["--json", *(part for name in asked.series for part in ("--series", name))]
+            self._began_ns = attachment.now_ns()
+            self._run = await ChildRun.started(arguments, _outcome)
+            self._instance, self._asked = attachment.name, msgspec.to_builtins(asked)
 
     async def stop(self) -> None:
         """Stop the run, if one is running."""
@@ -118,7 +128,7 @@ class Forecaster:
         return path
 
 
-def _check(asked: AskWhatIf) -> None:
+def _check(asked: AskWhatIf, secrets: Collection[str]) -> None:
     if not 0 < asked.horizon_s <= MOST_HORIZON_S:
         raise UsageError(
             "the horizon", expected=f"over 0 s to {MOST_HORIZON_S / 3600:g} h", got=f"{asked.horizon_s:g} s"
@@ -131,6 +141,12 @@ def _check(asked: AskWhatIf) -> None:
     ):
         if len(items) > most:
             raise UsageError(f"too many {what}", expected=f"at most {most}", got=str(len(items)))
+    for text in (*asked.series, *asked.require, *asked.finally_):
+        for name in secrets:
+            if name in text:
+                raise NotAllowed(
+                    f"{name} is secret, so a forecast does not tell its value", hint="ask about another tag"
+                )
     for command in asked.commands:
         if not 0 <= command.at_s < asked.horizon_s:
             raise UsageError("the time of a command", expected="within the horizon", got=f"{command.at_s:g} s")

@@ -78,11 +78,14 @@ function stated(r) {
 
 const answering = (r) => (r.functions ?? []).filter((f) => f.hex !== undefined); // the others were refused, or silent
 
+/** The registers in a state; of a CANopen node the number of objects. */
+const listed = (map, state) => map[state]?.join(", ") ?? map.counts?.[state] ?? "";
+
 const Dump = ({ r }) => html`
   <p>${r.values} values in ${r.passes} ${r.passes === 1 ? "pass" : "passes"}.</p>
   <${Table}
     head=${["Table", "Readable", "Refused", "Silent", "Not asked", "Longest read"]}
-    rows=${(r.maps ?? []).map((m) => [html`<strong>${m.map}</strong>`, m.readable.join(", "), m.refused.join(", "), m.silent.join(", "), m.not_asked.join(", "), m.max_read ?? ""])}
+    rows=${(r.maps ?? []).map((m) => [html`<strong>${m.map}</strong>`, ...["readable", "refused", "silent", "not_asked"].map((state) => listed(m, state)), m.max_read ?? ""])}
     empty="Nothing was read."
   />
   ${answering(r).length > 0 && html`<h3>Functions that answer</h3><p class="mono">${answering(r).map((f) => `${f.function.toString(16).toUpperCase().padStart(2, "0")}h`).join(", ")}</p>`}`;

@@ -47,10 +47,6 @@ class ChildRun:
         """Return for how long it has been running, or how long it took."""
         return asyncio.get_running_loop().time() - self._began_s if self.is_running else self._took_s
 
-    async def ended(self) -> None:
-        """Wait for the end of the run."""
-        await asyncio.gather(self._following, return_exceptions=True)
-
     async def _follow(self) -> None:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -83,7 +79,7 @@ class ChildRun:
         if self.is_running:
             self.trouble = "stopped"
             await child_process.interrupt(self._process, self._following)
-        await self.ended()
+        await asyncio.gather(self._following, return_exceptions=True)
 
 
 async def _tail(stream: asyncio.StreamReader) -> bytes:

@@ -104,7 +104,7 @@ def command(
     from fieldtwin.twin.site.system import load_system
 
     if series and not as_json:
-        raise UsageError("--series is for machines", expected="--json with it")
+        raise UsageError("--series is printed only as JSON", expected="--json with --series")
     plans: list[WhatIfPlan] = []
     if plan_file is not None:
         named, plans = load_plans(plan_file)

@@ -212,7 +212,7 @@ class RunSession(AsyncResource):
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:
-            for fault in self.faults:  # each error contains its own time
+            for fault in self.faults:  # each fault says when it begins and ends
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
 
     async def _start_thread(self, run_dir: Path) -> None:

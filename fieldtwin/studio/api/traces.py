@@ -50,7 +50,7 @@ async def get_trace(request: Request) -> dict[str, Any]:
         "seed": about.seed if about is not None else None,
         "verdict": about.verdict if about is not None else "",
         "reason": about.reason if about is not None else "",
-        "report": of_server(request, "traces", Traces).named(replay.name).report is not None,
+        "report": KnownTrace(replay.name, replay.path, about).report is not None,
         "failed": [msgspec.to_builtins(check) for check in failed_checks(replay.log, about)],
         "marks": marks,
         "marks_left_out": left_out,

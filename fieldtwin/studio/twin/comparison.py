@@ -78,24 +78,22 @@ def _plant(attachment: Attachment, name: str) -> _Plant | None:
 def _compared(attachment: Attachment, status: TwinStatus, name: str, variable: VariableStatus) -> Compared:
     plant = _plant(attachment, name)
     verdict, reason = _verdict(attachment, variable, plant)
-    secret = name in attachment.secrets
-    is_program = name in attachment.system.plc.programs
+    model = variable.value
+    if name in attachment.system.plc.programs and model is not None:
+        model = bool(model)
+    is_secret = name in attachment.secrets
     return Compared(
         name=name,
         unit=variable.unit,
-        model=SECRET
-        if secret
-        else bool(variable.value)
-        if is_program and variable.value is not None
-        else variable.value,
+        model=SECRET if is_secret else model,
         model_quality=variable.quality,
         model_reason=variable.reason,
         model_age_s=None if variable.t_ms is None else max(0.0, (status.now_ms - variable.t_ms) / 1000),
-        plant=None if plant is None else SECRET if secret else plant.value,
+        plant=None if plant is None else SECRET if is_secret else plant.value,
         plant_quality=plant.quality if plant is not None else None,
         plant_reason=plant.reason if plant is not None else None,
         plant_age_s=plant.age_s if plant is not None else None,
-        difference=None if plant is None or secret else _difference(variable.value, plant.value),
+        difference=None if plant is None or is_secret else _difference(variable.value, plant.value),
         verdict=verdict,
         reason=reason,
     )

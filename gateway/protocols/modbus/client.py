@@ -230,16 +230,11 @@ class ModbusClient:
         the reply to a different request.
         """
         units = self.units
-        if timeout_s is not None:
-            timeout_ns = round(checked_timeout(timeout_s) * NS_PER_S)
-        elif (known_ns := units.timeouts_ns.get(unit)) is not None:
-            timeout_ns = known_ns
-        else:
-            timeout_ns = units.timeout_ns(unit)
+        timeout_ns = units.timeout_ns(unit) if timeout_s is None else round(checked_timeout(timeout_s) * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
-        if units.hurried_ns and (hurried_ns := units.hurried_ns.get(unit)) is not None:
-            timeout_ns = min(timeout_ns, hurried_ns)
+        if units.shortened_ns and (shortened_ns := units.shortened_ns.get(unit)) is not None:
+            timeout_ns = min(timeout_ns, shortened_ns)
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
         if unanswered:
             request.unanswered(0)  # refuses a request that cannot be broadcast
@@ -279,7 +274,7 @@ class ModbusClient:
             settled = True
             line.answered(reply.t_ns, transaction.sent_ns)
             self.latency.record(reply.t_ns - transaction.sent_ns)
-            if self.units.hurried_ns:
+            if self.units.shortened_ns:
                 self.units.restore_timeout(unit)
             return reply
         except ModbusExceptionReply as e:

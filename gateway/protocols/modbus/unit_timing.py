@@ -53,9 +53,9 @@ class UnitTiming:
         """Whether at least one unit needs pauses."""
         self.spaced: dict[int, int] = {}
         """By unit ID: the end of its pause, in ns."""
-        self.timeouts_ns: dict[int, int] = {}
+        self._timeouts_ns: dict[int, int] = {}
         """Timeouts by unit ID, in ns; kept until the timing is changed."""
-        self.hurried_ns: dict[int, int] = {}
+        self.shortened_ns: dict[int, int] = {}
         """By unit ID: the shortened timeout, in ns."""
         self.held: dict[int, Hold] = {}
         """By unit ID: the request whose reply may still arrive."""
@@ -71,17 +71,19 @@ class UnitTiming:
     def restate(self, timeout_s: float) -> None:
         """Change the timeout of the units without their own, in seconds."""
         self._timeout_s = checked_timeout(timeout_s)
-        self.timeouts_ns.clear()
+        self._timeouts_ns.clear()
 
     def set_pace(self, unit: int, pace: UnitPace) -> None:
         """Use this timing for `unit` (0 to 255) from now on."""
         self._paces[unit] = pace
-        self.timeouts_ns.clear()
+        self._timeouts_ns.clear()
         self.have_pauses = self.have_pauses or bool(pace.spacing_s)
 
     def timeout_ns(self, unit: int) -> int:
-        """Return the normal timeout of `unit` in ns, and keep it in `timeouts_ns`."""
-        timeout_ns = self.timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
+        """Return the normal timeout of `unit` in ns."""
+        timeout_ns = self._timeouts_ns.get(unit)
+        if timeout_ns is None:
+            timeout_ns = self._timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
         return timeout_ns
 
     def shorten_timeout(self, unit: int, timeout_s: float) -> None:
@@ -90,15 +92,15 @@ class UnitTiming:
         This ends with the first reply of `unit`, or with `restore_timeout`. Without a reply, the next request to `unit` waits
         until its normal timeout is also over, because a late reply does not say which request it answers (case MB-013).
         """
-        self.hurried_ns[unit] = round(checked_timeout(timeout_s) * NS_PER_S)
+        self.shortened_ns[unit] = round(checked_timeout(timeout_s) * NS_PER_S)
 
     def restore_timeout(self, unit: int) -> None:
         """Restore the normal timeout of `unit`."""
-        self.hurried_ns.pop(unit, None)
+        self.shortened_ns.pop(unit, None)
 
     def is_shortened(self, unit: int) -> bool:
         """Return whether the timeout of `unit` is shortened and the unit has not answered since then."""
-        return unit in self.hurried_ns
+        return unit in self.shortened_ns
 
     def spaced_ns(self, unit: int) -> int:
         """Return the time (ns) from which `unit` may be asked, or 0 if it may be asked now.

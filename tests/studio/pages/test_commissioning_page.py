@@ -18,7 +18,7 @@ from accessibility_rules import MISSING as NO_AXE
 from accessibility_rules import violations
 from browser import MISSING, Window, browser
 
-METER = Path(__file__).parents[2] / "examples" / "unknown-device" / "flow_meter.py"
+METER = Path(__file__).parents[3] / "examples" / "unknown-device" / "flow_meter.py"
 SOCAT = shutil.which("socat") or ""
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(600)]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from browser import Window
 
-AXE = Path(__file__).parents[2] / "build" / "axe-core" / "axe.min.js"
+AXE = Path(__file__).parents[3] / "build" / "axe-core" / "axe.min.js"
 MISSING = "" if AXE.is_file() else "needs axe-core, which scripts/studio-assets --tests fetches with npm"
 _RUN = """
 const [tags, done] = arguments;

@@ -29,10 +29,10 @@ class ClientView:
         self._services += (service,)
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:
+        self._check_refusal((index, subindex))  # first: a recorded device may refuse an object that no data sheet has
         entry = self._core.data.find(index, subindex)
         if not entry.readable:
             raise abort(index, subindex, Abort.WRITE_ONLY)
-        self._check_refusal(entry.key)
         for service in self._owners(index):
             service.check_read(index, subindex)
         self._core.answer(entry.key, now_ns)

@@ -30,7 +30,10 @@ MAX_VALUES = 1_000_000
 _PDO_PARAMETERS = range(0x1400, 0x1C00)
 _SDO_SERVERS = range(RESPONSE + 1, RESPONSE + 128)
 _OF_THE_OBJECT = 0x06
-"""Abort codes that begin with this byte concern the object; others concern the transfer or the state of the device."""
+"""Abort codes that begin with this byte concern the object."""
+_OF_THE_DEVICE = 0x08
+"""Abort codes that begin with this byte depend on the state of the device, such as an empty error history. They are replayed only
+for objects that the data sheet lacks, because a declared object has its own rules. Other codes concern the transfer."""
 
 _ABORTS = frozenset(Abort)
 _NEVER_INITIAL = frozenset({0x1001, 0x1003})
@@ -182,7 +185,9 @@ class RecordedObjects:
                 self._uploaded(key, bytes(raw))
         elif command > 3:
             code = int.from_bytes(data[4:8], "little")
-            if command == 4 and not download and code >> 24 == _OF_THE_OBJECT and code in _ABORTS:
+            unknown = self._data.dictionary.entry(*key) is None
+            concerns_object = code >> 24 == _OF_THE_OBJECT or (unknown and code >> 24 == _OF_THE_DEVICE)
+            if command == 4 and not download and concerns_object and code in _ABORTS:
                 self.refusals.setdefault(key, Abort(code))
             self._transfer = None
 

@@ -20,6 +20,14 @@ from fieldtwin.capture.recordings.sinks import CanLogSink, ExchangeSink, LineSin
 from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logged, words
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
+from fieldtwin.cli.recordings.nothing_recorded import (
+    NOTHING_RECORDED,
+    OF_BUS,
+    OF_POLLING,
+    OF_SNIFFER,
+    OF_TAP,
+    nothing_recorded,
+)
 from fieldtwin.cli.recordings.record_options import FileOptions, PollOptions, RecordingSourceOptions
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.reading import DeviceTarget, dry_point
@@ -76,7 +84,8 @@ def command(
     fieldtwin record can:socketcan/can0 --profile drive-cia402 -o drive.log
     fieldtwin record run.jsonl --as-scenario observatory -o run.scenario.yaml
 
-    Replay the recording with `fieldtwin emulate`, or compare a device with it: `fieldtwin compare`.
+    Replay the recording with `fieldtwin emulate`, or compare a device with it: `fieldtwin compare`. Exit code 1: nothing was
+    recorded; 4: the device does not answer.
     """
     like = source.like
     if source.as_scenario:
@@ -149,6 +158,7 @@ class _Job:
             as_json,
         )
         self._clock = WallClock()
+        self._seconds, self._note = 0.0, ""
         self._parts: dict[str, Any] = {
             "max_bytes": files.part_mb * MB, "max_s": files.part_s or 0.0, "keep": files.keep or 0
         }  # fmt: skip
@@ -173,6 +183,7 @@ class _Job:
                 )  # fmt: skip
 
             self._run(work, lambda: f"{counters.rounds} rounds, {counters.exchanges} exchanges")
+        self._missing(file, "no request was sent", target.url, OF_POLLING)
         return self._summary(file, counters, {"exchanges": file.lines})
 
     def _dry(self, frames: Iterable[bytes | str | None]) -> int:
@@ -209,6 +220,7 @@ class _Job:
                 )  # fmt: skip
 
             self._run(work, lambda: f"{file.lines} frames")
+        self._missing(file, "no frame arrived", target.url, OF_BUS)
         return self._summary(file, counters if polled else None, {"frames": file.lines, "lost_here": lost})
 
     def tap(self, near: Endpoint, far: Endpoint) -> int:
@@ -217,7 +229,7 @@ class _Job:
         def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
             return LineTap(near, far, sink, say=self._say, clock=self._clock).run
 
-        return self._line(far, tapped, "tapped", "bytes to the device", "back")
+        return self._line(far, tapped, "tapped", OF_TAP, "bytes to the device", "back")
 
     def sniff(self, port: Endpoint) -> int:
         """Record a serial line between other devices, to which one adapter listens."""
@@ -225,6 +237,7 @@ class _Job:
             port,
             lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,
             "sniffed",
+            OF_SNIFFER,
             "bytes of requests",
             "of replies",
         )
@@ -238,6 +251,7 @@ class _Job:
         far: Endpoint,
         listening: Callable[[LineSink], Callable[[asyncio.Event], Coroutine[Any, Any, None]]],
         how: str,
+        check: str,
         there: str,
         back: str,
     ) -> int:
@@ -252,12 +266,14 @@ class _Job:
                 listening(sink),
                 lambda: f"{sink.bytes[Direction.SENT]} {there}, {sink.bytes[Direction.RECEIVED]} {back}",
             )
-        said = {
-            "bytes_sent": sink.bytes[Direction.SENT], "bytes_received": sink.bytes[Direction.RECEIVED], "raw": str(raw)
+        said: dict[str, Any] = {
+            "bytes_sent": sink.bytes[Direction.SENT], "bytes_received": sink.bytes[Direction.RECEIVED]
         }  # fmt: skip
-        if not any(sink.bytes.values()):
-            stderr.print("nothing passed")
+        passed = sum(sink.bytes.values())
+        if not passed:
+            self._missing(file, "no byte passed", str(far), check)
             return self._summary(file, None, said)
+        said["raw"] = str(raw)
         header = RecordingHeader(
             version=1, device=f"{how}/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
             made_by=words(), start_utc=started, prototype=self._emulated,
@@ -267,12 +283,21 @@ class _Job:
             "exchanges": found.records, "unanswered": found.pairs.unanswered, "strays": found.pairs.strays,
             "malformed": found.pairs.malformed, "recording": str(self._out), "profiles": list(map(str, found.profiles)),
         }  # fmt: skip
+        if not found.records:
+            self._note = nothing_recorded(f"{passed} bytes passed, but no request,", str(far), self._seconds, check)
+            self._out.unlink()
         return self._summary(file, None, said)
 
     # -- running and reporting ---------------------------------------------------------------------------------------------
 
     def _now(self) -> str:
         return datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+
+    def _missing(self, file: RotatingFile, what: str, where: str, check: str) -> None:
+        """Note that nothing was recorded, if so, and remove the empty file: its name is free for the next attempt."""
+        if not file.lines:
+            self._note = nothing_recorded(what, where, self._seconds, check)
+            file.path.unlink()
 
     def _run(self, work: Callable[[asyncio.Event], Coroutine[Any, Any, None]], status: Callable[[], str]) -> None:
         """Run until the recording ends, a signal arrives, or --for has passed."""
@@ -293,17 +318,22 @@ class _Job:
                     await asyncio.gather(showing, return_exceptions=True)
 
         with _status() as shown:
+            began_ns = self._clock.monotonic_ns()
             run_precise(main())
+            self._seconds = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
 
     def _summary(self, file: RotatingFile, counters: PollCounters | None, said: dict[str, Any]) -> int:
-        """Return 0, or 4 if no device ever answered."""
+        """Print the result. Return 0, 1 if nothing was recorded, or 4 if no device ever answered."""
         polled = counters is not None and counters.exchanges > 0
         silent = counters is not None and polled and counters.unanswered == counters.exchanges
+        code = NOTHING_RECORDED if self._note else 4 if silent else 0
         if self._json:
             parts: dict[str, Any] = {
                 "out": str(self._out),
-                "parts": list(map(str, file.parts)),
+                "parts": [str(part) for part in file.parts if part.exists()],
                 "removed": file.removed,
+                "seconds": round(self._seconds, 3),
+                "notes": [self._note] if self._note else [],
             }
             if counters is not None:
                 parts |= {
@@ -312,14 +342,17 @@ class _Job:
                 }  # fmt: skip
             json.dump(parts | said, sys.stdout)
             sys.stdout.write("\n")
-            return 4 if silent else 0
+            return code
         names = {"bytes_sent": "bytes to the device", "bytes_received": "bytes back", "lost_here": "frames lost here"}
         text = ", ".join(
             f"{v} {names.get(k, k)}"
             for k, v in said.items()
             if isinstance(v, int) and (v or k in ("exchanges", "frames"))
         )
-        stdout.print(f"{said.get('recording', self._out)}: {text or 'nothing'}", soft_wrap=True, markup=False)
+        if self._note:
+            stderr.print(self._note, soft_wrap=True, markup=False)
+        else:
+            stdout.print(f"{said.get('recording', self._out)}: {text}", soft_wrap=True, markup=False)
         for profile in said.get("profiles", ()):
             stdout.print(f"  draft profile: {profile}", soft_wrap=True, markup=False)
         if "raw" in said:
@@ -334,7 +367,7 @@ class _Job:
                 (counters.lost, "times the connection was lost"),
             ]  # fmt: skip
             stderr.print(", ".join(f"{n} {what}" for n, what in notes if n), soft_wrap=True)
-        return 4 if silent else 0
+        return code
 
 
 @contextmanager

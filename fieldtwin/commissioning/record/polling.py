@@ -23,6 +23,7 @@ from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile
 from fieldtwin.gateway.core.files.recording import RecordedExchange
+from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.devices.read_plan import GroupPlan, Learnt, Read
 from fieldtwin.gateway.wallclock import WallClock
 
@@ -192,7 +193,9 @@ async def record_node(
             async def one_round() -> None:
                 answers = await point.read(tags)
                 counters.exchanges += len(answers)
-                counters.unanswered += sum(bool(a.problem) for a in answers.values())
+                refused = sum(a.value.reason is Reason.REFUSED for a in answers.values())
+                counters.refused += refused
+                counters.unanswered += sum(bool(a.problem) for a in answers.values()) - refused
                 sink.check()
 
             await _rounds(one_round, clock, every_s, counters, stop, rounds)

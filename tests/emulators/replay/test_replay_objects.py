@@ -111,6 +111,14 @@ def test_a_request_that_was_always_aborted_is_aborted_again() -> None:
     assert rig.read(0x2006) == 7, "a state that the device was in is none of the object's"
 
 
+def test_an_object_without_data_that_no_data_sheet_has_is_refused_as_recorded() -> None:
+    """The emulated log of a node answered 06090011h for 1003h:01 where its device had answered "no data available"."""
+    log = [*LOG.splitlines(), "(2.0) can0 605#4003F00100000000", "(2.1) can0 585#8003F00124000008"]
+    objects = RecordedObjects(frames_of(log), parse_eds(RICH), 5)
+    rig = Rig(RICH, NodeContext(source=objects, factory=objects.initial, refusals=objects.refusals))
+    assert rig.sdo("40 03F0 01") == "8003F00124000008"
+
+
 def test_a_log_of_the_same_device_under_another_node_id(tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     path.write_text(LOG + "(100.5) can0 605#4000180100000000\n(100.6) can0 585#4300180185010000\n", encoding="ascii")

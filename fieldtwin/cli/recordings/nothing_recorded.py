@@ -14,7 +14,10 @@ OF_BUS = (
     "them, and --profile or --eds asks"
 )
 OF_TAP = "check that the client uses side A and sends requests, and the wiring of both sides"
-OF_SNIFFER = "check that a client sends requests, the wiring (A and B), baud rate and frame; `fieldtwin line` lists possible causes"
+OF_SNIFFER = (
+    "check that a client sends requests, the wiring (A and B), baud rate and frame; "
+    "`fieldtwin line` lists possible causes"
+)
 OF_POLLING = "check that the profile has readable tags, and let the recording run for at least one round"
 
 

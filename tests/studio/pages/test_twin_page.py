@@ -28,7 +28,8 @@ const variable = document.querySelector("table.variables tbody tr").cloneNode(tr
 for (const cell of [...variable.querySelectorAll("td.number")].slice(0, 2))
   cell.innerHTML = '<span class="bad-text">-1.23457e-14 (substituted)</span>';
 const decision = document.querySelector("table.decisions tbody tr").cloneNode(true);
-for (const cell of [...decision.querySelectorAll("td")].slice(1)) cell.textContent = "inclinometer.slope_lateral_filtered ".repeat(3);
+for (const cell of [...decision.querySelectorAll("td")].slice(1))
+  cell.textContent = "inclinometer.slope_lateral_filtered ".repeat(3);
 document.querySelector("table.variables tbody").append(variable);
 document.querySelector("table.decisions tbody").append(decision);
 """

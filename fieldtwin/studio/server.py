@@ -141,7 +141,7 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
         address = f"{scheme}://{shown}:{port}/"
         instance = await app.state.launcher.start(options.system) if options.system else options.instance
         if instance:
-            await app.state.gallery.attached(instance)  # its history begins now, not when a page first asks
+            await app.state.gallery.attached(instance)  # Studio keeps more changes than the gateway
         place = f"#/{instance}" if instance else await _first_trace(traces, options)
         url = (f"{address}?token={operate}" if operate else address) + place
         on_ready(Serving(url, address, access))

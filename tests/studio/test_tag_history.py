@@ -5,7 +5,16 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.studio.live.tag_history import LEAST_OF_A_TAG, MOST_OF_A_TAG, Point, TagHistory
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.studio.live.tag_history import (
+    LEAST_OF_A_TAG,
+    MOST_OF_A_TAG,
+    MOST_RECENT_OF_ALL,
+    RECENT_NS,
+    Point,
+    TagHistory,
+    recent,
+)
 
 points_of_a_tag = st.lists(
     st.tuples(st.integers(1, 50), st.floats(-1e6, 1e6), st.sampled_from(["good", "bad", "uncertain"])),
@@ -68,3 +77,28 @@ def test_changes_of_an_interval_have_the_point_before_each() -> None:
     assert history.changes("a.b", 0, 10) == [(None, points[0])]
     assert history.changes("a.b", 41, 99) == []
     assert history.changes("no.tag", 0, 99) == []
+
+
+def test_the_last_minute_of_all_tags_has_a_limited_number_of_points_and_none_for_a_text() -> None:
+    names = [f"a.t{n}" for n in range(1000)]
+    history = TagHistory([*names, "a.text"])
+    for n in range(LEAST_OF_A_TAG):
+        for name in names[:2]:
+            history.add(name, Point(n * NS_PER_S, float(n), "good", "none"))
+    history.add(names[2], Point(NS_PER_S, 7, "bad", "timeout"))
+    history.add("a.text", Point(1, "0042", "good", "none"))
+    now_ns = LEAST_OF_A_TAG * NS_PER_S
+    found = recent(history, history.names(), now_ns)
+    assert sum(len(points) for points in found.values()) <= MOST_RECENT_OF_ALL
+    assert 4 <= len(found["a.t0"]) <= MOST_RECENT_OF_ALL // 1001 + 4
+    assert found["a.t0"][0][0] <= now_ns - RECENT_NS
+    assert found["a.t0"][-1] == (now_ns - NS_PER_S, LEAST_OF_A_TAG - 1)
+    assert found["a.t2"] == [(NS_PER_S, None)]
+    assert found["a.text"] == []
+
+
+def test_the_last_minute_of_few_tags_is_complete() -> None:
+    history = TagHistory(["a.b"])
+    for n in range(100):
+        history.add("a.b", Point(n * NS_PER_S, n, "good", "none"))
+    assert recent(history, ["a.b"], 99 * NS_PER_S)["a.b"] == [(n * NS_PER_S, n) for n in range(39, 100)]

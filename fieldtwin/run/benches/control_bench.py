@@ -133,7 +133,8 @@ class ControlBench(AsyncResource):
         self._tags: dict[str, list[Any]] = {}
         self._asked: list[str] = []
         self._seen_ns = 0
-        self._since = 0
+        self._since: int | None = None
+        """The number of the newest sample that was seen, None before the first answer."""
         self._refused = 0
         """The newest refusal that was seen, by its number in the gateway's journal."""
         self._updates: dict[str, int] = {}
@@ -421,7 +422,9 @@ class ControlBench(AsyncResource):
     async def _changed_tags(self) -> list[TraceEvent]:
         if self._gateway is None:
             return []
-        answer = await self._gateway.call("watch", since=self._since, names=self._asked, refused=self._refused)
+        answer = await self._gateway.call(
+            "watch", samples=True, since=self._since, names=self._asked, refused=self._refused
+        )
         self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
         events = []
         for entry in answer["refusals"]:
@@ -436,6 +439,8 @@ class ControlBench(AsyncResource):
             self._updates[tag] = self._updates.get(tag, 0) + 1
             data = {"value": value, "quality": quality, "reason": reason.replace(" ", "_")}
             events.append(TraceEvent(t_ns - self._start_ns, TraceKind.TAG, tag, data))
+        if self._since is None:
+            self._since = answer["last"]
         return events
 
     def _changed_states(self) -> list[TraceEvent]:

@@ -39,7 +39,7 @@ async def start_prototype(request: Request) -> dict[str, Any]:
     if form.system not in known:  # a page must not start arbitrary files
         raise NotFound(f"no system {form.system[:80]!r}", expected=", ".join(sorted(known)))
     instance = await _launcher(request).start(form.system, form.instance)
-    await gallery_of(request).attached(instance)  # its history begins now, not when a page first asks
+    await gallery_of(request).attached(instance)  # Studio keeps more changes than the gateway
     return {"instance": instance}
 
 
@@ -56,6 +56,7 @@ def _launcher(request: Request) -> Launcher:
 async def get_instance(request: Request) -> dict[str, Any]:
     """Return the description of an instance: buses, devices with their tags, programs."""
     attachment = await attached(request)
+    await attachment.has_history()
     record = attachment.record
     return {
         "name": attachment.name,

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import CheckFailed, Unreachable, UsageError
 from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, prototype, recordings_of, tag_of
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
 from fieldtwin.studio.live.marks import Mark, all_marks
-from fieldtwin.studio.live.tag_history import MOST_POINTS
+from fieldtwin.studio.live.tag_history import MOST_POINTS, recent
 
 WRITE_WITHIN_S = 8.0
 """Longer than the gateway itself waits for the device."""
@@ -44,11 +44,19 @@ async def get_history(request: Request) -> dict[str, Any]:
     """Return the changes of a tag: [time in ns, value, quality, reason]."""
     attachment = await attached(request)
     device, name = tag_of(request, attachment)
+    await attachment.has_history()
     now_ns = attachment.now_ns()
     from_ns, to_ns = whole(request, "from_ns", 0), whole(request, "to_ns", now_ns)
     points = whole(request, "points", MOST_POINTS, 4, MOST_POINTS)
     found, thinned = attachment.history.between(f"{device}.{name}", from_ns, to_ns, points)
     return {"points": [list(point) for point in found], "thinned": thinned, "now_ns": now_ns}
+
+
+async def get_recent(request: Request) -> dict[str, Any]:
+    """Return of each tag the numbers of the last minute: [time in ns, number, or null for a value that is not good]."""
+    attachment = await attached(request)
+    await attachment.has_history()
+    return recent(attachment.history, attachment.history.names(), attachment.now_ns())
 
 
 async def list_marks(request: Request) -> list[Mark]:
@@ -104,6 +112,7 @@ async def write_value(request: Request) -> Any:
 TAG = INSTANCE + "/tags/{tag}"
 OPERATIONS = (
     Operation("GET", f"{INSTANCE}/tags", list_tags, "Read all tags"),
+    Operation("GET", f"{INSTANCE}/recent", get_recent, "Read the last minute of all tags"),
     Operation(
         "GET",
         f"{TAG}/history",

@@ -13,8 +13,8 @@ from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.frames import EXPORT, PAGE, file_of, frame_of, page_of
 from fieldtwin.studio.api.operation import Operation, Parameter, whole
 from fieldtwin.studio.api.reports import report_response
-from fieldtwin.studio.live.tag_history import MOST_POINTS
-from fieldtwin.studio.replay.instant import recent_at, state_at, transitions_at
+from fieldtwin.studio.live.tag_history import MOST_POINTS, recent
+from fieldtwin.studio.replay.instant import state_at, transitions_at
 from fieldtwin.studio.replay.marks import failed_checks, marks_of
 from fieldtwin.studio.replay.replay import Replay
 from fieldtwin.studio.replay.traces import KnownTrace, Traces
@@ -78,7 +78,7 @@ async def get_trace_state(request: Request) -> dict[str, Any]:
 async def get_trace_recent(request: Request) -> dict[str, Any]:
     """Return of each tag the numbers of the minute before an instant: [time in ns, number, or null for a bad value]."""
     replay = await _opened(request)
-    return recent_at(replay, _instant(request, replay))
+    return recent(replay.history, replay.tag_names, _instant(request, replay))
 
 
 async def get_trace_history(request: Request) -> dict[str, Any]:

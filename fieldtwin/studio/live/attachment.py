@@ -83,7 +83,7 @@ class Attachment:
         self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
         self.field_channel = Channel(found.dir / FIELD_SOCKET, "field simulator")
         self.history_from_ns = clock.monotonic_ns()
-        """Since when changes of tags are known: the start of the observation, or an earlier one that the gateway remembers."""
+        """Since when changes of tags are known: the start of the gateway, or the oldest change that it still keeps."""
         self.changes_lost = 0
         """Changes of tags that the gateway had dropped before they were read."""
         self.frames: FrameLog | None = None
@@ -94,8 +94,12 @@ class Attachment:
         self.history = TagHistory(tags)
         self._seen_change: int | None = None
         """The number of the latest change that was read, None before the first answer."""
+        self._history_read = asyncio.Event()
+        """Set when all changes that the gateway has kept were read, or when it did not answer."""
         self._is_complete = False
-        """Whether the changes that the gateway remembers from an earlier observation have been read."""
+        """Whether all changes since the start of the gateway have been read."""
+        self._gateway_began_ns = 0
+        """The start of the gateway whose changes are read."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
         self._plc_values = PlcValues(found.dir, self.secrets)
@@ -173,6 +177,8 @@ class Attachment:
             self._plc_values.close()
         elif what == "field":
             self.field = None
+        elif what == "tags":
+            self._history_read.set()
         if self.troubles.get(what) != reason:
             self.troubles[what] = reason
             self.updates.publish({"type": "status", "status": self.status()})
@@ -221,29 +227,44 @@ class Attachment:
         self.field = await self.field_channel.ask("get", FieldStatus)
         self.fault_marks.look(self.field, self.now_ns())
 
+    async def has_history(self) -> None:
+        """Wait until the changes that the gateway has kept are in `history`, or until the gateway did not answer."""
+        await self._history_read.wait()
+
     async def _read_tags(self) -> None:
+        while not await self._read_changes():
+            pass
+
+    async def _read_changes(self) -> bool:
+        """Read the next changes of tags, and return whether these were the last ones."""
         names = [] if self._is_complete else self.history.names()
         since = self._seen_change or 0
         answer = await self.gateway_channel.call("watch", since=since, names=names, refused=NONE_OF_THEM)
-        if answer["last"] < since:  # another gateway, whose numbers begin again
-            self._seen_change, self._is_complete = None, False
-            return
-        if self._seen_change is None and answer["changes"]:
-            self.history_from_ns = min(self.history_from_ns, answer["changes"][0][1])
+        if answer["began_ns"] != self._gateway_began_ns:
+            self._gateway_began_ns = answer["began_ns"]
+            if self._seen_change is not None:  # the gateway was restarted, so its numbers begin again
+                self._seen_change, self._is_complete = None, False
+                return False
+        if self._seen_change is None:
+            oldest_ns = answer["changes"][0][1] if answer["dropped"] else answer["began_ns"]
+            self.history_from_ns = min(self.history_from_ns, oldest_ns)
+        else:
+            self.changes_lost += answer["dropped"]
         changes = []
         for _, t_ns, name, value, quality, reason in answer["changes"]:
             point = self.point(name, t_ns, value, quality, reason)
             self.history.add(name, point)
             changes.append([name, *point])
-        if not self._is_complete and (not changes or answer["changes"][-1][0] == answer["last"]):
-            for name, (value, quality, reason, t_ns) in answer["tags"].items():
-                self.history.add_present(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
-            self._is_complete = True
-        if self._seen_change is not None:  # what it forgot before this observation is not lost to it
-            self.changes_lost += answer["dropped"]
         self._seen_change = answer["changes"][-1][0] if answer["changes"] else answer["last"]
-        if changes:
+        if changes and self._history_read.is_set():
             self.updates.publish({"type": "tags", "changes": changes})
+        if self._seen_change < answer["last"]:
+            return False
+        for name, (value, quality, reason, t_ns) in answer["tags"].items():
+            self.history.add_present(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
+        self._is_complete = True
+        self._history_read.set()
+        return True
 
     async def _follow_frames(self, frames: FrameLog) -> None:
         told, told_ns = -1, 0

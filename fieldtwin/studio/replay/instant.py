@@ -15,11 +15,9 @@ from fieldtwin.studio.live.tag_history import Point
 from fieldtwin.studio.replay.marks import faults_at, state_changes, step_at
 from fieldtwin.studio.replay.replay import Replay
 
-BAD, GOOD = "bad", "good"
+BAD = "bad"
 NEVER = Point(0, None, BAD, "never_read")
 RATE_OVER_NS = 5 * NS_PER_S
-RECENT_NS = 60 * NS_PER_S
-MOST_RECENT = 120
 LOOKS_BACK = 200
 """Frames of a device among which a later reading of an unchanged value is searched for."""
 
@@ -60,18 +58,6 @@ def transitions_at(replay: Replay, t_ns: int) -> dict[str, list[dict[str, Any]]]
         ]
         for program in replay.system.plc.programs
     }  # fmt: skip
-
-
-def recent_at(replay: Replay, t_ns: int) -> dict[str, list[tuple[int, float | None]]]:
-    """Return of each tag the numbers of the last minute, at most `MOST_RECENT`; None for a value that is not good."""
-    found = {}
-    for name in replay.tag_names:
-        points, _ = replay.history.between(name, max(0, t_ns - RECENT_NS), t_ns, MOST_RECENT)
-        found[name] = [
-            (point.t_ns, float(point.value) if point.quality == GOOD and isinstance(point.value, int | float) else None)
-            for point in points
-        ]
-    return found
 
 
 def _tag(replay: Replay, name: str, t_ns: int) -> dict[str, Any]:

@@ -144,3 +144,12 @@ def test_a_page_takes_the_start_time_of_the_new_run_when_a_run_starts_under_the_
         page.go(f"{observatory.url}#/observatory/overview")
         page.sees(".plan", "ctd")  # the page of the other instance is closed before its folder is gone
         shutil.rmtree(folder)
+
+
+def test_a_value_that_does_not_change_has_a_sparkline_when_the_page_is_opened(page: Window) -> None:
+    page.click(".nav a", "Devices")
+    path = f"{ROW.format('inclinometer.serial')} .spark path"  # no change of this tag can arrive while the page is open
+    line = until(
+        lambda: page.script("return document.querySelector(arguments[0])?.getAttribute('d')", path), "its line"
+    )
+    assert line.startswith("M")

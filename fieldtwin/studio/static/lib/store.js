@@ -19,7 +19,6 @@ export class Store {
     this.dropped = 0;
     this.frames = { total: 0, behind_bytes: 0 };
     this.recent = new Map(); // tag -> [[time in ns, number or null], ...] of the last minute, for sparklines
-    this.changed = new Map(); // tag -> time in ns of the last change
     this.rates = {}; // bus -> requests in a second
     this.listeners = new Set();
     this.frameListeners = new Set(); // called when the number of frames has changed
@@ -70,7 +69,6 @@ export class Store {
     if (this.about.started_ns !== started_ns) {
       Object.assign(this, { status: null, programs: {}, programsOf: "", rates: {}, dropped: 0 });
       this.recent.clear();
-      this.changed.clear();
       this.beginning = true;
       try {
         this.about = await get(this.path);
@@ -80,6 +78,22 @@ export class Store {
       this.beginning = false;
     }
     this.takeStatus(status);
+    this.tell();
+    this.fetchRecent();
+  }
+
+  /** The last minute before this page was opened, or before the connection was made again. Later changes arrive as updates. */
+  async fetchRecent() {
+    let found;
+    try {
+      found = await get(`${this.path}/recent`);
+    } catch {
+      return; // the sparklines then begin with the next change
+    }
+    for (const [name, points] of Object.entries(found)) {
+      const last = points.length ? points[points.length - 1][0] : -Infinity;
+      this.recent.set(name, [...points, ...(this.recent.get(name) ?? []).filter(([t]) => t > last)]);
+    }
     this.tell();
   }
 
@@ -136,9 +150,9 @@ export class Store {
         Object.assign(seen, { value, quality, reason, age_s: Math.max(0, (this.now() - t) / 1e9) });
         delete seen.text;
       }
-      this.changed.set(name, t);
+      if (typeof value === "string") continue; // a text has no sparkline
       const points = this.recent.get(name) ?? [];
-      points.push([t, quality === "good" && typeof value !== "string" ? Number(value) : null]);
+      points.push([t, quality === "good" ? Number(value) : null]);
       const oldest = t - RECENT_MS * 1e6;
       while (points.length > MOST_RECENT || (points.length > 1 && points[1][0] < oldest)) points.shift();
       this.recent.set(name, points);

@@ -86,12 +86,12 @@ export function Trends({ store, query }) {
     </p>`;
 }
 
-const LATE_NS = 5e9; // a run that is started with Studio is observed within this time
+const LATE_NS = 5e9; // the gateway of a run starts within this time
 
 /** Since when there are values, and why not from the beginning of the run. */
 function since({ history_from_ns: from, started_ns: started }) {
   const said = `Values are recorded since ${clock(Math.max(0, from - started))} after the start of the run`;
-  return from - started < LATE_NS ? `${said}.` : html`${said}, when Studio first observed it. A run with <code>--studio</code> has them from its beginning.`;
+  return from - started < LATE_NS ? `${said}.` : `${said}: the gateway keeps a limited number of changes, since its last start.`;
 }
 
 const middle = ([from, to], share) => from + (to - from) * share;

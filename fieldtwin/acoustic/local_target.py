@@ -17,7 +17,6 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.results.model import ScenarioResult
 from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind
 from fieldtwin.run.benches.control_bench import ControlBench, Where
-from fieldtwin.run.live.session import RunSession
 from fieldtwin.scenarios.judging.runner import ScenarioRunner
 from fieldtwin.scenarios.language.form import Scenario
 
@@ -43,7 +42,7 @@ async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> Sce
                 notes,
                 target="local",
                 names=used,
-                gone=_gone(one),
+                failure=one.failure,
             )
             await stack.enter_async_context(part)
             bench.parts[name] = Part(part, notes)
@@ -81,10 +80,6 @@ def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
         return known[0]
 
     return later_ns
-
-
-def _gone(session: RunSession) -> Callable[[], FieldtwinError | None]:
-    return lambda: next((failed for child in session.children.values() if (failed := child.failure())), None)
 
 
 def _told(bench: NetworkBench) -> Callable[[int], None]:

@@ -14,7 +14,8 @@ from __future__ import annotations
 import asyncio
 import os
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import OUTPUTS
 from fieldtwin.gateway.core.image.region import RegionReader
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
@@ -41,6 +42,7 @@ from fieldtwin.run.benches.field_lease import FieldLease
 from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
 from fieldtwin.run.benches.host_lateness import HostLateness
 from fieldtwin.run.benches.probes import Probes
+from fieldtwin.run.processes.children import Failure, cause_of
 from fieldtwin.run.processes.field_contact import check_same, connect_control, reachable
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
@@ -53,8 +55,6 @@ from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
 STARTING_S = 5.0
-ENDS_WITHIN_S = 2.0
-"""How long a process that has closed its control channel may take to end."""
 """Time in seconds within which a PLC must start and receive the gateway's first heartbeat."""
 HELD_KEPT = 20_000
 SERVED_WITHIN_S = 5.0
@@ -92,7 +92,8 @@ class ControlBench(AsyncResource):
     """A bench: ``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``.
 
     `names` are the tags and variables to read. `fresh` is called with the bench's abilities and returns whether the
-    system is to be reset before the scenario begins. `gone` returns the reason why the system has ended, or None.
+    system is to be reset before the scenario begins. `failure` returns why a process of the system has ended; None if
+    this program did not start the processes.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class ControlBench(AsyncResource):
         names: Collection[str],
         probes: Sequence[ScenarioProbe] = (),
         fresh: Callable[[frozenset[Can]], bool] = lambda can: False,
-        gone: Callable[[], FieldtwinError | None] = lambda: None,
+        failure: Failure | None = None,
     ) -> None:
         super().__init__()
         self.system = system
@@ -116,7 +117,7 @@ class ControlBench(AsyncResource):
         self._where = where
         self._names = list(names)
         self._fresh = fresh
-        self._gone = gone
+        self._failure = failure
         self._env: dict[str, str] = {}
         """The endpoints of the simulated devices, to which endpoints of probes may refer."""
         self.lease: FieldLease | None = None
@@ -154,6 +155,10 @@ class ControlBench(AsyncResource):
         self._held_since: dict[str, int] = {}
 
     async def _start(self) -> None:
+        async with self._naming_causes():
+            await self._open()
+
+    async def _open(self) -> None:
         where = self._where
         if not self._foreign():
             await self._open_controller()
@@ -377,7 +382,8 @@ class ControlBench(AsyncResource):
         if self._field is None:
             raise UsageError("there is no emulated field", expected="a prototype")
         try:
-            return await self._field.call(command, **args)
+            async with self._naming_causes():
+                return await self._field.call(command, **args)
         except RemoteError as e:
             if e.remote_exit_code == UsageError.exit_code:
                 raise UsageError(str(e)) from e
@@ -392,22 +398,25 @@ class ControlBench(AsyncResource):
         self._note(TraceKind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
-        try:
+        async with self._naming_causes():
             await self._look()
-        except ConnectionLost as e:
-            raise await self._reason_of(e) from e
 
-    async def _reason_of(self, lost: ConnectionLost) -> FieldtwinError:
-        """Return why a process closed its control channel. A process that fails closes the channel a moment before it ends."""
-        until_s = self.now_s() + ENDS_WITHIN_S
-        while (gone := self._gone()) is None and self.now_s() < until_s:
-            await asyncio.sleep(0.02)
-        return gone or lost
+    @asynccontextmanager
+    async def _naming_causes(self) -> AsyncIterator[None]:
+        """Raise the failure of the process in place of a lost control channel."""
+        try:
+            yield
+        except Unreachable as e:
+            if self._failure is None:
+                raise
+            raise await cause_of(e, self._failure) from e
 
     async def _look(self) -> None:
-        gone = self._gone() or (self.lease.lost if self.lease is not None else None)
-        if gone is not None:
-            raise gone
+        failed = self._failure() if self._failure is not None else None
+        if failed is None and self.lease is not None:
+            failed = self.lease.lost
+        if failed is not None:
+            raise failed
         events = await self._changed_tags() + self._changed_states()
         if self._probes is not None:
             events += self._probes.changes(self._start_ns)

@@ -37,7 +37,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
 from fieldtwin.run.live.scheduling_watch import SchedulingWatch
 from fieldtwin.run.live.summary import RunFacts, summarise
-from fieldtwin.run.processes.children import Child
+from fieldtwin.run.processes.children import Child, ChildFailed, cause_of
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
@@ -186,6 +186,12 @@ class RunSession(AsyncResource):
     # -- starting -------------------------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
+        try:
+            await self._start_all()
+        except Unreachable as e:
+            raise await cause_of(e, self.failure) from e
+
+    async def _start_all(self) -> None:
         self._stack.enter_context(self.instance)
         run_dir = self.instance.dir
         ecs = self.twin.ecs
@@ -371,6 +377,10 @@ class RunSession(AsyncResource):
             if failed is not None and name in self._clients:
                 del self._clients[name]
                 self.note_error(str(failed))
+
+    def failure(self) -> ChildFailed | None:
+        """Return why the first process that has ended did so, or None while all run."""
+        return next((failed for child in self.children.values() if (failed := child.failure())), None)
 
     def note_error(self, text: str) -> None:
         """Record an error, unless the same text is already recorded."""

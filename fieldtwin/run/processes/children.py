@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 from fieldtwin.gateway.core.control import ControlClient
@@ -12,6 +13,11 @@ from fieldtwin.twin.plant.child import command
 
 START_TIMEOUT_S = 30.0
 POLL_S = 0.02
+ENDS_WITHIN_S = 2.0
+"""How long after the loss of its control channel a process may take to end."""
+
+Failure = Callable[[], FieldtwinError | None]
+"""A function that returns why a part of a running system has ended, or None while all parts run."""
 
 
 class ChildFailed(FieldtwinError):
@@ -21,6 +27,18 @@ class ChildFailed(FieldtwinError):
         self.child_exit_code = code
         text = said or f"ended with {'signal ' + str(-code) if code < 0 else 'exit code ' + str(code)}"
         super().__init__(f"{name}: {text}", hint=f"log: {log}")
+
+
+async def cause_of(lost: Unreachable, failure: Failure) -> FieldtwinError:
+    """Return the error that ended a process; `lost`, the error of its control channel, if all processes run.
+
+    A process that fails closes its channel a moment before it ends, so the failure may appear up to `ENDS_WITHIN_S` later.
+    """
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + ENDS_WITHIN_S
+    while (failed := failure()) is None and loop.time() < until_s:
+        await asyncio.sleep(POLL_S)
+    return failed or lost
 
 
 def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:

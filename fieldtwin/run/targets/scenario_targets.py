@@ -11,7 +11,6 @@ import os
 import shlex
 import shutil
 import signal
-from collections.abc import Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from fieldtwin.results.trace_about import TraceAbout, write_results
 from fieldtwin.run.benches.control_bench import ControlBench, Where
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
+from fieldtwin.run.processes.children import Failure
 from fieldtwin.run.processes.field_found import find_field
 from fieldtwin.run.processes.with_controller import WithController
 from fieldtwin.run.targets.progress import Progress
@@ -211,7 +211,7 @@ async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> Scen
     if scenario.group is not None:
         return await kind_named(scenario.group.kind).run_scenario(scenario, target.seed, trace)
     async with AsyncExitStack() as stack:
-        gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
+        failure: Failure | None = None
         if target.name == "compose" or target.instance:
             where = await _running(scenario, target)
             if where.foreign and (refused := _of_a_foreign_controller(scenario)):
@@ -222,7 +222,7 @@ async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> Scen
                 WithController(scenario.system, _field_config(scenario, target), target.controller, name)
             )
             where = Where(both.instance.dir, own=True, foreign=True, env=both.env)
-            gone = both.failure
+            failure = both.failure
         else:
             session = _session(scenario, target)
             own = session.instance.dir
@@ -242,11 +242,7 @@ async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> Scen
                 plant=target.name == "real",
                 allowed=target.allow if target.name == "real" else Impact.DISRUPT,
             )
-
-            def ended() -> FieldtwinError | None:
-                return next((failed for child in session.children.values() if (failed := child.failure())), None)
-
-            gone = ended
+            failure = session.failure
 
         bench = ControlBench(
             scenario.system,
@@ -256,7 +252,7 @@ async def _run(scenario: Scenario, target: ScenarioTarget, trace: Trace) -> Scen
             names=sorted(scenario.used | _invariant_names(scenario, where)),
             probes=scenario.probes,
             fresh=lambda can: scenario.form.start == "fresh" and not refusal(scenario, target.name, can, where.allowed),
-            gone=gone,
+            failure=failure,
         )
         async with bench:
             result = await ScenarioRunner(scenario, bench).run()

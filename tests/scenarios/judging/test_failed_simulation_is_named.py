@@ -74,6 +74,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("fails_after_s", ["0.0", "0.3"])
+def test_a_failure_while_the_system_starts_is_named_too(folder: Path, fails_after_s: str) -> None:
+    """The connection to the simulated devices can be lost before their process has ended, which has the reason."""
+    program = folder / "pond.py"
+    program.write_text(program.read_text().replace("t_s > 1", f"t_s > {fails_after_s}"))
+    result = run_scenario(load_scenario(folder / "low.scenario.yaml"), ScenarioTarget("local"))
+    assert result.verdict is Verdict.ERROR, result
+    assert "in line 7: ValueError: no pond" in result.reason
+
+
 @pytest.mark.parametrize("target", ["virtual", "local"])
 def test_a_scenario_fails_and_names_file_line_and_exception(folder: Path, target: str) -> None:
     result = run_scenario(load_scenario(folder / "low.scenario.yaml"), ScenarioTarget(target))

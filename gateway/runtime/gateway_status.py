@@ -240,6 +240,7 @@ class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
     devices: dict[str, DeviceStatus]
     buses: dict[str, BusStatus]
     tags: dict[str, TagStatus]
+    """All tags; none in a brief status, which a client gets with ``"brief": true``."""
     outputs: list[OutputStatus]
     writes: WritesStatus
     refusals: RefusalsStatus

@@ -17,13 +17,16 @@ from fieldtwin.gateway.runtime.gateway_status import (
 )
 
 
-def describe(gateway: Gateway, now_ns: int) -> GatewayStatus:
-    """Return devices, buses, tags with quality and age, outputs, mailboxes, and the PLC as the gateway sees it."""
+def describe(gateway: Gateway, now_ns: int, *, brief: bool = False) -> GatewayStatus:
+    """Return devices, buses, tags with quality and age, outputs, mailboxes, and the PLC as the gateway sees it.
+
+    A brief status has no tags, because thousands of them take longer than everything else.
+    """
     outputs = gateway.outputs
     return GatewayStatus(
         devices=_devices(gateway, now_ns),
         buses={name: bus.status() for name, bus in gateway.buses.items()},
-        tags=_tags(gateway, now_ns),
+        tags={} if brief else _tags(gateway, now_ns),
         outputs=[
             OutputStatus(
                 tag=o.tag,

@@ -193,11 +193,11 @@ class GatewayProcess:
         return {"ready": True, "pid": os.getpid()}
 
     async def _get(self, args: dict[str, Any]) -> GatewayStatus:
-        return self._status()
+        return self._status(brief=args.get("brief") is True)
 
-    def _status(self) -> GatewayStatus:
+    def _status(self, *, brief: bool = False) -> GatewayStatus:
         return msgspec.structs.replace(
-            describe(self._gateway, self._clock.monotonic_ns()),
+            describe(self._gateway, self._clock.monotonic_ns(), brief=brief),
             learnt=learnt_statuses(self._gateway.drivers.values()),
             store_error=self._store_error,
             config=ConfigStatus(

@@ -1,8 +1,8 @@
 """Observe one running instance through its control channels and its capture.
 
 The statuses of gateway, PLC and field simulator are read two to four times a second, changes of tags ten times a second. A
-process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current. The
-PLC is asked only for what it answers in a bounded time; the values of its tags come from the process image.
+process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
+Gateway and PLC are asked only for what they answer in a bounded time; present values come from the process image.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import structs
+from msgspec import UNSET, structs
 
 from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -30,7 +30,9 @@ from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
 from fieldtwin.studio.live.marks import FaultMarks
 from fieldtwin.studio.live.observed import describe_system
-from fieldtwin.studio.live.plc_values import PlcValues
+from fieldtwin.studio.live.plc_values import whole_plc_status
+from fieldtwin.studio.live.present_tags import PresentTags
+from fieldtwin.studio.live.process_image import ProcessImage
 from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.studio.live.subscription import Publisher
 from fieldtwin.studio.live.tag_history import Point, TagHistory
@@ -40,6 +42,8 @@ from fieldtwin.twin.site.system import System
 
 TAGS_EVERY_S = 0.1
 GATEWAY_EVERY_S = 0.5
+COMPARED_EVERY_S = 0.5
+"""How often the history is compared with the present values, which become stale without a change that the gateway reports."""
 PLC_EVERY_S = 0.25
 BUCKETS_EVERY_S = 2.0
 """The distribution of scan times is read less often, because it takes the PLC longer than the rest of its brief status."""
@@ -66,9 +70,7 @@ class Attachment:
         self.name = found.name
         self.dir = found.dir
         self.record: RunRecord = found.record
-        [system] = read_resolved(str(found.dir / SYSTEM_FILE))
-        assert isinstance(system, System)
-        self.system = system
+        self.system = system = self._read_system()
         self.description = describe_system(system)
         self.gateway: GatewayStatus | None = None
         self.plc: WholePlcStatus | None = None
@@ -96,16 +98,24 @@ class Attachment:
         """The number of the latest change that was read, None before the first answer."""
         self._history_read = asyncio.Event()
         """Set when all changes that the gateway has kept were read, or when it did not answer."""
-        self._is_complete = False
-        """Whether all changes since the start of the gateway have been read."""
+        self._present = PresentTags(system, self.secrets, self.history)
+        self._compared_ns = 0
+        """When the history was last compared with the present values."""
+        self._reloads = 0
+        """The reloads of the gateway's files that `_present` knows."""
         self._gateway_began_ns = 0
         """The start of the gateway whose changes are read."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
-        self._plc_values = PlcValues(found.dir, self.secrets)
+        self._image = ProcessImage(found.dir)
         self._buckets_ns = 0
         """When the distribution of scan times was read."""
         self._nursery = Nursery()
+
+    def _read_system(self) -> System:
+        [system] = read_resolved(str(self.dir / SYSTEM_FILE))
+        assert isinstance(system, System)
+        return system
 
     async def __aenter__(self) -> Attachment:
         if self.record.capture:
@@ -128,7 +138,7 @@ class Attachment:
         await self._nursery.__aexit__(None, None, None)
         for channel in (self.gateway_channel, self.plc_channel, self.field_channel):
             await channel.aclose()
-        self._plc_values.close()
+        self._image.close()
         if self.frames is not None:
             self.frames.close()
 
@@ -138,14 +148,10 @@ class Attachment:
 
     def status(self) -> dict[str, Any]:
         """Return the statuses, as data for JSON."""
-        gateway = msgspec.to_builtins(self.gateway) if self.gateway is not None else None
-        if gateway is not None:
-            for name in self.secrets & gateway["tags"].keys():
-                gateway["tags"][name] |= {"value": SECRET}
         frames = self.frames
         return {
             "now_ns": self.now_ns(),
-            "gateway": gateway,
+            "gateway": msgspec.to_builtins(self.gateway) if self.gateway is not None else None,
             "plc": msgspec.to_builtins(self.plc) if self.plc is not None else None,
             "transitions": self.state_history.newest,
             "field": msgspec.to_builtins(self.field) if self.field is not None else None,
@@ -172,9 +178,9 @@ class Attachment:
     def _lost(self, what: str, reason: str) -> None:
         if what == "gateway":
             self.gateway = None
+            self._image.close()
         elif what == "plc":
             self.plc = None
-            self._plc_values.close()
         elif what == "field":
             self.field = None
         elif what == "tags":
@@ -184,7 +190,12 @@ class Attachment:
             self.updates.publish({"type": "status", "status": self.status()})
 
     async def _read_gateway(self) -> None:
-        self.gateway = await self.gateway_channel.ask("get", GatewayStatus)
+        await self.has_history()
+        gateway = await self.gateway_channel.ask("get", GatewayStatus, brief=True)
+        if gateway.config is not UNSET and gateway.config.reloads != self._reloads:
+            self._reloads = gateway.config.reloads
+            self._present.describe_values(self._read_system())
+        self.gateway = structs.replace(gateway, tags=self._present.statuses(self._image.inputs(), self.now_ns()))
         self.updates.publish({"type": "status", "status": self.status()})
 
     async def read_plc(self, buckets: bool = True) -> WholePlcStatus:
@@ -193,7 +204,7 @@ class Attachment:
         if self._described != (brief.pid, brief.restarts):  # a restart reads Structured Text again
             self.programs = await self._read_programs()
             self._described = (brief.pid, brief.restarts)
-        return self._plc_values.read(brief, self.programs, self.now_ns())
+        return whole_plc_status(self._image, brief, self.programs, self.secrets, self.now_ns())
 
     async def _read_plc(self) -> None:
         known, buckets = self.plc, self.plc is None or self.now_ns() - self._buckets_ns >= BUCKETS_EVERY_S * NS_PER_S
@@ -237,13 +248,14 @@ class Attachment:
 
     async def _read_changes(self) -> bool:
         """Read the next changes of tags, and return whether these were the last ones."""
-        names = [] if self._is_complete else self.history.names()
-        since = self._seen_change or 0
+        now_ns, since = self.now_ns(), self._seen_change or 0
+        inputs = self._image.inputs() if now_ns - self._compared_ns >= COMPARED_EVERY_S * NS_PER_S else None
+        names = [] if inputs is None else self._present.texts
         answer = await self.gateway_channel.call("watch", since=since, names=names, refused=NONE_OF_THEM)
         if answer["began_ns"] != self._gateway_began_ns:
             self._gateway_began_ns = answer["began_ns"]
             if self._seen_change is not None:  # the gateway was restarted, so its numbers begin again
-                self._seen_change, self._is_complete = None, False
+                self._seen_change, self._compared_ns = None, 0
                 return False
         if self._seen_change is None:
             oldest_ns = answer["changes"][0][1] if answer["dropped"] else answer["began_ns"]
@@ -256,15 +268,18 @@ class Attachment:
             self.history.add(name, point)
             changes.append([name, *point])
         self._seen_change = answer["changes"][-1][0] if answer["changes"] else answer["last"]
+        is_last = bool(self._seen_change >= answer["last"])
+        if inputs is not None and is_last:
+            self._compared_ns = now_ns
+            self._present.take_texts(answer["tags"], answer["now_ns"])
+            for name, point in self._present.missing(inputs):
+                self.history.add(name, point)
+                changes.append([name, *point])
         if changes and self._history_read.is_set():
             self.updates.publish({"type": "tags", "changes": changes})
-        if self._seen_change < answer["last"]:
-            return False
-        for name, (value, quality, reason, t_ns) in answer["tags"].items():
-            self.history.add_present(name, self.point(name, t_ns or answer["now_ns"], value, quality, reason))
-        self._is_complete = True
-        self._history_read.set()
-        return True
+        if is_last:
+            self._history_read.set()
+        return is_last
 
     async def _follow_frames(self, frames: FrameLog) -> None:
         told, told_ns = -1, 0

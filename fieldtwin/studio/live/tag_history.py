@@ -71,16 +71,10 @@ class TagHistory:
         if points is not None:
             points.append(point)
 
-    def add_present(self, name: str, point: Point) -> None:
-        """Add the present value of a tag, unless its latest change says the same. It is never older than that change."""
-        points = self._points.get(name)
-        if points is None:
-            return
-        latest = points[-1] if points else None
-        if latest is None:
-            points.append(point)
-        elif latest[1:] != point[1:]:
-            points.append(point._replace(t_ns=max(point.t_ns, latest.t_ns)))
+    def latest(self, name: str) -> Point | None:
+        """Return the latest point of a tag, None before the first one."""
+        points = self._points[name]
+        return points[-1] if points else None
 
     def names(self) -> list[str]:
         """Return the names of all tags."""

@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Coroutine, Sequence
 from typing import Any
 
-from fieldtwin.emulators.faults.can_engine import struck
+from fieldtwin.emulators.faults.can_engine import replaced_frames
 from fieldtwin.emulators.faults.can_fault import CanFault, CanPiece
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
 from fieldtwin.emulators.faults.fault import Active
@@ -79,7 +79,9 @@ class CanLink:
                 self.ended.set_result(e)
 
     def _become(self, frame: CanFrame, way: FrameDirection) -> Sequence[CanPiece]:
-        pieces = struck(self._faults, way, frame, node_of(frame), self._now_ns()) if self._faults.active else None
+        pieces = (
+            replaced_frames(self._faults, way, frame, node_of(frame), self._now_ns()) if self._faults.active else None
+        )
         return (CanPiece(frame),) if pieces is None else pieces
 
     async def _pass(self, frame: CanFrame, way: FrameDirection) -> None:

@@ -62,9 +62,10 @@ class ClientCounts:
 
 
 class CountDifference:
-    """The assignment of traffic to clients on a line that has one client at a time: it assigns the growth of `totals`.
+    """Assigns the traffic of a line to its clients, of which only one is connected at a time.
 
-    `totals` returns the requests and replies of all devices on the line so far.
+    `totals` returns the requests and replies of all devices on the line so far. Their increase since the last call belongs to
+    the present client.
     """
 
     def __init__(self, clients: ClientCounts, totals: Callable[[], tuple[int, int]]) -> None:

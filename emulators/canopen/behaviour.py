@@ -50,7 +50,7 @@ class Objects:
         return default if entry is None else codec.decode(entry.data_type, self._data.factory(index, subindex))
 
     def channels(self, index: int) -> list[int]:
-        """Return the subindices of an array above 0."""
+        """Return the subindices of an array, except subindex 0."""
         found = self._data.dictionary.objects.get(index)
         return sorted(sub for sub in found.entries if sub) if found else []
 

@@ -76,7 +76,7 @@ _TARGET = {
 
 @dataclass(frozen=True, slots=True)
 class NodeContext:
-    """The parts and settings of a node besides its data sheet.
+    """The parts and settings of a node that its data sheet does not contain.
 
     `source` gives values by time and, if it is an `AnswersReads`, for each upload. `model` computes the device's behaviour
     from them and from the values that clients write; `distort` changes the model's output, for faults. `held` is called
@@ -248,9 +248,10 @@ class CanopenNode:
             self._faults.changed(state, now_ns)
         return self.tick(now_ns)
 
-    def on_second_node(self, tell: Callable[[int], None]) -> None:
-        """Call `tell` with the identifier when another node sends on an identifier of this node; once until the next reset."""
-        self._faults.tell = tell
+    def on_second_node(self, callback: Callable[[int], None]) -> None:
+        """Call `callback` with the identifier when a different node sends on an identifier of this node. It is called once
+        until the next reset."""
+        self._faults.on_second_node = callback
 
     def overrun(self, now_ns: int) -> list[CanFrame]:
         """Report that the CAN controller lost received frames: EMCY 8110h."""
@@ -275,7 +276,7 @@ class CanopenNode:
 
     def set_time(self, time: TimeOfDay, now_ns: int) -> list[CanFrame]:
         """Set the device's own clock, which a TIME producer sends."""
-        self._time.tell(time, now_ns)
+        self._time.set_time(time, now_ns)
         return self.tick(now_ns)
 
     def set_value(self, index: int, subindex: int, raw: bytes, now_ns: int) -> list[CanFrame]:

@@ -117,7 +117,7 @@ class AnswersReads(Protocol):
     """A source that can also give a value for each single upload of an object, in the order of recorded uploads."""
 
     def answer(self, key: tuple[int, int], now_ns: int, /) -> bytes | None:
-        """Return bytes as sent for the upload that begins, or None to leave the object unchanged."""
+        """Return the value for the upload that begins, as the bytes to send. Return None to leave the object's present value."""
         ...
 
 

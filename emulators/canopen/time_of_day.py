@@ -58,7 +58,7 @@ class TimeService(NodeService):
         known, at_ns = self._known
         return known.later((now_ns - at_ns) // NS_PER_MS)
 
-    def tell(self, time: TimeOfDay, now_ns: int) -> None:
+    def set_time(self, time: TimeOfDay, now_ns: int) -> None:
         """Set the clock."""
         self._known = (time, now_ns)
         self._core.note(now_ns, "time", COB_ID, 0, time.to_bytes())
@@ -91,7 +91,7 @@ class TimeService(NodeService):
         if not self._core.communicating or len(data) != _SIZE:
             self._core.counters.ignored += 1
         else:
-            self.tell(TimeOfDay.from_bytes(data), now_ns)
+            self.set_time(TimeOfDay.from_bytes(data), now_ns)
         return True
 
     def tick(self, now_ns: int) -> None:

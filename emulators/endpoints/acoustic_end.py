@@ -79,7 +79,7 @@ class AcousticServer:
 
     def _hand_on(self, name: str, writer: asyncio.StreamWriter, now_ns: int) -> None:
         wanted = self._wanted[name]
-        while wanted and self._medium.say(name, wanted[0], now_ns):
+        while wanted and self._medium.transmit(name, wanted[0], now_ns):
             wanted.popleft()
             writer.write(_frame(b"A"))
         while (heard := self._medium.take(name, now_ns)) is not None:

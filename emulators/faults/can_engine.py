@@ -9,7 +9,9 @@ from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection, Framin
 from fieldtwin.gateway.core.canframe import CanFrame
 
 
-def struck(faults: WireFaults, way: FrameDirection, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
+def replaced_frames(
+    faults: WireFaults, way: FrameDirection, frame: CanFrame, node: int, now_ns: int
+) -> list[CanPiece] | None:
     """Return the frames that replace `frame`, or None if no fault changes it.
 
     Several faults are applied one after the other.
@@ -21,13 +23,13 @@ def struck(faults: WireFaults, way: FrameDirection, frame: CanFrame, node: int, 
             continue
         if not aimed(active, frame):
             continue
-        if not fault.aims_at(frame, node) or not active.strikes(seen(way, node), now_ns):
+        if not fault.aims_at(frame, node) or not active.applies_to(seen(way, node), now_ns):
             continue
         before = pieces if pieces is not None else [CanPiece(frame)]
         pieces = [
             CanPiece(after.frame, after.delay_s + piece.delay_s)
             for piece in before
-            for after in fault.strike(piece.frame, node, active.random)
+            for after in fault.apply(piece.frame, node, active.random)
         ]
         active.struck += pieces != before
     return pieces

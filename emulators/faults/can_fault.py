@@ -36,7 +36,7 @@ class CanFault(Fault):
         return True
 
     @abstractmethod
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         """Return the frames that replace `frame`."""
 
     def appears(self, node: int, random: Random) -> tuple[CanPiece, ...]:

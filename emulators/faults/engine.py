@@ -54,7 +54,7 @@ class WireFaults:
         return bool(refusing)
 
     def decide(self, frame: FaultFrame, now_ns: int) -> FaultEffect | None:
-        """Return the effect on the frame, or None if no fault strikes it.
+        """Return the effect on the frame, or None if no fault changes it.
 
         Faults are applied in the order in which they were injected, except that faults which divide the frame come last.
         """
@@ -63,7 +63,7 @@ class WireFaults:
             return None
         dividing: list[tuple[Active, WireFault]] = []
         for active in self.in_at(now_ns):
-            if isinstance(active.fault, WireFault) and active.strikes(frame, now_ns):
+            if isinstance(active.fault, WireFault) and active.applies_to(frame, now_ns):
                 if active.fault.divides:
                     dividing.append((active, active.fault))
                 else:
@@ -87,21 +87,21 @@ def _struck(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, act
 
 def _joined(before: FaultEffect | None, frame: FaultFrame, fault: WireFault, active: Active) -> FaultEffect:
     if before is None:
-        return fault.strike(frame, active.random)
+        return fault.apply(frame, active.random)
     pieces: list[DelayedBytes] = []
-    hang: ConnectionEffect | None = before.hang
+    connection: ConnectionEffect | None = before.connection
     for piece in before.pieces:
         if piece.back or not piece.data:
             pieces.append(piece)
             continue
         seen = understood(frame.way, frame.framing, piece.data)
-        after = fault.strike(
+        after = fault.apply(
             FaultFrame(seen.way, seen.framing, seen.data, seen.unit, seen.pdu, frame.address, frame.count),
             active.random,
         )
         pieces += _later(after.pieces, piece)
-        hang = hang or after.hang
-    return FaultEffect(tuple(pieces), hang)
+        connection = connection or after.connection
+    return FaultEffect(tuple(pieces), connection)
 
 
 def _later(pieces: Iterable[DelayedBytes], behind: DelayedBytes) -> list[DelayedBytes]:

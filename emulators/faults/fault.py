@@ -53,7 +53,7 @@ class FaultEffect:
     """The effect of a fault on a frame: pieces in order, and the effect on the connection after them."""
 
     pieces: tuple[DelayedBytes, ...] = ()
-    hang: ConnectionEffect | None = None
+    connection: ConnectionEffect | None = None
 
 
 def passed(*data: bytes) -> FaultEffect:
@@ -136,7 +136,7 @@ class WireFault(Fault):
     kind = InjectionPoint.BYTES
 
     @abstractmethod
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         """Return the effect on `frame`."""
 
     def appears(self) -> ConnectionEffect | None:
@@ -194,7 +194,7 @@ class Active:
     functions: frozenset[int] = frozenset()
     """Function codes of the table that contains the addresses; empty: all."""
 
-    def strikes(self, frame: FaultFrame, now_ns: int) -> bool:
+    def applies_to(self, frame: FaultFrame, now_ns: int) -> bool:
         """Return whether the fault is to change this frame, and count frames that match its aim.
 
         If the fault then changes the frame, the caller increases `struck`. A fault without an effect has tested nothing.

@@ -54,7 +54,7 @@ MODBUS = frozenset({Framing.RTU, Framing.ASCII, Framing.MBAP})
 
 
 def framing_of(plant: Endpoint) -> Framing:
-    """Return the framing of a bus."""
+    """Return the framing of the bus whose endpoint in the system file is `plant`."""
     if plant.is_can:
         return Framing.RAW
     if plant.scheme == "ascii":

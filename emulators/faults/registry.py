@@ -31,7 +31,7 @@ def _load() -> dict[str, type[Fault]]:
 
 
 FAULTS: dict[str, type[Fault]] = _load()
-"""The faults by name, in the order of the list of faults."""
+"""The fault classes by name, in the order in which ``fieldtwin faults`` lists them."""
 
 
 def fault_class(name: str) -> type[Fault]:

@@ -162,7 +162,8 @@ def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...])
 
 
 def counted(count: str | int | None) -> range | None:
-    """Return the register or bit counts of a text such as ``40``, ``65..125`` or ``65..``; None: all. Raises `WrongAim`."""
+    """Return the range of register or bit counts that a text such as ``40``, ``65..125`` or ``65..`` describes. Return None if
+    the text is empty, which means every count. Raises `WrongAim`."""
     if count is None:
         return None
     low, dots, high = str(count).partition("..")

@@ -142,7 +142,7 @@ class AcousticMedium:
         here = self._modem(name)
         return [n for n, other in self._modems.items() if other is not here and self._way_m(here, other) is not None]
 
-    def say(self, name: str, payload: bytes, now_ns: int, *, times: int = 1, every_ns: int = 0) -> bool:
+    def transmit(self, name: str, payload: bytes, now_ns: int, *, times: int = 1, every_ns: int = 0) -> bool:
         """Queue `payload` at `name`, to be sent `times` times. Return False if the modem's queue is full."""
         self.advance(now_ns)
         modem = self._modem(name)

@@ -44,7 +44,7 @@ class MemberTrace(Trace):
             if data.get("target"):
                 data = {**data, "target": self._prefix + data["target"]}
         else:
-            self.tell(t_ns, kind, where, data)
+            self.notify(t_ns, kind, where, data)
             where = self._prefix + where
         self._whole.note(t_ns + self.offset_ns, kind, where, data)
 
@@ -126,7 +126,8 @@ class NetworkBench:
         return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
 
     def host_late_total_s(self, since_s: float) -> tuple[float, float]:
-        """Return the first part's lateness: only its bench sleeps, for all systems."""
+        """Return the lateness of the first system's bench (see `Bench.host_late_total_s`), because only that bench waits, for
+        all systems."""
         told = [p.bench.host_late_total_s(since_s - p.trace.offset_ns / NS_PER_S) for p in self.parts.values()]
         return told[0][0], max(any_s for _, any_s in told)
 

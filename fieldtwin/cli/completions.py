@@ -1,4 +1,4 @@
-"""Values that the shell offers for arguments: names of systems, and words that can be explained.
+"""Values that the shell offers for arguments: names of systems, and IDs that `fieldtwin explain` knows.
 
 The shell calls the program at each press of the tab key, so each function reads no more than it needs.
 """
@@ -22,7 +22,8 @@ def systems(ctx: click.Context, param: click.Parameter, incomplete: str) -> list
 
 
 def explained(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the IDs without spaces that `fieldtwin explain` knows and that begin with `incomplete`, in any case."""
+    """Return the IDs without spaces that `fieldtwin explain` knows and that begin with `incomplete`. Upper and lower case are
+    equal."""
     from fieldtwin.explain.lookup import everything
 
     wanted = incomplete.lower()

@@ -98,7 +98,7 @@ class GroupedCommand(click.Command):
 def moved_options(sentence: str, *names: str, is_flag: bool = False) -> Decorator:
     """Add hidden options that a command no longer has.
 
-    The use of one raises `UsageError` with `sentence`, in which {} stands for the option.
+    Using such an option raises `UsageError` with `sentence`, in which {} stands for the option.
     """
 
     def refuse(ctx: click.Context, parameter: click.Parameter, value: Any) -> None:

@@ -123,9 +123,9 @@ class Trace:
         # this avoids `value`, which goes through a descriptor, and the hash of a Kind, which is computed in Python: both
         # are slow
         if self._told[kind._value_]:
-            self.tell(t_ns, kind, where, data)
+            self.notify(t_ns, kind, where, data)
 
-    def tell(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
+    def notify(self, t_ns: int, kind: TraceKind, where: str, data: dict[str, Any]) -> None:
         """Pass an event to the listeners, in the order of their registration."""
         event = TraceEvent(t_ns, kind, where, data)
         for listener in self._told[kind._value_]:

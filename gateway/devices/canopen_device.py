@@ -132,7 +132,7 @@ class CanopenDriver(DeviceDriver):
         return state is NmtState.OPERATIONAL and not self.master.heartbeat_lost(self.node)
 
     @property
-    def unbrought(self) -> tuple[str, ...]:
+    def unreceived_tags(self) -> tuple[str, ...]:
         """Return the tags of the node's TPDOs that are not received, because the node is not OPERATIONAL (7.3.2.2).
 
         A node without a heartbeat counts as OPERATIONAL for the TPDOs that it has sent. The state of a node whose heartbeat was

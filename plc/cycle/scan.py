@@ -300,7 +300,7 @@ class Scan:
         gateway is dead."""
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
 
-    def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
+    def substituted_values(self, tag: str) -> dict[str, TagValue]:
         """Return the variables (``program.variable``) whose value differs from that of input `tag`.
 
         They differ because the input is bad and the policy of the variable replaces its value."""

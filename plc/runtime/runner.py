@@ -441,11 +441,11 @@ class TaskRunner:
     def inputs(self) -> dict[str, TagValue]:
         return {tag: self._as_read(value) for tag, value in self.entries[0].scan.inputs().items()}
 
-    def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
-        """Return `Scan.seen_otherwise` of all tasks."""
+    def substituted_values(self, tag: str) -> dict[str, TagValue]:
+        """Return `Scan.substituted_values` of all tasks."""
         if self.halted:  # no program reads inputs
             return {}
-        return {name: seen for entry in self.entries for name, seen in entry.scan.seen_otherwise(tag).items()}
+        return {name: seen for entry in self.entries for name, seen in entry.scan.substituted_values(tag).items()}
 
     def input(self, tag: str) -> TagValue:
         """Return `Scan.input` of the first task."""

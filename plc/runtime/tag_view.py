@@ -57,7 +57,7 @@ class TagView:
                 row = _row(runner.as_limited(spec), runner.input(name), runner.forces.inputs.get(name), now_ns, utc_ns)
                 seen = {
                     variable: {"value": as_seen.value, "quality": str(as_seen.quality)}
-                    for variable, as_seen in runner.seen_otherwise(name).items()
+                    for variable, as_seen in runner.substituted_values(name).items()
                 }
                 rows.append({**row, "side": "input", "seen": seen})
             if spec := self._specs[OUTPUTS].get(name):

@@ -57,7 +57,7 @@ class Station:
         p.value, p.count, p.sample = self.temperature, self.count, ()  # type: ignore[attr-defined]
         p.execute(ScanInfo(now_ns, self.scans, self.scans == 1))
         for _, data in p.said.pending:  # type: ignore[attr-defined]
-            self.sea.say(self.name, data, now_ns)
+            self.sea.transmit(self.name, data, now_ns)
         self.log += [data for _, data in p.log.pending]  # type: ignore[attr-defined]
         p.said.pending, p.log.pending = [], []  # type: ignore[attr-defined]
         self.kept = p.retained()
@@ -85,7 +85,9 @@ class Ocean:
                 station.scan(self.now_s)
 
     def order(self, period_s: int) -> None:
-        self.sea.say("ship", encode_period(period_s).data, round(self.now_s * 1e9), times=3, every_ns=15_000_000_000)
+        self.sea.transmit(
+            "ship", encode_period(period_s).data, round(self.now_s * 1e9), times=3, every_ns=15_000_000_000
+        )
 
     def periods(self) -> list[int]:
         return [station.period_s for station in self.stations.values()]
@@ -231,7 +233,7 @@ def test_an_invalid_message_changes_nothing(nonsense: bytes) -> None:
     ocean = Ocean(0.0, 1)
     ocean.order(10)
     ocean.run(60)
-    ocean.sea.say("ship", nonsense, round(ocean.now_s * 1e9))
+    ocean.sea.transmit("ship", nonsense, round(ocean.now_s * 1e9))
     ocean.run(30)
     assert ocean.stations["west"].unknown == 1
     assert ocean.periods() == [10, 10, 10]

@@ -28,7 +28,7 @@ def test_values_held_inside_their_age(raw: bytes, asked_ns: int, now_ns: int, ri
     oracle.held("d.x", b"a", 100)
     oracle.held("d.x", b"b", 200)
     oracle.published("d.x", raw, 1, asked_ns, now_ns)
-    oracle.judge(EMULATED)
+    oracle.check(EMULATED)
     assert (oracle.checked, oracle.wrong_count) == (1, 0 if right else 1)
     assert bool(oracle.wrong) is not right
 
@@ -36,12 +36,12 @@ def test_values_held_inside_their_age(raw: bytes, asked_ns: int, now_ns: int, ri
 def test_real_devices_are_not_checked_and_old_values_are_dropped() -> None:
     oracle = AgeOracle()
     oracle.published("real.x", b"a", 1, 0, 10)
-    oracle.judge(EMULATED)
+    oracle.check(EMULATED)
     assert oracle.checked == 0
     for n in range(1000):
         t_ns = n * KEPT_NS // 100
         oracle.held("d.x", bytes([n % 251]), t_ns)
         oracle.published("d.x", bytes([n % 251]), n, t_ns, t_ns)
-        oracle.judge(EMULATED)
+        oracle.check(EMULATED)
     assert oracle.wrong_count == 0
     assert len(oracle._held["d.x"].times_ns) < 110

@@ -25,14 +25,16 @@ MOST_WAITING = 64
 
 
 class RefusalPlaces:
-    """The lookup that completes the entries of `journal` over the PLC's control channel at `socket`, and then calls `tell`
+    """The lookup that completes the entries of `journal` over the PLC's control channel at `socket`, and then calls `on_entry`
     with each completed entry.
     """
 
-    def __init__(self, journal: Refusals, socket: Path, tell: Callable[[dict[str, Any]], None] | None = None) -> None:
+    def __init__(
+        self, journal: Refusals, socket: Path, on_entry: Callable[[dict[str, Any]], None] | None = None
+    ) -> None:
         self._journal = journal
         self._socket = socket
-        self._tell = tell
+        self._on_entry = on_entry
         self._waiting: deque[RefusedOutput] = deque()
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._idle.set()
@@ -50,8 +52,8 @@ class RefusalPlaces:
 
     def _complete(self, entry: RefusedOutput, program: str, place: str) -> None:
         self._journal.placed(entry.number, program, place)
-        if self._tell is not None:
-            self._tell(asdict(entry.status()))
+        if self._on_entry is not None:
+            self._on_entry(asdict(entry.status()))
 
     async def run(self) -> None:
         """Look up the program line of each waiting entry, until cancelled."""

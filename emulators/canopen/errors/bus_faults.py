@@ -28,7 +28,7 @@ class BusFaults(NodeService):
         self._emergency = emergency
         self._react = react
         self.state = CanErrorState.ACTIVE
-        self.tell: Callable[[int], None] | None = None
+        self.on_second_node: Callable[[int], None] | None = None
         """A function that is called with the identifier when a second node sends on an identifier of this node, once until the
         next reset.
         """
@@ -72,9 +72,9 @@ class BusFaults(NodeService):
         if frame.can_id not in own:
             return False
         self._raise(COLLISION, now_ns)
-        if self.tell is not None and not self._reported:
+        if self.on_second_node is not None and not self._reported:
             self._reported = True
-            self.tell(frame.can_id)
+            self.on_second_node(frame.can_id)
         return True
 
     def on_error_frame(self, frame: CanFrame, now_ns: int) -> None:

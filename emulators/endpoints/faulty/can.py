@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from fieldtwin.emulators.endpoints.can.bus_runner import AttachedConnection
-from fieldtwin.emulators.faults.can_engine import aimed, seen, struck
+from fieldtwin.emulators.faults.can_engine import aimed, replaced_frames, seen
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault, CanPiece
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
 from fieldtwin.emulators.faults.fault import Active
@@ -90,10 +90,10 @@ class FaultyCan(CanConnection):
         return True
 
     def _struck(self, way: FrameDirection, frame: CanFrame) -> list[CanPiece] | None:
-        """Return the frames that replace `frame`, or None if no fault strikes it."""
+        """Return the frames that replace `frame`, or None if no fault changes it."""
         if not self._faults.active or frame.error:
             return None
-        return struck(self._faults, way, frame, self.node, self._now_ns())
+        return replaced_frames(self._faults, way, frame, self.node, self._now_ns())
 
     def _put_in(self, active: Active) -> None:
         if not isinstance(active.fault, CanFault) or (active.units and self.node not in active.units):
@@ -145,7 +145,7 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
         if attempts is None and again is not None and again.key() == frame.key():
             again = None  # its controller sends it again, successfully
             return None
-        if not aimed(active, frame) or not active.strikes(seen(FrameDirection.REPLY, frame.can_id & 0x7F), now_ns()):
+        if not aimed(active, frame) or not active.applies_to(seen(FrameDirection.REPLY, frame.can_id & 0x7F), now_ns()):
             return None
         again = frame
         spoilt += 1

@@ -195,8 +195,8 @@ class FaultyEnd(ByteConnection):
                     self._send_at(due_ns + round(after_s * NS_PER_S), way, piece)
         if self._free_ns.get(way, 0) <= now_ns:
             self._free_ns.pop(way, None)
-        if outcome.hang is not None:
-            self._hang(outcome.hang, at_once)
+        if outcome.connection is not None:
+            self._disturb(outcome.connection, at_once)
         return [] if self._dead else at_once
 
     def _gather(self, way: FrameDirection, piece: DelayedBytes) -> None:
@@ -246,34 +246,34 @@ class FaultyEnd(ByteConnection):
 
     def _put_in(self, active: Active) -> None:
         """Schedule the effect of a fault on the connection at the fault's start time."""
-        hang = active.fault.appears() if isinstance(active.fault, WireFault) else None
-        if hang is None:
+        effect = active.fault.appears() if isinstance(active.fault, WireFault) else None
+        if effect is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
-        self._loop.call_later(wait_s, self._appear, active, hang)
+        self._loop.call_later(wait_s, self._appear, active, effect)
 
-    def _appear(self, active: Active, hang: ConnectionEffect) -> None:
+    def _appear(self, active: Active, effect: ConnectionEffect) -> None:
         if active.id in self._faults.active and in_time(active, self._now_ns()):
             active.struck += 1
-            self._hang(hang, [])
+            self._disturb(effect, [])
 
-    def _hang(self, hang: ConnectionEffect, last: list[bytes]) -> None:
+    def _disturb(self, effect: ConnectionEffect, last: list[bytes]) -> None:
         in_memory = isinstance(self.inner, MemoryEnd) and self.inner.wire.serial
         if self._dead or in_memory or self.inner.type is PROTOCOL.RS232:
             return  # a serial line cannot be closed: the fault itself drops the bytes
-        if hang is ConnectionEffect.HALF_OPEN:
+        if effect is ConnectionEffect.HALF_OPEN:
             self._dead = True
             return
         for data in last:
             self._start(data)
         self._dead = True
-        self._loop.call_soon(self._end, hang)
+        self._loop.call_soon(self._end, effect)
 
-    def _end(self, hang: ConnectionEffect) -> None:
+    def _end(self, effect: ConnectionEffect) -> None:
         if isinstance(self.inner, MemoryEnd):
             self.inner.wire.cut(ConnectionLost("the other side ended the connection", where=str(self.endpoint)))
         elif isinstance(self.inner, SocketEnd):
-            self.inner.evict(reset=hang is ConnectionEffect.RESET)
+            self.inner.evict(reset=effect is ConnectionEffect.RESET)
         else:
             task = self._loop.create_task(self.inner.aclose(), name="a fault's end of a connection")
             self._tasks.add(task)

@@ -15,7 +15,7 @@ class DuplicateNode(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id in (HEARTBEAT + node, SDO_REPLY + node)
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         if frame.can_id == HEARTBEAT + node:
             return CanPiece(frame), CanPiece(CanFrame(frame.can_id, b"\x7f"), 0.001)
         return CanPiece(frame), CanPiece(frame, 0.001)

@@ -26,7 +26,7 @@ class EmcyBurst(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return False  # the fault only adds frames
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return as_is(frame)
 
     def appears(self, node: int, random: Random) -> tuple[CanPiece, ...]:

@@ -23,5 +23,5 @@ class HeartbeatLate(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == HEARTBEAT + node
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return (CanPiece(frame, random.uniform(0.0, self.parameters.most_ms / 1000)),)

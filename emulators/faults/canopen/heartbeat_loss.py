@@ -15,5 +15,5 @@ class HeartbeatLoss(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == HEARTBEAT + node
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return ()

@@ -20,5 +20,5 @@ class LateFrame(CanFault):
     summary = "a frame of the node arrives `by_ms` late (narrow it with `cob_id`)"
     form = Form
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return (CanPiece(frame, self.parameters.by_ms / 1000),)

@@ -12,5 +12,5 @@ class LostFrame(CanFault):
     name = "lost-frame"
     summary = "a frame of the node is lost (narrow it with `cob_id`)"
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return ()

@@ -15,5 +15,5 @@ class LostSegment(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == SDO_REPLY + node and bool(frame.data) and frame.data[0] >> 5 in (0, 1)
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return ()

@@ -26,5 +26,5 @@ class OddHeartbeat(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == HEARTBEAT + node
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return (CanPiece(CanFrame(frame.can_id, bytes((self.parameters.state,)))),)

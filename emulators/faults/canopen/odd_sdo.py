@@ -35,7 +35,7 @@ class OddSdo(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == SDO_REPLY + node and len(frame.data) == 8
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         p, data = self.parameters, bytearray(frame.data)
         if data[0] >> 5 in (_UPLOAD, 3):  # an initiate; segments name no object and no size
             index = (int.from_bytes(data[1:3], "little") + p.index_by) & 0xFFFF

@@ -29,7 +29,7 @@ class SdoAbort(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == SDO_REPLY + node and len(frame.data) == 8 and frame.data[0] != 0x80
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         if frame.data[0] >> 5 in (2, 3):  # an initiate names the object, a segment does not
             self._object = frame.data[1:4]
         data = b"\x80" + self._object + int(self.parameters.code).to_bytes(4, "little")

@@ -16,5 +16,5 @@ class SdoToggle(CanFault):
         segment = frame.data[:1] and frame.data[0] >> 5 in (0, 1)
         return frame.can_id == SDO_REPLY + node and bool(segment)
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return (CanPiece(CanFrame(frame.can_id, bytes((frame.data[0] ^ 0x10,)) + frame.data[1:])),)

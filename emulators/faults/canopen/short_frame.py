@@ -20,7 +20,7 @@ class ShortFrame(CanFault):
     summary = "a frame of the node ends after `length` bytes (narrow it with `cob_id`)"
     form = Form
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         if frame.remote:
             return (CanPiece(frame),)
         return (CanPiece(CanFrame(frame.can_id, frame.data[: self.parameters.length], extended=frame.extended)),)

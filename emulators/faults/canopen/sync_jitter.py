@@ -25,5 +25,5 @@ class SyncJitter(CanFault):
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == SYNC
 
-    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+    def apply(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return (CanPiece(frame, random.uniform(0.0, self.parameters.most_ms / 1000)),)

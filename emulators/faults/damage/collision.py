@@ -19,7 +19,7 @@ class Collision(WireFault):
     summary = "a second sender collides with the frame from byte `at` on: each byte is the AND of both, as on RS485"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         at = self.parameters.at
         over = random.randbytes(max(0, len(frame.data) - at))
         mixed = bytes(a & b for a, b in zip(frame.data[at:], over, strict=True))

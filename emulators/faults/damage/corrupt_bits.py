@@ -24,7 +24,7 @@ class CorruptBits(WireFault):
     )
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         bits = self.parameters.bits
         if self.parameters.fits and frame.pdu:
             return passed(remade(frame, pdu=frame.pdu[:1] + _turned(frame.pdu[1:], bits, random)))

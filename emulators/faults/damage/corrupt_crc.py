@@ -13,7 +13,7 @@ class CorruptCrc(WireFault):
     summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; no effect over TCP, which has none"
     framings = frozenset({Framing.RTU, Framing.ASCII})
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         data = frame.data
         if frame.framing is Framing.RTU and data:
             return passed(data[:-1] + bytes((data[-1] ^ 0x5A,)))

@@ -24,7 +24,7 @@ class CorruptLength(WireFault):
     form = Form
     framings = MODBUS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         by = self.parameters.by
         if frame.framing is Framing.MBAP:
             length = (int.from_bytes(frame.data[4:6]) + by) & 0xFFFF

@@ -13,5 +13,5 @@ class Echo(WireFault):
     summary = "the sender receives its own frame before the reply"
     ways = frozenset((FrameDirection.REQUEST,))
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect((DelayedBytes(frame.data, back=True), DelayedBytes(frame.data)))

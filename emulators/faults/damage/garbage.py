@@ -20,5 +20,5 @@ class Garbage(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), follow the frame immediately"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(frame.data + (bytes.fromhex(self.parameters.data) or random.randbytes(self.parameters.count)))

@@ -21,7 +21,7 @@ class Noise(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), precede the frame by `lead_ms`"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         p = self.parameters
         before = bytes.fromhex(p.data) or random.randbytes(p.count)
         if not p.lead_ms:

@@ -19,5 +19,5 @@ class Truncate(WireFault):
     summary = "the last `count` bytes of the frame are missing"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(frame.data[: max(1, len(frame.data) - self.parameters.count)])

@@ -19,7 +19,7 @@ class WrongBaud(WireFault):
     summary = "each byte arrives as different bytes, or not at all, as with a baud rate that is wrong by `factor`"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         heard = bytearray()
         credit = 0.0
         for byte in frame.data:

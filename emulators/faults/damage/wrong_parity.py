@@ -12,6 +12,6 @@ class WrongParity(WireFault):
     name = "wrong-parity"
     summary = "bytes whose parity bit is wrong are dropped, which depends on their bits"
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         heard = bytes(byte for byte in frame.data if byte.bit_count() % 2 == 0)
         return passed(heard) if heard else LOST

@@ -10,13 +10,11 @@ from fieldtwin.emulators.faults.frames import FaultFrame, FrameDirection
 
 class Disconnect(WireFault):
     name = "disconnect"
-    summary = (
-        "connections are closed at once and new ones refused until the fault ends; a serial line is dead meanwhile"
-    )
+    summary = "connections are closed at once and new ones refused until the fault ends; a serial line loses all bytes until then"
     ways = frozenset(FrameDirection)
     refuses = True
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST
 
     def appears(self) -> ConnectionEffect:

@@ -13,5 +13,5 @@ class Drop(WireFault):
     summary = "the frame is lost"
     ways = frozenset(FrameDirection)
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST

@@ -20,6 +20,6 @@ class Duplicate(WireFault):
     summary = "the frame arrives again, `after_ms` later"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         again = DelayedBytes(frame.data, self.parameters.after_ms / 1000)
         return FaultEffect((DelayedBytes(frame.data), *[again] * self.parameters.times))

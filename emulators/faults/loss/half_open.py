@@ -12,5 +12,5 @@ class HalfOpen(WireFault):
     name = "half-open"
     summary = "from this frame on, the connection silently carries no data"
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
-        return FaultEffect(hang=ConnectionEffect.HALF_OPEN)
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
+        return FaultEffect(connection=ConnectionEffect.HALF_OPEN)

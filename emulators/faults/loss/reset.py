@@ -19,7 +19,7 @@ class Reset(WireFault):
     summary = "the connection is reset after the first `at` bytes of the frame"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect(
             (DelayedBytes(frame.data[: self.parameters.at]),) if self.parameters.at else (), ConnectionEffect.RESET
         )

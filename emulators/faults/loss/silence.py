@@ -13,5 +13,5 @@ class Silence(WireFault):
     summary = "the device never answers: its requests do not reach it"
     ways = frozenset((FrameDirection.REQUEST,))
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return LOST

@@ -14,5 +14,5 @@ class Busy(WireFault):
     summary = "the reply is exception 06, server device busy"
     framings = MODBUS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(remade(frame, pdu=bytes((frame.pdu[0] | 0x80, 6)))) if frame.pdu else passed(frame.data)

@@ -36,7 +36,7 @@ class ExceptionReply(WireFault):
     codes = CODES
     framings = MODBUS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if not frame.pdu:
             return passed(frame.data)
         return passed(remade(frame, pdu=bytes((frame.pdu[0] | 0x80, self.parameters.code))))

@@ -28,7 +28,7 @@ class FewerRegisters(WireFault):
     framings = MODBUS
     functions = _BITS | _REGISTERS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         pdu = frame.pdu
         width = 1 if frame.function in _BITS else 2 if frame.function in _REGISTERS else 0
         if not width or pdu[0] & 0x80 or len(pdu) < 2 + width:

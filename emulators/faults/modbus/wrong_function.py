@@ -21,7 +21,7 @@ class WrongFunction(WireFault):
     form = Form
     framings = MODBUS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if not frame.pdu:
             return passed(frame.data)
         return passed(remade(frame, pdu=bytes((self.parameters.code,)) + frame.pdu[1:]))

@@ -25,7 +25,7 @@ class WrongTransaction(WireFault):
     form = Form
     framings = frozenset({Framing.MBAP})
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         if frame.framing is not Framing.MBAP or len(frame.data) < 4:
             return passed(frame.data)
         p = self.parameters

@@ -21,5 +21,5 @@ class WrongUnit(WireFault):
     form = Form
     framings = MODBUS
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return passed(remade(frame, unit=self.parameters.unit_id))

@@ -19,5 +19,5 @@ class Coalesce(WireFault):
     summary = "frames are collected for `every_ms` and arrive in one piece"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect((DelayedBytes(frame.data, self.parameters.every_ms / 1000, gather=True),))

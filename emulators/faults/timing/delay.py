@@ -19,5 +19,5 @@ class Delay(WireFault):
     summary = "the frame arrives `by_ms` later, and delays the frames after it"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect((DelayedBytes(frame.data, self.parameters.by_ms / 1000),))

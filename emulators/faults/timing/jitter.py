@@ -19,5 +19,5 @@ class Jitter(WireFault):
     summary = "the frame arrives up to `most_ms` later (uniform distribution)"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect((DelayedBytes(frame.data, random.uniform(0.0, self.parameters.most_ms / 1000)),))

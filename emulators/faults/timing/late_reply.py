@@ -19,5 +19,5 @@ class LateReply(WireFault):
     summary = "the reply arrives `by_ms` late, and later replies may overtake it"
     form = Form
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         return FaultEffect((DelayedBytes(frame.data, self.parameters.by_ms / 1000, overtake=True),))

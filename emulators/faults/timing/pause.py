@@ -20,7 +20,7 @@ class Pause(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         half = len(frame.data) // 2
         return FaultEffect(
             (DelayedBytes(frame.data[:half]), DelayedBytes(frame.data[half:], self.parameters.pause_ms / 1000))

@@ -23,7 +23,7 @@ class Reorder(WireFault):
         super().__init__(parameters)
         self._held: FaultFrame | None = None
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         before, self._held = self._held, None
         if before is not None:
             return FaultEffect((DelayedBytes(frame.data, overtake=True), DelayedBytes(before.data, overtake=True)))

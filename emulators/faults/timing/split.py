@@ -22,7 +22,7 @@ class Split(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: FaultFrame, random: Random) -> FaultEffect:
+    def apply(self, frame: FaultFrame, random: Random) -> FaultEffect:
         p, left, cut = self.parameters, frame.data, list[bytes]()
         while len(left) > p.at and len(cut) < p.times:
             cut.append(left[: p.at])

@@ -81,7 +81,8 @@ class HomingPath:
 
 
 def plan(method: int, axis: DriveAxis, x: float, v: float, speeds: Speeds) -> HomingPath:
-    """Return the path of a method from position `x` with speed `v`. `method` is one of `METHODS`."""
+    """Return the path of the drive during homing by `method`, which is one of `METHODS`. The drive begins at position `x` with
+    speed `v`."""
     if method in (35, 37):
         stop = Motion(x, v, to_speed(v, 0.0, speeds.acceleration, speeds.acceleration))
         return HomingPath(stop, stop.at(stop.duration_s)[0])

@@ -20,7 +20,7 @@ class AcousticLink:
         self._every_ns = every_ns
 
     def submit(self, payload: bytes, now_ns: int) -> bool:
-        taken = self._medium.say(self._name, payload, now_ns, times=self._times, every_ns=self._every_ns)
+        taken = self._medium.transmit(self._name, payload, now_ns, times=self._times, every_ns=self._every_ns)
         if taken:
             self.sent += 1
             self.resent += self._times - 1

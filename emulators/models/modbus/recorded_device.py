@@ -54,7 +54,7 @@ def load_replay(
 class RecordedDevice(ProfiledReplay):
     """One unit of an emulated line. `kind` is the connection type of the emulated device.
 
-    `identity` gives tags other values than the recorded ones. A request that is not in the profile's command list is also
+    `identity` maps tags to values that replace the recorded ones. A request that is not in the profile's command list is also
     answered, and counted in `unlisted`.
     """
 

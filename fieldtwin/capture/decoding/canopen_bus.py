@@ -1,4 +1,4 @@
-"""Decode one CAN bus of a trace as CANopen: frames in, words and exchanges out (CiA 301, CiA 305).
+"""Decode the CANopen traffic on one CAN bus of a trace: its input is frames, its output texts and exchanges (CiA 301, CiA 305).
 
 Identifiers are those of the pre-defined connection set, except for PDOs, whose identifiers are learnt (see `node_map`).
 No clock.

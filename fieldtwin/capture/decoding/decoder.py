@@ -1,4 +1,4 @@
-"""The interface of decoding: events of a trace in, words and exchanges out, event by event or all at once.
+"""The interface of decoding: it converts the events of a trace to texts and exchanges, event by event or all at once.
 
     decoder = Decoder(system)
     for event in trace.events:

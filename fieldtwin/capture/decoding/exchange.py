@@ -139,7 +139,8 @@ class DecodedExchange:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """One event of a trace in words. `fields` are the parts (plain data); `exchanges` those that it completed."""
+    """The description of one event of a trace. `fields` are the fields of its frame as plain data, and `exchanges` the
+    exchanges that the event completed."""
 
     text: str
     fields: dict[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Decode one Modbus connection of a trace: chunks both ways in, words and exchanges out.
+"""Decode one Modbus connection of a trace: its input is the chunks of both directions, its output texts and exchanges.
 
 On a serial line one request is awaited at a time, and the next one ends it; on MBAP replies are matched by their
 transaction ID. A frame that answers no request is a stray. No clock: times come with the chunks.

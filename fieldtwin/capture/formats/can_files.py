@@ -1,9 +1,9 @@
 """Read CAN logs of other programs (Vector's .asc and .blf, PEAK's .trc) through python-can's readers, as frames with times.
 
-One of the files that use python-can, and it uses only its readers: no interface is opened. The readers trust a file:
-therefore lines and packed blocks are checked for their size before, frames afterwards, and any error becomes
-`FileInvalid`, whatever the readers raise. CAN FD and error frames are counted and omitted. These formats lose data:
-.trc has no error frames, .asc and .blf have the times of their writers.
+One of the files that use python-can, and it uses only its readers: no interface is opened. The readers do not check a file.
+Therefore this module checks the size of lines and packed blocks before they are read, and the frames afterwards, and translates
+every error of the readers into `FileInvalid`. CAN FD and error frames are counted and omitted. These formats lose data: .trc
+has no error frames, .asc and .blf have the times of their writers.
 """
 
 from __future__ import annotations

@@ -35,7 +35,8 @@ T68_IN_T90 = 1.00024
 """The factor from ITS-90 to IPTS-68 that oceanography uses (Saunders 1990, WOCE Newsletter 10)."""
 
 Progress = Callable[[int, int], None]
-"""Called with the bytes read and the total, both of the file on disk (compressed, if it is)."""
+"""A function that is called with the number of bytes read and the total number. Both count bytes of the file on disk, which may
+be compressed."""
 
 
 UNITS = {"pressure": "dbar", "temperature": "degC", "conductivity": "S/m"}

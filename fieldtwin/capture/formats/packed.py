@@ -1,7 +1,7 @@
 """Unpack gzip and bzip2 files, up to a limit: a few kilobytes of either can expand to gigabytes.
 
-Memory is not a concern, because unpacked data is read in pieces. Time is: without a limit, the packed file determines
-how long reading takes.
+The limit protects against long reading times, which the packed file would otherwise determine. It is not needed for memory,
+because unpacked data is read in pieces.
 """
 
 from __future__ import annotations

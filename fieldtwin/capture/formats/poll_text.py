@@ -1,8 +1,8 @@
 """Convert the output of modpoll and mbpoll into exchanges: the request that they report, and the values that they received.
 
-They print values and no bytes, so the reply is reconstructed from them: 16-bit registers and bits as they are, 32-bit
-values in the word order that they name (or, unnamed, modpoll's: low word first). They print no times; polls are spaced
-by their rate. A poll that failed with a named exception has that exception; any other failure has no reply. Pure text;
+They print values and no bytes, so the reply is reconstructed from them: 16-bit registers and bits as they are, 32-bit values in
+the word order that the output names, or in modpoll's order (low word first) if it names none. They print no times; polls are
+spaced by their rate. A poll that failed with a named exception has that exception; any other failure has no reply. Pure text;
 bounded by a line.
 """
 

@@ -65,7 +65,8 @@ class Segments:
         return self._give_up() if full else []
 
     def acknowledged(self, number: int) -> list[tuple[int, bytes]]:
-        """Note that the receiver has everything before `number`: the capture lost any gap there; it is not repeated."""
+        """Note that the receiver has all data before `number`. A gap before it is missing only in the capture, so it will not
+        be sent again."""
         found: list[tuple[int, bytes]] = []
         while self._waiting and 0 < (number - self.next) % _SEQUENCES < _SEQUENCES // 2:
             found += self._give_up()

@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.values import Scalar
 
 TRANSFERS = ("SDO upload", "SDO download")
 RARE = 5
-"""The smallest number of messages of a kind from which their rate is compared."""
+"""The rates of a kind of message are compared only if there are at least this many messages of it."""
 OFTEN = Tolerance(0.005, 0.5)
 """Permitted difference of the mean time between messages, in seconds."""
 

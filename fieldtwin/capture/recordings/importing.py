@@ -124,9 +124,8 @@ def import_capture(
 ) -> TextSummary:
     """Import a fieldtwin capture or tap as a recording.
 
-    It is of `fieldtwin run --capture`, of `record --tap`, or a command's log of sent frames. If it has several
-    endpoints, `url` selects one; `framing` (rtu, ascii, mbap) overrides the endpoint's. Raises `FileInvalid`,
-    `UsageError`.
+    Such a file comes from `fieldtwin run --capture` or `record --tap`, or is a command's log of sent frames. If it has several
+    endpoints, `url` selects one; `framing` (rtu, ascii, mbap) overrides the endpoint's. Raises `FileInvalid`, `UsageError`.
     """
     seen = [Endpoint.parse(url)] if url else endpoints_of(path)
     if len(seen) != 1:

@@ -27,7 +27,8 @@ class RuleOptions:
         default="20ms/50%",
         show_default=True,
         metavar="AMOUNT",
-        help="Tolerance of the median and 90th percentile of latencies: a time or a share, whichever is larger; `any`: no limit.",
+        help="Permitted difference of each function's median and 90th percentile latency: a time, a percentage of the recorded "
+        "latency, or both (the larger applies); `any`: latencies are not compared.",
     )
     least: float = option(
         "--least",

@@ -85,7 +85,7 @@ def command(
 
         put_in = load_faults(Path(faults), lambda spec: target(loaded, spec))
 
-    def tell(env: dict[str, str]) -> None:
+    def on_start(env: dict[str, str]) -> None:
         if quiet:
             return
         stderr.print(f"[bold]field simulator[/bold] of {escape(loaded.name)}")
@@ -95,9 +95,9 @@ def command(
                 continue
             stderr.print(f"  {name}={escape(value)}", soft_wrap=True)
 
-    def tell_struck(struck: list[StruckStatus]) -> None:
+    def on_end(struck: list[StruckStatus]) -> None:
         if not quiet:
             for one in struck:
                 stderr.print(f"fault {struck_of(one).text}", soft_wrap=True, markup=False, highlight=False)
 
-    return run(run_with(config, words, instance=instance, faults=put_in, tell=tell, tell_struck=tell_struck))
+    return run(run_with(config, words, instance=instance, faults=put_in, on_start=on_start, on_end=on_end))

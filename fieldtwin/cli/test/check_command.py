@@ -289,7 +289,7 @@ def _judged(
     with ExitStack() as stack:
         log = stack.enter_context(ClientLog(files.log_path, endpoint, words)) if files.log_path else None
         progress = stack.enter_context(CheckProgress(sum(case.chosen(plan.only) for case in cases)))
-        listener = Listener(progress.say, progress.tell, *([log.on_event] if log is not None else []))
+        listener = Listener(progress.print_line, progress.add_result, *([log.on_event] if log is not None else []))
         found = run(judge(listener))
     results = [waive(result, waivers, started.date()) for result in found]
     about = {

@@ -124,7 +124,7 @@ class DeviceCheck:
         return INTERRUPTED if self.interrupted else code
 
     def play(self, most: int, check: Callable[..., Any]) -> Checked:
-        """Run ``check(taps, go_on, say, tell)`` with a progress bar, and with a log if requested.
+        """Run ``check(taps, go_on, print_line, on_result)`` with a progress bar, and with a log if requested.
 
         Ctrl-C ends it after the present test case, a second one at once; changed values are restored in any case.
         """
@@ -145,7 +145,7 @@ class DeviceCheck:
 
             async def main() -> Checked:
                 taps = (log,) if log is not None else ()
-                task = asyncio.ensure_future(check(taps, go_on, progress.say, progress.tell))
+                task = asyncio.ensure_future(check(taps, go_on, progress.print_line, progress.add_result))
 
                 def stop() -> None:
                     if self.interrupted:
@@ -174,18 +174,18 @@ class DeviceCheck:
             plan.at_most.value, wrote, timeout_s,
         )  # fmt: skip
 
-    def estimate(self, on_paper: Checked) -> None:
-        """Return the number of cases and their duration with a device that answers at once."""
+    def estimate(self, dry_run_result: Checked) -> None:
+        """Print the number of cases, and the time that they take if the device answers at once."""
         from fieldtwin.console import stderr
 
-        played = sum(bool(result.spoken) for result in on_paper.results)
+        played = sum(bool(result.spoken) for result in dry_run_result.results)
         stderr.print(
-            f"{played} cases, about {max(1, round(on_paper.took_s))} s if the device answers at once; Ctrl-C stops",
+            f"{played} cases, about {max(1, round(dry_run_result.took_s))} s if the device answers at once; Ctrl-C stops",
             markup=False,
         )
 
-    def on_paper(self, checked: Checked) -> int:
-        """Print the frames of a dry run, which sends nothing."""
+    def print_dry_run(self, checked: Checked) -> int:
+        """Print the frames that a dry run would have sent, and return the exit code."""
         from fieldtwin.cli.test.check_view import print_dry_run
 
         print_dry_run(checked, as_json=self.files.as_json)

@@ -88,15 +88,15 @@ def modbus(
         endpoint, unit, plan, timeout_s, 1 / care.rate, echo, share_bus=share_bus,
         given={table: at for table, at, _ in map(_cell, reads)}, may_write=may_write,
     )  # fmt: skip
-    on_paper = modbus_dry_run(to_do)
+    dry_run_result = modbus_dry_run(to_do)
     if care.dry_run:
-        return check.on_paper(on_paper)
+        return check.print_dry_run(dry_run_result)
     check.ask(CASES, plan, traits)
-    check.estimate(on_paper)
+    check.estimate(dry_run_result)
     began = datetime.now(UTC)
     checked = check.play(
         len([c for c in CASES if c.chosen(plan.only)]),
-        lambda taps, go_on, say, tell: check_modbus(replace(to_do, taps=taps, go_on=go_on), say, tell),
+        lambda taps, go_on, print_line, on_result: check_modbus(replace(to_do, taps=taps, go_on=go_on), print_line, on_result),
     )  # fmt: skip
     return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
 
@@ -180,15 +180,15 @@ def canopen(
     to_do = CanopenOptions(
         endpoint, node, plan, bitrate or 0, timeout_s, 1 / care.rate, boot_s, eds, share_bus, may_write
     )
-    on_paper = canopen_dry_run(to_do)
+    dry_run_result = canopen_dry_run(to_do)
     if care.dry_run:
-        return check.on_paper(on_paper)
+        return check.print_dry_run(dry_run_result)
     check.ask(CASES, plan, frozenset({"can"}))
-    check.estimate(on_paper)
+    check.estimate(dry_run_result)
     began = datetime.now(UTC)
     checked = check.play(
         len([c for c in CASES if c.chosen(plan.only)]),
-        lambda taps, go_on, say, tell: check_canopen(replace(to_do, taps=taps, go_on=go_on), say, tell),
+        lambda taps, go_on, print_line, on_result: check_canopen(replace(to_do, taps=taps, go_on=go_on), print_line, on_result),
     )  # fmt: skip
     return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 IMPACTS = ("observe", "read", "write", "disrupt")
 """The values of `Impact`, in rising order."""
 FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
-"""The arguments of --fail-on, each with the number of bases, counted in the order of `Basis`, that then decide the exit code."""
+"""The values of --fail-on. Each maps to a number n: failures of the first n members of `Basis` decide the exit code."""
 _FILE = click.Path(dir_okay=False, path_type=Path)
 _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
@@ -79,7 +79,7 @@ class CaseOptions:
 
     @property
     def bases(self) -> frozenset[Basis]:
-        """The bases whose failed cases decide the exit code."""
+        """Return the bases whose failed cases decide the exit code."""
         from fieldtwin.conformance.core.case import Basis
 
         return frozenset(list(Basis)[: FAIL_ON[self.fail_on]])

@@ -59,11 +59,11 @@ class CheckProgress:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._bar.stop()
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Print a diagnostic line."""
         stderr.print(text, markup=False, soft_wrap=True)
 
-    def tell(self, result: CaseResult) -> None:
+    def add_result(self, result: CaseResult) -> None:
         """Report a finished case."""
         self._bar.update(self._task, advance=1, description=f"{result.case.id} {result.verdict.value}")
         if result.verdict.bad:

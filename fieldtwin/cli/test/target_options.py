@@ -14,7 +14,7 @@ from fieldtwin.conformance.core.case import Impact
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """Where scenarios run, with the options of each kind of target."""
+    """The target on which scenarios run, with the options of each kind of target."""
 
     target: str = option(
         "--target",

@@ -129,7 +129,7 @@ def why_nothing(seen: dict[str, Any], place: str) -> str:
     return why.removeprefix(f"{place}: ")
 
 
-def told_of(variables: dict[str, Any], undeclared: int) -> str:
+def variables_text(variables: dict[str, Any], undeclared: int) -> str:
     """Return how many of the model's variables were received, and how many of them can be trusted."""
     heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
     good = sum(variable["quality"] == "good" for variable in heard)
@@ -150,7 +150,7 @@ def print_shadow(seen: dict[str, Any]) -> None:
     states = f"{seen['statuses']}, {seen['agreed']} of them agree with the model"
     lines = [
         *([("model", f"{seen['state']}, period {seen['period_s']} s")] if compared else []),
-        ("variables", told_of(seen["variables"], seen["undeclared"])),
+        ("variables", variables_text(seen["variables"], seen["undeclared"])),
         ("from", f"{', '.join(seen['origins'])}, {kind}"),
         ("statuses", states) if compared else ("states", "not compared: no device of this system reports one"),
         (

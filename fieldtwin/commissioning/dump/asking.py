@@ -1,7 +1,7 @@
-"""Send one question to a device and classify the result, with the patience that a sweep needs.
+"""Send one question to a device and classify the result. Questions are repeated as often as a sweep needs.
 
-A busy reply is not a refusal, and silence may be caused by noise. This module must never send a request that changes
-the device.
+A busy reply is not a refusal, and noise may be the cause of silence. This module must never send a request that changes the
+device.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class DeviceReader(Protocol):
 
 
 class ModbusAsker:
-    """A unit behind `client`.
+    """A reader that sends its questions to one unit through `client`.
 
     A question without a good reply is repeated up to `retries` times; after each exchange the line is left free for
     `spacing_s` seconds.
@@ -146,7 +146,7 @@ def _without_result(error: WireError) -> Silent | Invalid:
 
 
 class CanopenAsker:
-    """A node behind `master`. A pause of `spacing_s` after each transfer leaves the bus free for others."""
+    """A reader that asks one node through `master`. A pause of `spacing_s` after each transfer leaves the bus free for others."""
 
     def __init__(
         self, master: CanopenMaster, node: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0

@@ -1,8 +1,8 @@
 """Continue a sweep where asking address by address is too expensive: in silent areas, and with other read lengths.
 
-Every question in a silent area costs a timeout, so the addresses are sampled, the roundest first, until the time budget
-is used up. Among refusals a device may hold values that can only be read whole, so reads of two and more registers are
-tried there. Pure, as `sweep` is.
+Every question in a silent area costs a timeout, so only some addresses are tried, round numbers first, until the time budget is
+used up. Registers that are refused one by one may hold values that can only be read whole, so reads of two and more registers
+are tried there. Pure, as `sweep` is.
 """
 
 from __future__ import annotations

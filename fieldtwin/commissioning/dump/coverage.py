@@ -171,7 +171,7 @@ def joined(spans: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def coarse_to_fine(start: int, end: int, finest: int, levels: Sequence[Sequence[int]]) -> Iterator[int]:
-    """Yield each multiple of `finest` or of a number in `levels` from `start` to before `end`, the roundest first."""
+    """Yield each multiple of `finest` or of a number in `levels` from `start` to before `end`, round numbers first."""
     seen: set[int] = set()
     yield start
     seen.add(start)

@@ -326,8 +326,8 @@ def key_of(asked: RegisterRange | ObjectKey) -> str:
 class DumpWriter:
     """A writer that appends lines to `path`; each is handed to the operating system when the call returns.
 
-    `resume`: continue after the last complete line. Raises `FileInvalid` when the file cannot be written; at most
-    `max_bytes` are.
+    `resume`: continue after the last complete line. It writes at most `max_bytes` bytes. Raises `FileInvalid` when the file
+    cannot be written.
     """
 
     def __init__(self, path: Path, *, resume_at: int | None = None, max_bytes: int = 4 << 30) -> None:

@@ -72,8 +72,8 @@ class _Patience:
 class ObjectSweep(_Patience):
     """A sweep over every index of `ranges` (both ends included): subindex 0 first, then the others of existing objects.
 
-    After `MOST_SILENT` consecutive questions without a reply the other indices are sampled, the roundest first. Where
-    the node answers again, the sweep continues from there.
+    After `MOST_SILENT` consecutive questions without a reply, only some of the other indices are tried, round numbers first.
+    Where the node answers again, the sweep continues from there.
     """
 
     def __init__(self, ranges: Sequence[tuple[int, int]] = EVERYTHING, budget_us: int | None = None) -> None:

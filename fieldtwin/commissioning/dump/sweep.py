@@ -3,10 +3,10 @@
 Pure: a sweep is a generator that yields questions and receives their outcomes. The same answers always lead to the same
 questions. This is how an interrupted dump continues: recorded answers are replayed, and no question is sent twice.
 
-A read that is refused contains a hole or is too long, and the exception code does not show which (devices disagree).
-Therefore a single register decides; after a readable prefix the next register decides again, and a short read across
-the border. In an area that cannot be read only some addresses are tried (`Sweep.stride`). Where the device is silent
-`asking` stops early, because each question costs a timeout; `beyond` continues from there within a time budget.
+A read that is refused contains a hole or is too long, and the exception code does not show which (devices disagree). Therefore
+a single register is read next. If it is readable, the sweep reads on from there to the next refusal, and a short read across
+that border shows its cause. In an area that cannot be read only some addresses are tried (`Sweep.stride`). Where the device is
+silent `asking` stops early, because each question costs a timeout; `beyond` continues from there within a time budget.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from fieldtwin.gateway.protocols.modbus.requests.data import MAX_READ_BITS, MAX_
 
 ILLEGAL_FUNCTION = 0x01
 DENSE = 8
-"""Number of addresses after a readable one that are all tried before a sweep strides."""
+"""Number of addresses after a readable one that a sweep tries one by one, before it begins to skip addresses."""
 ROUND = 50
-"""A sweep that strides also tries multiples of this, because blocks of registers often begin at round numbers."""
+"""A sweep that skips addresses also tries multiples of this number, because blocks of registers often begin at round numbers."""
 MOST_SILENT = 10
 """Number of consecutive reads without a reply after which a sweep stops trying single addresses."""
 TRUSTED_SILENCE = 2
-"""Number of repeated questions without a reply after which silence counts as a refusal; probes are no longer repeated."""
+"""After this many repeated questions without a reply, silence counts as a refusal, and probes are no longer repeated."""
 MOST_PAIR_TRIALS = 4
 
 
@@ -119,9 +119,9 @@ class TableMap:
 class Sweep:
     """An exploration of `span`. `most` is the longest read to try (None: the standard's). `stride` 1 reads every address.
 
-    `found` and `coverage` are filled while `asking` runs. `patient` is whether the last yielded question deserves retries.
-    `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the pause after
-    each.
+    `found` and `coverage` are filled while `asking` runs. `patient` is true if the last yielded question is to be repeated when
+    no reply arrives. `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the
+    pause after each.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 ENOUGH_SIGNS = 6
-"""Number of plausible values, out of those that could have been implausible, that make a map likely."""
+"""If at least this many values are plausible, of those that could also have been implausible, the profile is likely to fit."""
 TELLING_BYTES = 4
 """A server ID shorter than this many bytes is shared by many devices, so it identifies none."""
 _SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")

@@ -17,10 +17,11 @@ Curve = tuple[tuple[float, float], ...]
 """Points ``(log odds of the model, observed share)``, both rising."""
 
 UPPER_HALF = "may be its upper half"
-"""Part of the reason why a reading is capped that has a neighbour with which it could be one longer number."""
+"""A part of the text that says why the certainty of a reading is limited: the register and its neighbour could be one longer
+number."""
 
 OTHER_HALF = "it may be the upper half of"
-"""Part of the reason why the reading of a register that never changed is capped, if its neighbour did change."""
+"""A part of the text that says why the certainty of a reading is limited: the register never changed, but its neighbour did."""
 
 CURVES: dict[str, Curve] = {
     "single": ((2.31, 0.9359), (8.97, 0.9904)),
@@ -96,8 +97,8 @@ def calibrated(probability: float, kind: str) -> float:
 def fitted(samples: Sequence[tuple[float, bool]], bins: int = 16) -> Curve:
     """Return a curve for ``(probability of the model, right)``.
 
-    Bins have equally many samples; neighbours that would fall are merged. The curve lies one standard error below the
-    observation, so that it claims too little rather than too much.
+    Bins have equally many samples; adjacent bins are merged where the curve would decrease. The curve lies one standard error
+    below the observation, so that it claims too little rather than too much.
     """
     ordered = sorted((log_odds(p), right) for p, right in samples)
     size = max(25, -(-len(ordered) // bins))

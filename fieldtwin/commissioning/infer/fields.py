@@ -123,7 +123,7 @@ class Run:
 
 
 def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
-    """Return all readings of a run with their costs. This is the expensive part: some milliseconds a register."""
+    """Return all readings of a run with their costs. This is the slow part: it takes a few milliseconds per register."""
     return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
 
 

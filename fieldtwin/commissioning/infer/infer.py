@@ -98,7 +98,7 @@ def without_repetitions(series: Series) -> Series:
 
 
 def infer(series: Series) -> Inference:
-    """Infer the meaning of the registers. Pure; takes some milliseconds a register."""
+    """Infer the meaning of the registers. Pure; takes a few milliseconds per register."""
     seen = without_repetitions(series)
     tables = [(table, seen.cells.get(table, {})) for table in REGISTER_TABLES]
     clocks, runs = [], []

@@ -105,7 +105,8 @@ def _likeness(reading: Interpretation, numbers: Sequence[float], *, whole: bool)
 
 
 def with_scales(readings: Sequence[Interpretation]) -> list[Interpretation]:
-    """Give integers that equal a float of the same device times a power of ten in every pass that scale."""
+    """Set the scale of integers: if an integer equals, in every pass, a float of the same device times a power of ten, that
+    power is its scale."""
     floats = [r for r in readings if r.type.startswith("float") and r.moves and r.probability >= 0.8]
     return [_scaled(r, floats) if "int" in r.type and r.moves else r for r in readings]
 

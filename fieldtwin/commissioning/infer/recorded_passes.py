@@ -20,7 +20,8 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 MOST_PASSES = 2_000
 """Maximum number of passes of a long recording, spread evenly over it."""
 FEWEST_REPLIES = 3
-"""A request with fewer answers is omitted if another one has this many: it would shorten every column."""
+"""A request with fewer answers is omitted if a different request has at least this many. It would reduce the number of passes,
+because each pass needs a value of every register."""
 
 
 def dump_of_recording(

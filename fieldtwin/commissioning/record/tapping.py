@@ -26,8 +26,8 @@ Say = Callable[[str], None]
 class LineTap:
     """A relay between `near` and `far` that reports to `sink`. `say` is called with messages for the user.
 
-    A TCP client that leaves is not an error, nor is a device that cannot be reached for it: the next client may
-    connect.
+    A TCP client that disconnects is not an error. A device that cannot be reached for a client is not an error either: the next
+    client may connect.
     """
 
     def __init__(

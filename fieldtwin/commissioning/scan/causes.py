@@ -342,7 +342,7 @@ def _of_probe(probe: ScanProbe, e: SerialEvidence) -> list[LikelyCause]:
 
 
 def can_causes(facts: CanFacts, heard: ObservedBus, load: float) -> list[LikelyCause]:
-    """Return the causes of a silent CAN bus, of errors, and of a full bus."""
+    """Return the causes of a silent CAN bus, of errors, and of a bus load that is too high."""
     found: list[LikelyCause] = []
     errors = facts.tx_errors + facts.rx_errors
     if facts.state == "bus-off":

@@ -64,7 +64,7 @@ def dwell_over(heard: Heard, elapsed_s: float) -> bool:
     return elapsed_s >= wanted_s and not (heard.frames > 0 and not heard.sure)
 
 
-def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
+def line_verdict(auditions: Iterable[Audition]) -> LineVerdict | None:
     """Return the setting at which most bytes form frames; None if they form frames at no setting."""
     good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
     if not good:

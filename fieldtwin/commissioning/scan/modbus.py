@@ -13,7 +13,14 @@ from functools import partial
 from fieldtwin.commissioning.access.connection import bytes_at
 from fieldtwin.commissioning.access.progress import PhaseProgress
 from fieldtwin.commissioning.scan import settings as plan
-from fieldtwin.commissioning.scan.listening import Audition, LineVerdict, dwell_over, judge, siblings, worth_hearing
+from fieldtwin.commissioning.scan.listening import (
+    Audition,
+    LineVerdict,
+    dwell_over,
+    line_verdict,
+    siblings,
+    worth_hearing,
+)
 from fieldtwin.commissioning.scan.odd_replies import OddReply, gathered
 from fieldtwin.commissioning.scan.settings import Pace, ScanStep
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, SharedUnitIds, detect_shared_unit_ids, spread_over
@@ -220,7 +227,7 @@ class ModbusScanner:
             return not (options.listen_only or self._stop())
         waiting = worth_hearing(first, likely)[1:]
         while waiting and not self._stop():
-            verdict = judge(result.auditions)
+            verdict = line_verdict(result.auditions)
             if verdict is not None and verdict.sure:
                 break
             best = max(result.auditions, key=lambda a: (a.heard.sure, a.heard.share))
@@ -230,11 +237,11 @@ class ModbusScanner:
                     break
                 waiting = kin
             result.auditions.append(await self._audition(waiting.pop(0), 0.0))
-        found = judge(result.auditions)
+        found = line_verdict(result.auditions)
         if found is not None and found.settings != first and not self._stop():  # listen for longer, to hear other units
             longer = await self._audition(found.settings, options.listen_s, whole=True)
             result.auditions = [longer if a.settings == longer.settings else a for a in result.auditions]
-        result.verdict = judge(result.auditions)
+        result.verdict = line_verdict(result.auditions)
         if result.verdict is not None:
             result.heard = result.verdict.heard
         if options.listen_only or self._stop():
@@ -296,7 +303,7 @@ class ModbusScanner:
         found = len(self.result.units) + len(sweep.found)
         self._tell(PhaseProgress(phase, done_s + part * step.seconds, total_s, f"{where}unit {sweep.asking}", found))
 
-    async def _step(self, step: ScanStep, tell: Callable[[ScanStep, UnitSweep], None]) -> None:
+    async def _step(self, step: ScanStep, on_question: Callable[[ScanStep, UnitSweep], None]) -> None:
         settings = step.settings
         endpoint = plan.with_settings(self._endpoint, settings) if settings else self._endpoint
         shared = self.result.heard is not None and self.result.heard.bytes > 0
@@ -309,7 +316,7 @@ class ModbusScanner:
             quiet_ns=SHARED_QUIET_NS if shared else 0,
         )
         try:
-            await self._drive(sweep, endpoint, lambda: tell(step, sweep))
+            await self._drive(sweep, endpoint, lambda: on_question(step, sweep))
             lost = await self._confirm(sweep, endpoint) if sweep.found and not self._ended else set()
         finally:
             self._keep(sweep, settings)
@@ -320,14 +327,14 @@ class ModbusScanner:
             for f in self.result.units
         ]
 
-    async def _drive(self, sweep: UnitSweep, endpoint: Endpoint, tell: Callable[[], None]) -> None:
+    async def _drive(self, sweep: UnitSweep, endpoint: Endpoint, on_question: Callable[[], None]) -> None:
         """Run the sweep until all units were asked, reopening the connection whenever the server closes it."""
         breaks, last_asked = 0, -1
         while True:
             url = str(endpoint)
             async with bytes_at(url, taps=self._taps, connector=self._connector, clock=self._clock) as connection:
                 try:
-                    await self._ask(sweep, connection, tell)
+                    await self._ask(sweep, connection, on_question)
                     return
                 except ConnectionLost:
                     breaks = breaks + 1 if sweep.asked == last_asked + 1 else 1
@@ -339,11 +346,11 @@ class ModbusScanner:
                         unit, breaks = sweep.skip(), 0
                         self.result.notes.append(f"the server closes the connection whenever unit {unit} is asked")
 
-    async def _ask(self, sweep: UnitSweep, connection: ByteConnection, tell: Callable[[], None]) -> None:
+    async def _ask(self, sweep: UnitSweep, connection: ByteConnection, on_question: Callable[[], None]) -> None:
         clock = self._clock
         while not self._ended and (step := sweep.poll(clock.monotonic_ns())) is not None:
             if isinstance(step, SendRequest):
-                tell()
+                on_question()
                 await connection.write(step.data)
                 sweep.handed_over(clock.monotonic_ns())
                 continue

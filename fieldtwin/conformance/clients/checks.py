@@ -38,7 +38,7 @@ Rule = Callable[[Observation], Finding | None]
 def all_of(*rules: Rule) -> CheckFunction:
     """Return the first finding that is not a pass, else the first pass with a reason."""
 
-    def judge(seen: Observation) -> Finding:
+    def check(seen: Observation) -> Finding:
         good: Finding | None = None
         for rule in rules:
             found = rule(seen)
@@ -47,7 +47,7 @@ def all_of(*rules: Rule) -> CheckFunction:
             good = good or found
         return good or passed()
 
-    return judge
+    return check
 
 
 # -- every client -----------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def goes_on(seen: Observation) -> Finding | None:
 def asks_cleanly(seen: Observation) -> Finding | None:
     """Check that the client sends only valid requests."""
     for bad in seen.of(Garbled, seen.begun_ns):
-        return failed(f"sent {len(bad.data)} bytes that are no request: {bad.data[:16].hex(' ')}")
+        return failed(f"sent {len(bad.data)} bytes that do not form a request: {bad.data[:16].hex(' ')}")
     return None
 
 

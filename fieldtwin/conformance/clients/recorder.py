@@ -21,13 +21,13 @@ class Recorder:
     def __init__(self) -> None:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self.total = 0
-        self.tell: Callable[[Event], None] = lambda event: None
+        self.on_event: Callable[[Event], None] = lambda event: None
         """Called with each event."""
 
     def add(self, event: Event) -> None:
         self._events.append(event)
         self.total += 1
-        self.tell(event)
+        self.on_event(event)
 
     @property
     def dropped(self) -> int:

@@ -107,7 +107,7 @@ class ClientRun(Generic[C]):
     """One conformance test of a client.
 
     `traits` are the features of the endpoint, for `framings` of cases; `silent` is a case that leaves a request
-    unanswered, which measures the client's timeout. `tell` is called with each result.
+    unanswered, which measures the client's timeout. `on_result` is called with each result.
     """
 
     stage: HostileDevice[C]
@@ -116,7 +116,7 @@ class ClientRun(Generic[C]):
     plan: ClientPlan
     traits: frozenset[str]
     probe: Probe | None = None
-    tell: Callable[[CaseResult], None] = lambda result: None
+    on_result: Callable[[CaseResult], None] = lambda result: None
     restart: Callable[[], Awaitable[None]] | None = None
     """Restarts the program under test, so that lasting damage by one case does not affect the next."""
     results: list[CaseResult] = field(default_factory=list)
@@ -297,7 +297,7 @@ class ClientRun(Generic[C]):
             events, stage.first_ns, over_ns, until_ns, self.habit, before, after, last,
             self.probe is not None, self.plan.timeout_s, self.plan.patience_s,
         )  # fmt: skip
-        return case.about.judge(seen), events
+        return case.about.check(seen), events
 
     def _watched(self, case: C) -> None:
         now_ns = self.stage.now_ns()
@@ -306,14 +306,14 @@ class ClientRun(Generic[C]):
             self._done(case, skipped(reason), now_ns)
             return
         events = self.stage.recorder.since(0)
-        self._done(case, case.about.judge(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
+        self._done(case, case.about.check(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
 
     def _done(self, case: C, finding: Finding, since_ns: int, wire: tuple[Line, ...] = ()) -> None:
         result = CaseResult(
             case.about.on_wire(self.traits), finding, (self.stage.now_ns() - since_ns) / NS_PER_S, wire=wire
         )
         self.results.append(result)
-        self.tell(result)
+        self.on_result(result)
 
     # -- small things ---------------------------------------------------------------------------------------------
 

@@ -58,10 +58,10 @@ class Options:
 
 @dataclass(frozen=True)
 class Listener:
-    """The callbacks of a test: `say` receives a line of console output, `tell` each result, `log` each event."""
+    """The callbacks of a test: `print_line` receives a line of console output, `on_result` each result, `log` each event."""
 
-    say: Callable[[str], None]
-    tell: Callable[[CaseResult], None]
+    print_line: Callable[[str], None]
+    on_result: Callable[[CaseResult], None]
     log: Callable[[Event], None] = lambda event: None
 
 
@@ -83,7 +83,7 @@ async def check_modbus_client(options: Options, listener: Listener) -> list[Case
         theirs = await _open(options.listen, stage, nursery, closing, "ascii" if in_ascii else "rtu")
         here = traits(scheme) | (PtyLine.traits() if options.listen.scheme == "pty" else frozenset())
         probe, on_text = _probe(options, nursery)
-        run = ClientRun(stage, CASES, SILENT, options.plan, here, probe, listener.tell)
+        run = ClientRun(stage, CASES, SILENT, options.plan, here, probe, listener.on_result)
         return await _judged(run, options, theirs, on_text, listener)
 
 
@@ -108,7 +108,7 @@ async def check_canopen_master(options: Options, listener: Listener) -> list[Cas
         nursery.start(stage.serve(connection), "nodes")
         probe, on_text = _probe(options, nursery)
         here = CAN_TRAITS | ({"heartbeat"} if options.heartbeat_s else set())
-        run = ClientRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, here, probe, listener.tell)
+        run = ClientRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, here, probe, listener.on_result)
         return await _judged(run, options, bus.bound, on_text, listener)
 
 
@@ -119,8 +119,8 @@ async def _judged(
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-    run.stage.recorder.tell = listener.log
-    listener.say(f"listening on {options.listen}; the client or master connects to {theirs}")
+    run.stage.recorder.on_event = listener.log
+    listener.print_line(f"listening on {options.listen}; the client or master connects to {theirs}")
     if not options.command:
         return await run.run()
     program = ProgramUnderTest(options.command, theirs, on_text, run.ended)
@@ -130,9 +130,9 @@ async def _judged(
             return await run.run()
     finally:
         if run.exit_code is not None:
-            listener.say(f"the program ended early, exit code {run.exit_code}; its last output:")
+            listener.print_line(f"the program ended early, exit code {run.exit_code}; its last output:")
             for line in program.said:
-                listener.say(f"  {line}")
+                listener.print_line(f"  {line}")
 
 
 async def _open(

@@ -175,4 +175,4 @@ class CasePlan:
 class ClientCase(About):
     """A case for masters, with its check."""
 
-    judge: CheckFunction
+    check: CheckFunction

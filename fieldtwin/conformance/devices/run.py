@@ -91,7 +91,7 @@ async def play(
     plan: CasePlan,
     transcript: Transcript,
     clock: Clock,
-    tell: Callable[[DeviceResult], None] = lambda result: None,
+    on_result: Callable[[DeviceResult], None] = lambda result: None,
     go_on: Callable[[], str] = lambda: "",
 ) -> list[DeviceResult]:
     """Return the results of the chosen cases, in order. Before each, `go_on` returns a reason to stop, or an empty string."""
@@ -113,7 +113,7 @@ async def play(
             lost = 0 if well else lost + 1
         took_s = (clock.monotonic_ns() - began_ns) / NS_PER_S
         results.append(DeviceResult(case.on_wire(wire.traits), finding, took_s, spoken=transcript.spoken))
-        tell(results[-1])
+        on_result(results[-1])
     return results
 
 

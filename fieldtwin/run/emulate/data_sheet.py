@@ -95,13 +95,13 @@ def print_remarks(name: str, found: Iterable[Remark]) -> None:
 def report_second_node(node: CanopenNode) -> None:
     """Print a message when another node on the bus has the node ID of `node`."""
 
-    def tell(can_id: int) -> None:
+    def report(can_id: int) -> None:
         stderr.print(
             f"{_named(node)}: another node on the bus has this node ID: it sent {can_id:03X}h (--node gives another one)",
             soft_wrap=True,
         )
 
-    node.on_second_node(tell)
+    node.on_second_node(report)
 
 
 def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeOptions) -> CanopenNode:

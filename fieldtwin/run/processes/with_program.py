@@ -40,11 +40,12 @@ OURS = ("RUN", "PROFILES", "TOKEN", "TRACEBACK", "JSON", "SYSTEM", "CONTROL", "F
 only the longer variables.
 """
 
-Tell = Callable[[dict[str, str]], None]
+OnStart = Callable[[dict[str, str]], None]
 
 
 def environment(contact: FieldContact, system: System, control: Path) -> dict[str, str]:
-    """Return the environment variables that tell the program where the field is (docs/reference/with.md has the table)."""
+    """Return the environment variables that give a program the endpoints of the simulated field devices. docs/reference/with.md
+    has the table."""
     env = _of_system(system, control)
     for name, bus in system.buses.items():
         endpoint = contact.mapping.get(bus.endpoint)
@@ -105,13 +106,13 @@ async def run_with(
     *,
     instance: str = "",
     faults: Sequence[dict[str, Any]] = (),
-    tell: Tell,
-    tell_struck: Callable[[list[StruckStatus]], None] = lambda struck: None,
+    on_start: OnStart,
+    on_end: Callable[[list[StruckStatus]], None] = lambda struck: None,
 ) -> int:
     """Start the field simulator of `config`, run `argv`, and stop both. Return the exit status of `argv`.
 
-    The status is 128 and the signal's number if a signal ended it. The `run_dir` of `config` is chosen here. `tell` is
-    called with the environment before `argv` starts, `tell_struck` after its end with how often each fault took effect.
+    The status is 128 and the signal's number if a signal ended it. The `run_dir` of `config` is chosen here. `on_start` is
+    called with the environment before `argv` starts, `on_end` after its end with how often each fault took effect.
 
     Raises `UsageError` for a missing program, before anything starts; `ChildFailed` when the field simulator ended
     during the run and the program exited with success.
@@ -131,8 +132,8 @@ async def run_with(
                 twin,
                 [program, *argv[1:]],
                 faults,
-                tell,
-                tell_struck,
+                on_start,
+                on_end,
             )
         finally:
             if not instance:  # the folder is removed, because no other process knows its name
@@ -145,8 +146,8 @@ async def _inside(
     twin: DigitalTwinPrototype,
     argv: list[str],
     faults: Sequence[dict[str, Any]],
-    tell: Tell,
-    tell_struck: Callable[[list[StruckStatus]], None],
+    on_start: OnStart,
+    on_end: Callable[[list[StruckStatus]], None],
 ) -> int:
     system = twin.ecs.system
     resolved = write_resolved(home.path("prototype.pickle"), system, twin.prototype)
@@ -161,10 +162,10 @@ async def _inside(
             start_ns = WallClock().monotonic_ns()
             for fault in faults:
                 await contact.client.call("fault", fault=fault, start_ns=start_ns)
-            tell(env)
+            on_start(env)
             status = await _run_program(argv, env)
             if faults and child.failure() is None:
-                tell_struck((await contact.client.ask("get", FieldStatus)).struck)
+                on_end((await contact.client.ask("get", FieldStatus)).struck)
         finally:
             await contact.aclose()
         failed = child.failure()

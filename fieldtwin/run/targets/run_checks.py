@@ -52,7 +52,7 @@ class RunChecker:
         """Check often enough that no journal overflows; until cancelled."""
         while True:
             for name, check in self._checks.items():
-                check.judge(self._benches[name])
+                check.check(self._benches[name])
             first = next(iter(self._benches.values()))
             await first.sleep_until_s(first.now_s() + PIECE_S)
 

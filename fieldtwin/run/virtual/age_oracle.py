@@ -66,7 +66,7 @@ class AgeOracle:
         """Record that DEVICE.TAG is still good at `now_ns`; checked like `published`, but not counted as a published value."""
         self._still_good.append((now_ns, tag, raw, value, source_ns))
 
-    def judge(self, emulated: frozenset[str]) -> None:
+    def check(self, emulated: frozenset[str]) -> None:
         """Compare the waiting values with the device's history. Skip tags of devices that are not `emulated`."""
         judged: dict[str, bool] = {}
         for now_ns, tag, raw, value, source_ns in self._waiting:

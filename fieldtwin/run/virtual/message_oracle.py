@@ -27,7 +27,7 @@ class MessageOracle:
         self._arrived = Consumer(emitter.event, MOST_KEPT)
         emitter.subscribe(self._arrived)
 
-    def judge(self, sent: list[bytes]) -> None:
+    def check(self, sent: list[bytes]) -> None:
         """Compare the messages that arrived with those that were `sent`, both in order of time."""
         arrived = [] if self._arrived is None else [item.data for item in self._arrived.queue]
         left = iter(sent)

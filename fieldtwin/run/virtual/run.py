@@ -193,7 +193,7 @@ class VirtualRun:
 
     def _judge(self, running: VirtualSystems) -> None:
         for name, check in self.checks.items():
-            check.judge(running.systems[name])
+            check.check(running.systems[name])
 
     async def _through(self, bench: Bench, loop: VirtualLoop, judge: Callable[[], None]) -> None:
         """Advance to the end of the run's time, piece by piece."""

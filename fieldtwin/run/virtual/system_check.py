@@ -111,7 +111,7 @@ class SystemCheck:
         for program, state in bench.states().items():
             self.states.note(program, state, bench.loop.now_ns)
 
-    def judge(self, bench: VirtualBench) -> None:
+    def check(self, bench: VirtualBench) -> None:
         """Check the values published since the last call. Call it often enough that no journal overflows."""
         self.elapsed_s = bench.now_s()
         self._judge(bench.run.field)
@@ -123,7 +123,7 @@ class SystemCheck:
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
         if self.topside is not None:
-            self.messages.judge([encode_period(period).data for period in self.topside.commands_sent])
+            self.messages.check([encode_period(period).data for period in self.topside.commands_sent])
         self._take_status(bench, outputs)
 
     async def settle(self, bench: VirtualBench) -> None:
@@ -209,7 +209,7 @@ class SystemCheck:
             for held in device.journal.since(self._numbers.get(name, 0)):
                 self.oracle.held(f"{name}.{held.tag}", held.raw, held.t_ns)
                 self._numbers[name] = held.number
-        self.oracle.judge(self._emulated)
+        self.oracle.check(self._emulated)
 
     def _take_status(self, bench: VirtualBench, outputs: list[OutputStatus]) -> None:
         now_ns = bench.loop.now_ns

@@ -79,7 +79,7 @@ class TraceFrames(FrameLog):
         if event.kind is not TraceKind.FRAME or event.where not in self._system.buses:
             return None
         if self._times and event.t_ns < self._times[-1]:
-            raise ValueError("the time goes back")
+            raise ValueError("the time is earlier than that of the frame before")
         self._item(event)  # a frame that cannot be read is not listed
         return event
 

@@ -178,7 +178,7 @@ class TraceLog:
         if not 0 <= t_ns <= LONGEST_NS:
             raise ValueError(f"the time {t_ns} ns is not within a run")
         if t_ns < self.last_ns - LATE_NS:
-            raise ValueError(f"the time goes back by {(self.last_ns - t_ns) / NS_PER_S:g} s")
+            raise ValueError(f"the time is earlier than before by {(self.last_ns - t_ns) / NS_PER_S:g} s")
         t_ns = self._after_check.time_of(t_ns, kind, data)
         self.last_ns = max(self.last_ns, t_ns)
         match kind:

@@ -24,7 +24,8 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> list[str]:
 
 
 def _by_similarity(name: str, known: Iterable[str], least: float) -> list[str]:
-    """Return the names with at least this likeness to `name`, the most similar first, equally similar ones as they come."""
+    """Return the names whose similarity to `name` is at least `least`, the most similar first. Equally similar names keep their
+    order."""
     matcher = difflib.SequenceMatcher(b=name)
     found = []
     for each in known:

@@ -70,7 +70,7 @@ class TimingForm(Strict):
 
 
 class Defaults(Strict):
-    """The properties of a tag that does not set them itself."""
+    """The default properties of the tags, for each tag that does not set them itself."""
 
     type: ValueType = "uint16"
     order: Order = "ABCD"

@@ -231,7 +231,7 @@ class Bridge:
         except ModbusExceptionReply:
             self.counters.refused += 1
             raise
-        code = self.config.policy.judge(caller.address, unit, asked, caller.role)
+        code = self.config.policy.check(caller.address, unit, asked, caller.role)
         if broadcast and not code and asked.function not in BROADCAST_FUNCTIONS:
             code = ILLEGAL_FUNCTION
         if code:

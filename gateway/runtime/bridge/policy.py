@@ -73,7 +73,7 @@ class AllowRule:
     def is_for(self, role: str) -> bool:
         return self.roles is None or role in self.roles
 
-    def judge(self, unit: int, asked: ServerRequest) -> int:
+    def check(self, unit: int, asked: ServerRequest) -> int:
         """Return `ALLOWED`, or the exception code of the first check that fails: unit, function, address."""
         if self.units is not None and unit not in self.units:
             return NO_PATH
@@ -108,11 +108,11 @@ class Policy:
         """Return whether a client from `peer` may connect at all."""
         return any(rule.admits(peer) for rule in self.rules)
 
-    def judge(self, peer: str, unit: int, asked: ServerRequest, role: str = "") -> int:
+    def check(self, peer: str, unit: int, asked: ServerRequest, role: str = "") -> int:
         """Return `ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function or a role (MBTLS
         8.5), 02 for an address."""
         verdicts = {
-            rule.judge(unit, asked) if rule.is_for(role) else ILLEGAL_FUNCTION
+            rule.check(unit, asked) if rule.is_for(role) else ILLEGAL_FUNCTION
             for rule in self.rules
             if rule.admits(peer)
         }

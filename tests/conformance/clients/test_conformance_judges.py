@@ -63,7 +63,7 @@ def _good() -> list[Event]:
     [
         ([ValuePublished(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
         ([ValuePublished(_at(0.5), Word.OTHER, "0")], "published 0, which no correct answer contained, 0"),
-        ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
+        ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that do not form a request: ff ff"),
         ([Ended(_at(0.7), 3)], "the client ended, exit code 3, 0.70 s"),
         ([RequestSeen(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
         ([ObservedConnection(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),

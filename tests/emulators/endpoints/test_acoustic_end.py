@@ -40,7 +40,7 @@ def test_each_end_receives_the_messages_of_the_other(tmp_path: Path) -> None:
             await eventually(all_heard)
             assert heard == said
             assert (a.sent, b.delivered) == (20, 20)
-            medium.say("b", b"ahoy", clock.monotonic_ns())  # an end in this process: the server wakes up for it
+            medium.transmit("b", b"ahoy", clock.monotonic_ns())  # an end in this process: the server wakes up for it
             await eventually(lambda: a.arrived(0) == b"ahoy")
             await server.aclose()
             await eventually(lambda: not a.submit(b"x", 0))  # no client takes it any more; nothing breaks

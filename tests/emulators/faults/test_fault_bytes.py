@@ -65,7 +65,7 @@ def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: An
     assert isinstance(fault, WireFault)
     frame = understood(FrameDirection.REPLY, framing, data)
     assert frame.pdu, "the frame of a test is a whole one"
-    return fault.strike(frame, Random(7))
+    return fault.apply(frame, Random(7))
 
 
 def pieces(outcome: FaultEffect) -> list[tuple[bytes, float]]:
@@ -174,7 +174,7 @@ def test_faults_of_a_connection() -> None:
     assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect(
         (DelayedBytes(ON_TCP[:4]),), ConnectionEffect.RESET
     )
-    assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(hang=ConnectionEffect.HALF_OPEN)
+    assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(connection=ConnectionEffect.HALF_OPEN)
     assert made("disconnect").appears() is ConnectionEffect.CLOSE
     assert made("disconnect").refuses
 
@@ -182,11 +182,11 @@ def test_faults_of_a_connection() -> None:
 def test_the_next_frame_goes_before_the_reordered() -> None:
     fault = made("reorder", most_ms=50)
     first, second = (understood(FrameDirection.REPLY, Framing.RTU, line(f"1103 02 000{n}")) for n in (1, 2))
-    (held,) = fault.strike(first, Random(1)).pieces
-    assert [piece.data for piece in fault.strike(second, Random(1)).pieces] == [second.data, first.data]
+    (held,) = fault.apply(first, Random(1)).pieces
+    assert [piece.data for piece in fault.apply(second, Random(1)).pieces] == [second.data, first.data]
     assert held.gone is not None
     assert held.gone()  # the frames were swapped
-    (alone,) = fault.strike(first, Random(1)).pieces
+    (alone,) = fault.apply(first, Random(1)).pieces
     assert alone.gone is not None
     assert not alone.gone()  # no second frame arrived
 
@@ -237,7 +237,7 @@ def test_on_a_can_bus(
     sent = CanFrame(frame[0], bytes.fromhex(frame[1]))
     assert fault.aims_at(sent, NODE) is (expected is not None)
     if expected is not None:
-        after = [(p.frame.can_id, p.frame.data.hex(), p.delay_s) for p in fault.strike(sent, NODE, Random(1))]
+        after = [(p.frame.can_id, p.frame.data.hex(), p.delay_s) for p in fault.apply(sent, NODE, Random(1))]
         assert after == expected
 
 
@@ -248,19 +248,19 @@ def test_faults_of_unsolicited_frames_of_a_node() -> None:
     ]
     (short,) = made("emcy-burst", count=1, length=3).appears(NODE, Random(1))
     assert short.frame.data == b"\x00\x10\x01"
-    (far,) = made("odd-sdo", extended=True).strike(CanFrame(0x585, bytes(8)), NODE, Random(1))
+    (far,) = made("odd-sdo", extended=True).apply(CanFrame(0x585, bytes(8)), NODE, Random(1))
     assert far.frame.extended
     boots = made("boot-storm", count=3, every_ms=50).appears(NODE, Random(1))
     assert [(p.frame, p.delay_s) for p in boots] == [(CanFrame(0x705, b"\0"), n * 0.05) for n in range(3)]
 
 
 def test_late_frames_on_a_can_bus() -> None:
-    (beat,) = made("heartbeat-late", most_ms=300).strike(CanFrame(0x705, b"\5"), NODE, Random(1))
+    (beat,) = made("heartbeat-late", most_ms=300).apply(CanFrame(0x705, b"\5"), NODE, Random(1))
     assert 0 < beat.delay_s <= 0.3
     sync = made("sync-jitter", most_ms=5)
     assert sync.ways == frozenset((FrameDirection.REQUEST,))
     assert sync.aims_at(CanFrame(0x80, b""), NODE)
-    (heard,) = sync.strike(CanFrame(0x80, b""), NODE, Random(1))
+    (heard,) = sync.apply(CanFrame(0x80, b""), NODE, Random(1))
     assert 0 < heard.delay_s <= 0.005
 
 
@@ -317,7 +317,7 @@ REQUEST = understood(FrameDirection.REQUEST, Framing.RTU, line("1103 0010 0002")
 
 def hits(fault: Active, times: int = 8, frame: FaultFrame = REQUEST) -> list[int]:
     """Return which frames out of so many, one second apart, the fault changes; counted from 1."""
-    return [n for n in range(1, times + 1) if fault.strikes(frame, n * 1_000_000_000)]
+    return [n for n in range(1, times + 1) if fault.applies_to(frame, n * 1_000_000_000)]
 
 
 @pytest.mark.parametrize(
@@ -458,7 +458,7 @@ def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:
 def test_every_fault_takes_every_frame(data: bytes, framing: Framing, kind: type[WireFault]) -> None:
     fault = kind(kind.form())
     for way in FrameDirection:
-        outcome = fault.strike(understood(way, framing, data), Random(1))
+        outcome = fault.apply(understood(way, framing, data), Random(1))
         assert all(isinstance(piece.data, bytes) and piece.delay_s >= 0 for piece in outcome.pieces)
 
 
@@ -486,6 +486,6 @@ def test_a_fault_declares_the_framings_in_which_it_changes_anything(name: str, f
     kind = FAULTS[name]
     assert issubclass(kind, WireFault)
     random = Random(3)
-    struck = {f.function for f in frames_of(framing) if made(name).strike(f, random) != passed(f.data)}
+    struck = {f.function for f in frames_of(framing) if made(name).apply(f, random) != passed(f.data)}
     assert bool(struck) is (framing in kind.framings)
     assert not kind.functions or struck <= kind.functions

@@ -23,7 +23,7 @@ def s(seconds: float) -> int:
 def test_neighbours_receive_it_later_and_others_do_not() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     assert sea.neighbours("west") == ["middle"]
-    assert sea.say("west", b"ahoy", 0)
+    assert sea.transmit("west", b"ahoy", 0)
     assert sea.take("middle", s(2.59)) is None  # 12 bytes at 20 B/s are 0.6 s, in transit for 2 s
     assert sea.take("middle", s(2.6)) == b"ahoy"
     assert sea.take("middle", s(9)) is None
@@ -35,8 +35,8 @@ def test_neighbours_receive_it_later_and_others_do_not() -> None:
 
 def test_two_simultaneous_messages_collide_where_both_are_received() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
-    sea.say("west", b"one", 0)
-    sea.say("east", b"two", s(0.3))
+    sea.transmit("west", b"one", 0)
+    sea.transmit("east", b"two", s(0.3))
     sea.advance(s(10))
     assert sea.take("middle", s(10)) is None
     assert sea.counters["middle"].lost["collision"] == 2
@@ -44,8 +44,8 @@ def test_two_simultaneous_messages_collide_where_both_are_received() -> None:
 
 def test_a_sending_modem_receives_nothing() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
-    sea.say("west", b"one", 0)
-    sea.say("middle", b"two", s(1.9))  # it sends until 2.45 s, and the message from west arrives from 2 s on
+    sea.transmit("west", b"one", 0)
+    sea.transmit("middle", b"two", s(1.9))  # it sends until 2.45 s, and the message from west arrives from 2 s on
     assert sea.take("middle", s(10)) is None
     assert sea.counters["middle"].lost["speaking"] == 1
     assert sea.take("west", s(10)) == b"two"
@@ -54,8 +54,8 @@ def test_a_sending_modem_receives_nothing() -> None:
 
 def test_a_modem_waits_while_it_receives() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
-    sea.say("west", b"one", 0)
-    sea.say("middle", b"two", s(2.2))  # in the middle of its reception, to 2.55 s
+    sea.transmit("west", b"one", 0)
+    sea.transmit("middle", b"two", s(2.2))  # in the middle of its reception, to 2.55 s
     assert sea.take("middle", s(2.55)) == b"one"
     assert sea.take("west", s(4.55)) is None
     assert sea.take("west", s(6)) == b"two"
@@ -63,7 +63,7 @@ def test_a_modem_waits_while_it_receives() -> None:
 
 def test_a_modem_accepts_a_limited_number_of_bytes() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
-    taken = sum(sea.say("west", bytes([n]), 0) for n in range(10))
+    taken = sum(sea.transmit("west", bytes([n]), 0) for n in range(10))
     assert taken == QUEUE + 1  # one is in transit
     assert [sea.take("middle", s(60)) for _ in range(taken + 1)] == [*(bytes([n]) for n in range(taken)), None]
 
@@ -71,7 +71,7 @@ def test_a_modem_accepts_a_limited_number_of_bytes() -> None:
 def test_a_listener_that_takes_nothing_loses_the_oldest() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     for n in range(MAX_RECEIVED + 3):
-        assert sea.say("west", bytes([n]), s(n))
+        assert sea.transmit("west", bytes([n]), s(n))
     assert sea.take("middle", s(500)) == bytes([3])
     assert sea.counters["middle"].dropped == 3
 
@@ -95,7 +95,7 @@ def test_faults_drop_messages() -> None:
         return listener == 3
 
     sea = AcousticMedium(WATER, ROW, seed=1, spoils=spoils)
-    sea.say("middle", b"one", 0)
+    sea.transmit("middle", b"one", 0)
     assert sea.take("west", s(5)) == b"one"
     assert sea.take("east", s(5)) is None
     assert sea.counters["east"].lost["fault"] == 1
@@ -104,7 +104,7 @@ def test_faults_drop_messages() -> None:
 
 def test_no_such_modem() -> None:
     with pytest.raises(UsageError, match="no modem 'north'"):
-        AcousticMedium(WATER, ROW, seed=1).say("north", b"x", 0)
+        AcousticMedium(WATER, ROW, seed=1).transmit("north", b"x", 0)
 
 
 @settings(max_examples=60, deadline=None)
@@ -126,7 +126,7 @@ def test_every_message_is_received_once_or_lost_for_a_reason_independent_of_poll
             while t_s + every_s < at_s:
                 t_s += every_s
                 sea.advance(s(t_s))
-            sea.say(name, payload, s(at_s))
+            sea.transmit(name, payload, s(at_s))
         for name in ROW:
             while (payload_heard := sea.take(name, s(10_000))) is not None:
                 heard[name].append(payload_heard)

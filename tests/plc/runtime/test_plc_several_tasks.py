@@ -106,7 +106,7 @@ def test_inputs_of_a_stopped_plc_are_bad(tmp_path: Path) -> None:
     seen = rig.runner.input("d.n")
     assert (seen.value, seen.quality, seen.reason) == (7, Quality.BAD, Reason.NOT_OPERATIONAL)
     assert {value.quality for value in rig.runner.inputs().values()} == {Quality.BAD}
-    assert rig.runner.seen_otherwise("d.n") == {}
+    assert rig.runner.substituted_values("d.n") == {}
 
 
 def test_inputs_are_good_again_after_a_restart(tmp_path: Path) -> None:

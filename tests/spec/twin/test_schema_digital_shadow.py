@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
-from fieldtwin.cli.twin.shadow_command import told_of
+from fieldtwin.cli.twin.shadow_command import variables_text
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import STATE_CODES, delta
 from fieldtwin.gateway.core.values import DATA, STATUS, Quality, Reason
@@ -244,7 +244,7 @@ def test_DigitalShadow_what_the_system_does_not_declare_is_no_part_of_its_model_
     assert list(rig.shadow.digital_model.variables) == [variable.name for variable in DECLARED]
     assert rig.shadow.describe()["undeclared"] == 1
     seen = rig.shadow.describe()
-    assert told_of(seen["variables"], seen["undeclared"]) == (
+    assert variables_text(seen["variables"], seen["undeclared"]) == (
         "3, 0 of them received, 0 good; 1 values of tags that it does not declare"
     )
 

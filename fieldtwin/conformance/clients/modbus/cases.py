@@ -10,7 +10,7 @@ format. `on_tcp` gives the basis and the clause of a case on TCP, where they dif
 
 from __future__ import annotations
 
-from fieldtwin.conformance.clients import checks as judges
+from fieldtwin.conformance.clients import checks
 from fieldtwin.conformance.clients.habits import (
     bounded_addresses,
     broadcasts_wait,
@@ -35,35 +35,35 @@ def _case(
     clause: str,
     impact: Impact,
     play: ReplyFunction,
-    judge: CheckFunction,
+    check: CheckFunction,
     does: str,
     must: str,
 ) -> ModbusCase:
-    return ModbusCase(ClientCase(id, title, clause, impact, does, must, judge, basis=basis), play)
+    return ModbusCase(ClientCase(id, title, clause, impact, does, must, check, basis=basis), play)
 
 
 def _bad(
     id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "refuse it; go on"
 ) -> ModbusCase:
-    return _case(id, title, basis, clause, READ, play, judges.rejects, does, must)
+    return _case(id, title, basis, clause, READ, play, checks.rejects, does, must)
 
 
 def _good(
     id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "take the answer"
 ) -> ModbusCase:
-    case = _case(id, title, basis, clause, READ, play, judges.accepts, does, must)
+    case = _case(id, title, basis, clause, READ, play, checks.accepts, does, must)
     return case.on(holds_good=True, strikes=4)
 
 
 def _waits(
     id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "take the answer"
 ) -> ModbusCase:
-    case = _case(id, title, basis, clause, READ, play, judges.accepts_on_line, does, must)
+    case = _case(id, title, basis, clause, READ, play, checks.accepts_on_line, does, must)
     return case.on(holds_good=True, strikes=4)
 
 
-def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction, must: str) -> ModbusCase:
-    case = _case(id, title, basis, clause, LOOK, line_plays.nothing, judge, "answers well during the whole run", must)
+def _watch(id: str, title: str, basis: Basis, clause: str, check: CheckFunction, must: str) -> ModbusCase:
+    case = _case(id, title, basis, clause, LOOK, line_plays.nothing, check, "answers well during the whole run", must)
     return case.on(wants="nothing")
 
 
@@ -74,11 +74,11 @@ CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", REQUIRED, "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),
     _bad("MB-003", "truncated reply", REQUIRED, "SL 2.4.1", line_plays.truncated, "sends half a reply",
          "time out; the next request is clean").on_tcp(ROBUST, OWN),
-    _case("MB-005", "a pause inside a frame", REQUIRED, "SL 2.5.1.1", READ, line_plays.paused, judges.either,
+    _case("MB-005", "a pause inside a frame", REQUIRED, "SL 2.5.1.1", READ, line_plays.paused, checks.either,
           "pauses 10 ms in the middle", "take it (tolerant) or discard it (strict)").on(holds_good=True, strikes=3, framings=RTU),
     _waits("MB-006", "an adapter splits a frame by 16 ms", FIELD, "modbus-tk #13", line_plays.split_16_ms,
           "sends four pieces 16 ms apart").on(framings=RTU),
-    _case("MB-007", "two frames closer than t3.5", ROBUST, "SL 2.5.1.1", READ, line_plays.glued, judges.either,
+    _case("MB-007", "two frames closer than t3.5", ROBUST, "SL 2.5.1.1", READ, line_plays.glued, checks.either,
           "sends another unit's frame right before its own", "take its frame (tolerant) or discard both (strict)"
           ).on(holds_good=True, strikes=3, framings=RTU),
     _good("MB-008", "leading 00 / FF noise", FIELD, "minimalmodbus #61", line_plays.leading_noise,
@@ -91,9 +91,9 @@ CASES: tuple[ModbusCase, ...] = (
           "echoes the request with a bit flipped, nothing else").on(framings=RTU),
     _case("MB-012", "a late reply of another shape inside the next request", REQUIRED, "SL 2.4.1, AP 6; pymodbus PR #2636",
           READ, line_plays.late_other,
-          judges.late_other, "answers a request when the next one, of another shape, has been sent", "never take it as data"
+          checks.late_other, "answers a request when the next one, of another shape, has been sent", "never take it as data"
           ).on(wants="read", strikes=5).on_tcp(REQUIRED, "TG 4.4.1.3; pymodbus PR #2636"),
-    _case("MB-013", "a late reply of identical shape", ROBUST, OWN, READ, line_plays.late, judges.late_same_shape,
+    _case("MB-013", "a late reply of identical shape", ROBUST, OWN, READ, line_plays.late, checks.late_same_shape,
           "answers after 1.5 timeouts", "never take it as the reply to the next request"
           ).on(strikes=1).on_tcp(REQUIRED, "TG 4.4.1.3"),
     _bad("MB-014", "a second reply", ROBUST, OWN, line_plays.second_reply, "answers twice, with another value the second time",
@@ -114,23 +114,23 @@ CASES: tuple[ModbusCase, ...] = (
          "refuse it within its timeout; go on").on_tcp(REQUIRED, "TG 4.4.1.3, AP 6.3"),
     _bad("MB-018b", "odd byte count", REQUIRED, "SL 2.4.1, AP 6.3", line_plays.odd_count, "adds half a register",
           "refuse it within its timeout; go on").on_tcp(REQUIRED, "TG 4.4.1.3, AP 6.3"),
-    _case("MB-019", "write echo differs", ROBUST, "AP 6.6", WRITE, line_plays.other_echo, judges.write_echo,
+    _case("MB-019", "write echo differs", ROBUST, "AP 6.6", WRITE, line_plays.other_echo, checks.write_echo,
           "confirms another value than was written", "say that the write failed: write again, or read back"
           ).on(wants="write", strikes=1),
     _case("MB-020", "exception for another function", REQUIRED, "SL 2.4.1, AP 7", READ, line_plays.other_exception,
-          judges.not_our_exception, "sends the exception response of a function that was not requested", "refuse it; go on"
+          checks.not_our_exception, "sends the exception response of a function that was not requested", "refuse it; go on"
           ).on_tcp(REQUIRED, "TG 4.4.1.3, AP 7"),
     _case("MB-021", "exception frame of 5 bytes", ROBUST, "AP 7", READ, line_plays.exception_at_once_and_later(4),
-          judges.short_frame, "answers with exception 04, the first time at once and the second time half a timeout later",
+          checks.short_frame, "answers with exception 04, the first time at once and the second time half a timeout later",
           "recognise it at once, without waiting for the length of a normal reply"),
-    _case("MB-022", "vendor exception code", FIELD, "Telegraf #10597", READ, line_plays.exception(0x50), judges.survives,
+    _case("MB-022", "vendor exception code", FIELD, "Telegraf #10597", READ, line_plays.exception(0x50), checks.survives,
           "answers with exception 50h", "go on"),
-    _case("MB-023", "exception 05", ROBUST, "TG 4.4.2.5", READ, line_plays.exception(5), judges.survives,
+    _case("MB-023", "exception 05", ROBUST, "TG 4.4.2.5", READ, line_plays.exception(5), checks.survives,
           "answers with exception 05: the request takes longer", "go on polling"),
-    _case("MB-024", "exception 06", ROBUST, "AP 7; HA #54345", READ, line_plays.exception(6), judges.busy,
+    _case("MB-024", "exception 06", ROBUST, "AP 7; HA #54345", READ, line_plays.exception(6), checks.busy,
           "answers 4 requests with exception 06: it is busy", "not ask more often; publish no value").on(strikes=4),
     _case("MB-025", "exception 02 in a merged read", FIELD, "ioBroker #581; Telegraf #14671", READ, line_plays.hole,
-          judges.bisects,
+          checks.bisects,
           "refuses a read of several registers with exception 02", "ask for fewer registers").on(wants="read of several",
           strikes=6),
     _watch("MB-026", "broadcast write", REQUIRED, "SL 2.4.1; libmodbus #372", broadcasts_wait,
@@ -138,7 +138,7 @@ CASES: tuple[ModbusCase, ...] = (
            ).on(framings=LINES),
     _watch("MB-027", "broadcast read", REQUIRED, "SL 2.1; libmodbus #379", no_broadcast_reads,
            "send no read to unit 0: no unit answers it").on(framings=LINES),
-    _case("MB-028", "unit 0 behind a gateway", FIELD, "mbusd #61", WRITE, line_plays.nothing, judges.unit_0,
+    _case("MB-028", "unit 0 behind a gateway", FIELD, "mbusd #61", WRITE, line_plays.nothing, checks.unit_0,
           "does not answer a request to unit 0",
           "not repeat it because no reply came").on(framings=TCP, wants="request to unit 0", strikes=1),
     _watch("MB-036", "counts within the standard's", REQUIRED, "AP 6", legal_requests,
@@ -168,25 +168,25 @@ CASES: tuple[ModbusCase, ...] = (
           "answers with transaction id 0", "refuse it, unless it is set up to accept it").on(framings=TCP),
     _good("MB-056c", "unknown transaction id, then ours", REQUIRED, "TG 4.4.1.3", tcp_plays.other_tag_first,
           "sends a reply with another transaction id before its own", "discard the first, take the second").on(framings=TCP),
-    _case("MB-064a", "reset inside a reply", ROBUST, "TG 4.2.2", CUT, tcp_plays.reset, judges.cut_off,
+    _case("MB-064a", "reset inside a reply", ROBUST, "TG 4.2.2", CUT, tcp_plays.reset, checks.cut_off,
           "resets the connection inside a reply", "connect again, with a pause").on(framings=STREAM, strikes=3),
-    _case("MB-064b", "the other side hangs up", ROBUST, "TG 4.2.2", CUT, tcp_plays.hang_up, judges.cut_off,
+    _case("MB-064b", "the other side hangs up", ROBUST, "TG 4.2.2", CUT, tcp_plays.hang_up, checks.cut_off,
           "closes the connection instead of answering", "connect again, with a pause").on(framings=STREAM, strikes=3),
-    _case("MB-064c", "half-open connection", ROBUST, "TG 4.2.2", CUT, tcp_plays.half_open, judges.cut_off,
+    _case("MB-064c", "half-open connection", ROBUST, "TG 4.2.2", CUT, tcp_plays.half_open, checks.cut_off,
           "leaves the connection open and no longer answers on it", "close it, connect again"
           ).on(framings=STREAM, strikes=1),
-    _case("MB-065a", "connection limit", ROBUST, "TG 4.2.1", CUT, tcp_plays.closed_while_unused, judges.cut_off,
+    _case("MB-065a", "connection limit", ROBUST, "TG 4.2.1", CUT, tcp_plays.closed_while_unused, checks.cut_off,
           "closes the connection while no request is pending", "connect again"
           ).on(framings=STREAM, strikes=3),
-    _case("MB-066", "USB unplugged and back", FIELD, "pymodbus #2326", CUT, line_plays.unplugged(), judges.cut_off,
+    _case("MB-066", "USB unplugged and back", FIELD, "pymodbus #2326", CUT, line_plays.unplugged(), checks.cut_off,
           "removes the port for 1 s", "open it again and go on").on(framings=("port",), strikes=1),
-    _case("MB-067", "port locked", FIELD, "HA #144615", CUT, line_plays.unplugged(2.0), judges.cut_off,
+    _case("MB-067", "port locked", FIELD, "HA #144615", CUT, line_plays.unplugged(2.0), checks.cut_off,
           "removes the port for 1 s and locks it for 2 s when it is back", "try again and go on"
           ).on(framings=("lock",), strikes=1),
-    _case("MB-068", "wrong baud rate or parity", ROBUST, OWN, CUT, line_plays.garbage, judges.survives,
+    _case("MB-068", "wrong baud rate or parity", ROBUST, OWN, CUT, line_plays.garbage, checks.survives,
           "answers with what a wrong baud rate makes of a reply", "go on, without a flood of requests").on(framings=RTU,
           strikes=3),
-    _case("MB-069", "two clients on one line", FIELD, "pymodbus #432", CUT, line_plays.collision, judges.rejects,
+    _case("MB-069", "two clients on one line", FIELD, "pymodbus #432", CUT, line_plays.collision, checks.rejects,
           "overlays the reply with another frame", "never take it as data").on(framings=RTU),
     _bad("MB-070a", "ASCII: a bad LRC", REQUIRED, "SL 2.5.2.2", line_plays.bad_lrc, "sends a wrong LRC").on(framings=ASCII),
     _good("MB-070b", "ASCII: a second colon", REQUIRED, "SL 2.5.2.1", line_plays.second_colon,

@@ -164,14 +164,14 @@ class NodeConnection:
 
     # -- SDO ---------------------------------------------------------------------------------------------------------
 
-    async def tell(self, data: bytes, *, at_once: bool = False) -> None:
+    async def send_sdo(self, data: bytes, *, at_once: bool = False) -> None:
         """Send an SDO frame to the server without padding, even if it is shorter than 8 bytes."""
         await self.send(CanFrame(SDO_REQUEST + self.node, data), at_once=at_once)
 
     async def ask(self, data: bytes, within_s: float | None = None) -> SdoReply:
         """Send an SDO request, padded to 8 bytes, and return the reply."""
         self.forget()
-        await self.tell(data.ljust(8, b"\0"))
+        await self.send_sdo(data.ljust(8, b"\0"))
         return await self.reply(within_s)
 
     async def reply(self, within_s: float | None = None) -> SdoReply:
@@ -181,7 +181,7 @@ class NodeConnection:
 
     async def abandon(self, key: Key, code: int = 0x0800_0000) -> None:
         """Send the client's abort, which ends a transfer and is not answered."""
-        await self.tell(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
+        await self.send_sdo(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
     async def upload(self, key: Key) -> bytes | SdoReply:
         """Return the value by an ordinary upload, or the reply that ended a failed upload."""

@@ -126,7 +126,7 @@ async def empty_history(wire: NodeConnection) -> Finding:
 async def short_request(wire: NodeConnection) -> Finding:
     """CO-026: send an upload request of 4 bytes, which is ignored or optionally accepted."""
     wire.forget()
-    await wire.tell(b"\x40" + mux(0x1000))
+    await wire.send_sdo(b"\x40" + mux(0x1000))
     reply = await wire.reply()
     if reply.data and not reply.abort:
         return await verdict(wire, "", "takes it")
@@ -220,7 +220,7 @@ async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool
         return b"", f"{begun} instead of a block upload"
     value, losing = b"", lose
     wire.forget()
-    await wire.tell(b"\xa3".ljust(8, b"\0"))
+    await wire.send_sdo(b"\xa3".ljust(8, b"\0"))
     for _ in range(MOST_BLOCKS):
         segments = await _block(wire, size)
         if isinstance(segments, str):
@@ -229,7 +229,7 @@ async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool
         over = bool(segments[-1][0] & 0x80) and len(got) == len(segments)
         losing = losing and len(segments) < 2
         value += b"".join(segment[1:] for segment in got)
-        await wire.tell(bytes((0xA2, len(got), size)).ljust(8, b"\0"))
+        await wire.send_sdo(bytes((0xA2, len(got), size)).ljust(8, b"\0"))
         if over:
             return await _block_end(wire, value, begun)
     await wire.abandon(key)
@@ -256,7 +256,7 @@ async def segment_lost(wire: NodeConnection) -> Finding:
     if wrong:
         await wire.abandon(key)
         return await verdict(wire, wrong)
-    await wire.tell(b"\xa1".ljust(8, b"\0"))
+    await wire.send_sdo(b"\xa1".ljust(8, b"\0"))
     return await verdict(
         wire, "" if value == usual else f"{value.hex(' ').upper()} instead of what an ordinary upload gives"
     )
@@ -271,8 +271,8 @@ async def right_after_the_end(wire: NodeConnection) -> Finding:
         await wire.abandon(key)
         return await verdict(wire, wrong)
     wire.forget()
-    await wire.tell(b"\xa1".ljust(8, b"\0"))
-    await wire.tell((b"\x40" + mux(0x1000)).ljust(8, b"\0"), at_once=True)
+    await wire.send_sdo(b"\xa1".ljust(8, b"\0"))
+    await wire.send_sdo((b"\x40" + mux(0x1000)).ljust(8, b"\0"), at_once=True)
     reply = await wire.reply()
     good = reply.specifier == 2 and reply.data[1:4] == mux(0x1000)
     return passed() if good else await verdict(wire, f"{reply} instead of 1000h")

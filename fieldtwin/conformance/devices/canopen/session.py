@@ -66,8 +66,8 @@ class _OfTheNode(Transcript):
 
 async def check_canopen(
     options: CanopenOptions,
-    say: Callable[[str], None] = lambda text: None,
-    tell: Callable[[DeviceResult], None] = lambda result: None,
+    print_line: Callable[[str], None] = lambda text: None,
+    on_result: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
     """Run the whole check.
 
@@ -91,9 +91,9 @@ async def check_canopen(
                 f"another master uses SDO with node {options.node}", hint="--share-bus runs the check all the same"
             )
         identity = await learn(wire)
-        say(f"1000h is {wire.device_type.hex(' ').upper()}")
+        print_line(f"1000h is {wire.device_type.hex(' ').upper()}")
         before = transcript.spoken
-        results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
+        results = await play(wire, CASES, options.plan, transcript, clock, on_result, options.go_on)
     return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 
 

@@ -258,7 +258,7 @@ async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
         wire.forget()
         for n, segment in enumerate(segments):
             if not (lose and n == 1):
-                await wire.tell(segment)
+                await wire.send_sdo(segment)
         reply = await wire.reply()
         if lose:
             if reply.data[:2] != b"\xa2\x01":
@@ -267,7 +267,7 @@ async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
                 )
             wire.forget()
             for n, segment in enumerate(_segments(before[7:])):
-                await wire.tell(bytes((segment[0],)) + segment[1:] if n else segment)
+                await wire.send_sdo(bytes((segment[0],)) + segment[1:] if n else segment)
             reply = await wire.reply()
             segments = segments[1:]
         if reply.data[:2] != bytes((0xA2, len(segments))):

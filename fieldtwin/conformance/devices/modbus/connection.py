@@ -134,7 +134,7 @@ class DeviceConnection:
         number = self.next_transaction() if transaction is None else transaction
         return framed(self.framing, self.unit if unit is None else unit, pdu, number)
 
-    async def say(self, data: bytes, *carries: bytes, at_once: bool = False) -> None:
+    async def send(self, data: bytes, *carries: bytes, at_once: bool = False) -> None:
         """Send `data`, which contains the PDUs `carries`; keep the pause between two requests unless `at_once`."""
         for pdu in carries:
             self._must_be_allowed(pdu)
@@ -199,7 +199,7 @@ class DeviceConnection:
         On a connection with transaction IDs only replies to the request count.
         """
         number = self.next_transaction()
-        await self.say(self.frame(pdu, unit, number), pdu)
+        await self.send(self.frame(pdu, unit, number), pdu)
         heard = await self.hear(within_s=self.timeout_s * (PATIENCE if due else 1))
         if self.framing in ("mbap", "udp"):
             late = [a for a in heard.answers if a.transaction != number]

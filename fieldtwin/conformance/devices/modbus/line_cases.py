@@ -24,16 +24,16 @@ async def bad_check_sum(wire: DeviceConnection) -> Finding:
     frame = bytearray(wire.frame(wire.good))
     frame[-1] ^= 0xFF
     frame[-2] ^= 0xFF
-    await wire.say(bytes(frame), wire.good)
+    await wire.send(bytes(frame), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
 async def half_then_whole(wire: DeviceConnection) -> Finding:
     """MB-004: send half a request, and after a pause a whole request."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[: len(frame) // 2], wire.good)
+    await wire.send(frame[: len(frame) // 2], wire.good)
     await wire.pause(max(LONG_PAUSE_S, 2 * wire.pause_s))
-    await wire.say(frame, wire.good)
+    await wire.send(frame, wire.good)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the complete one")
 
@@ -41,9 +41,9 @@ async def half_then_whole(wire: DeviceConnection) -> Finding:
 async def gap_inside(wire: DeviceConnection) -> Finding:
     """MB-005: send a frame with a pause of 2.5 characters or 2 ms inside."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[:4], wire.good)
+    await wire.send(frame[:4], wire.good)
     await wire.pause(max(6.5 * wire.char_s, 0.002))  # four characters are still in transmission
-    await wire.say(frame[4:], wire.good, at_once=True)
+    await wire.send(frame[4:], wire.good, at_once=True)
     heard = await wire.hear()
     if answers_good(wire, heard, 1):
         return passed("takes it: tolerant")
@@ -56,7 +56,7 @@ async def gap_inside(wire: DeviceConnection) -> Finding:
 async def no_gap(wire: DeviceConnection) -> Finding:
     """MB-007: send two requests without a pause between them."""
     frame = wire.frame(wire.good)
-    await wire.say(frame + frame, wire.good)
+    await wire.send(frame + frame, wire.good)
     heard = await wire.hear(2)
     if answers_good(wire, heard, 2):
         return passed("answers both: tolerant")
@@ -77,7 +77,7 @@ async def _goes_on(wire: DeviceConnection, data: bytes, *, may_discard: bool) ->
     silence separates them, and its check sum is wrong (SL 2.5.1.1). With zeros after a frame the check sum is right
     again, and the length is wrong: exception 03.
     """
-    await wire.say(data, wire.good)
+    await wire.send(data, wire.good)
     heard = await wire.hear()
     took = answers_good(wire, heard, 1)
     refused = len(heard.answers) == 1 and heard.answers[0].pdu == bytes((wire.good[0] | 0x80, 0x03)) and not heard.rest
@@ -112,7 +112,7 @@ async def trailing_zeros(wire: DeviceConnection) -> Finding:
 
 async def broadcast_read(wire: DeviceConnection) -> Finding:
     """MB-027: send a read to unit 0, the broadcast address. No device may answer."""
-    await wire.say(wire.frame(wire.good, 0), wire.good)
+    await wire.send(wire.frame(wire.good, 0), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
@@ -150,11 +150,11 @@ async def neighbours_talk(wire: DeviceConnection) -> Finding:
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
     response = b"\x03\x04\x11\x22\x33\x44"
-    await wire.say(wire.frame(request, other), request)
+    await wire.send(wire.frame(request, other), request)
     await wire.pause(LONG_PAUSE_S)
-    await wire.say(wire.frame(response, other), request)
+    await wire.send(wire.frame(response, other), request)
     await wire.pause(LONG_PAUSE_S)
-    await wire.say(wire.frame(wire.good), wire.good)
+    await wire.send(wire.frame(wire.good), wire.good)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to ours alone")
 
@@ -163,9 +163,9 @@ async def neighbour_silent(wire: DeviceConnection) -> Finding:
     """MB-031: send a request that another unit does not answer, then one to this unit."""
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
-    await wire.say(wire.frame(request, other), request)
+    await wire.send(wire.frame(request, other), request)
     await wire.pause(LONG_PAUSE_S)
-    await wire.say(wire.frame(wire.good), wire.good)
+    await wire.send(wire.frame(wire.good), wire.good)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to ours alone")
 
@@ -174,7 +174,7 @@ async def stranger_function(wire: DeviceConnection) -> Finding:
     """MB-032: send an unknown function to another unit."""
     other = await _silent_neighbour(wire)
     pdu = b"\x64\x00\x01"
-    await wire.say(wire.frame(pdu, other), pdu)
+    await wire.send(wire.frame(pdu, other), pdu)
     heard = await wire.hear()
     if not heard.nothing:
         return failed(f"{heard} instead of silence")
@@ -184,7 +184,7 @@ async def stranger_function(wire: DeviceConnection) -> Finding:
 
 async def wrong_baud_rate(wire: DeviceConnection) -> Finding:
     """MB-068: send the bytes that a wrong baud rate makes of a request."""
-    await wire.say(bytes.fromhex("80 00 F8 00 78 80 E6 FE 00 80 F8 66 06 FE"), b"\x80")
+    await wire.send(bytes.fromhex("80 00 F8 00 78 80 E6 FE 00 80 F8 66 06 FE"), b"\x80")
     await wire.pause(LONG_PAUSE_S)
     return await silent_then_good(wire, await wire.hear())
 
@@ -194,7 +194,7 @@ async def two_clients(wire: DeviceConnection) -> Finding:
     one, other = wire.frame(wire.good), framed("rtu", wire.unit, read_of(0x04, 0x1234, 9))
     if wire.framing == "ascii":
         raise NotHere("this test case runs on RTU")
-    await wire.say(bytes(a & b for a, b in zip(one, other, strict=False)), b"\x80")
+    await wire.send(bytes(a & b for a, b in zip(one, other, strict=False)), b"\x80")
     await wire.pause(LONG_PAUSE_S)
     return await silent_then_good(wire, await wire.hear())
 
@@ -205,14 +205,14 @@ async def two_clients(wire: DeviceConnection) -> Finding:
 async def bad_lrc(wire: DeviceConnection) -> Finding:
     """MB-070: send a request with a wrong check sum (LRC)."""
     body = bytes((wire.unit,)) + wire.good
-    await wire.say(ascii_frame(body, lrc(body) ^ 0xFF), wire.good)
+    await wire.send(ascii_frame(body, lrc(body) ^ 0xFF), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
 async def second_colon(wire: DeviceConnection) -> Finding:
     """MB-070: send half a frame, then a whole frame. The colon begins a new frame."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[:7] + frame, wire.good)
+    await wire.send(frame[:7] + frame, wire.good)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the second")
 
@@ -220,18 +220,18 @@ async def second_colon(wire: DeviceConnection) -> Finding:
 async def gap_over_a_second(wire: DeviceConnection) -> Finding:
     """MB-070: send a frame with a pause of 1.5 s between two characters."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[:7], wire.good)
+    await wire.send(frame[:7], wire.good)
     await wire.pause(1.5)
-    await wire.say(frame[7:], wire.good, at_once=True)
+    await wire.send(frame[7:], wire.good, at_once=True)
     return await silent_then_good(wire, await wire.hear())
 
 
 async def gap_under_a_second(wire: DeviceConnection) -> Finding:
     """MB-070: send a frame with a pause of half a second between two characters."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[:7], wire.good)
+    await wire.send(frame[:7], wire.good)
     await wire.pause(0.5)
-    await wire.say(frame[7:], wire.good, at_once=True)
+    await wire.send(frame[7:], wire.good, at_once=True)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer")
 
@@ -245,7 +245,7 @@ async def no_character(wire: DeviceConnection) -> Finding:
     """MB-070: send a character other than 0 to F inside the frame."""
     frame = bytearray(wire.frame(wire.good))
     frame[5:6] = b"G"
-    await wire.say(bytes(frame), wire.good)
+    await wire.send(bytes(frame), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
@@ -267,7 +267,7 @@ async def frame_of_256(wire: DeviceConnection) -> Finding:
 async def frame_of_257(wire: DeviceConnection) -> Finding:
     """MB-050: send a frame of 257 bytes, which is one byte too long."""
     body = bytes((wire.unit,)) + longest(wire) + b"\x5a"
-    await wire.say(with_crc(body), longest(wire))
+    await wire.send(with_crc(body), longest(wire))
     await wire.pause(LONG_PAUSE_S)
     heard = await wire.hear()
     if not heard.nothing:

@@ -69,8 +69,8 @@ def traits_of(endpoint: Endpoint) -> frozenset[str]:
 
 async def check_modbus(
     options: ModbusOptions,
-    say: Callable[[str], None] = lambda text: None,
-    tell: Callable[[DeviceResult], None] = lambda result: None,
+    print_line: Callable[[str], None] = lambda text: None,
+    on_result: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
     """Run the whole check. Raises `Unreachable` without an answer, `NotAllowed` for foreign traffic on the line."""
     endpoint = Endpoint.parse(options.endpoint)
@@ -100,10 +100,10 @@ async def check_modbus(
                     hint="--share-bus runs the check all the same",
                 )
         await learn(wire, options.given, {table: at for table, (at, _) in options.may_write.items()})
-        say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
+        print_line(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
         identity = await read_identity(wire)
         before = transcript.spoken
-        results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
+        results = await play(wire, CASES, options.plan, transcript, clock, on_result, options.go_on)
         await wire.aclose()
     return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 

@@ -21,7 +21,7 @@ async def byte_by_byte(wire: DeviceConnection) -> Finding:
     """MB-051: send a request with each byte in its own segment."""
     frame = wire.frame(wire.good)
     for at in range(len(frame)):
-        await wire.say(frame[at : at + 1], wire.good, at_once=at > 0)
+        await wire.send(frame[at : at + 1], wire.good, at_once=at > 0)
         await wire.pause(0.002)
     heard = await wire.hear()
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer")
@@ -30,7 +30,7 @@ async def byte_by_byte(wire: DeviceConnection) -> Finding:
 async def several_at_once(wire: DeviceConnection) -> Finding:
     """MB-052: send three ADUs in one segment. The device must answer each or refuse it with exception 06, in order."""
     numbers = [wire.next_transaction() for _ in range(3)]
-    await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
+    await wire.send(b"".join(_adu(wire, n) for n in numbers), wire.good)
     heard = await wire.hear(3)
     got = [a.transaction for a in heard.answers]
     served = all(wire.is_good(a) or a.refusal == 0x06 for a in heard.answers)
@@ -45,7 +45,7 @@ async def several_at_once(wire: DeviceConnection) -> Finding:
 async def more_than_allowed(wire: DeviceConnection) -> Finding:
     """MB-053: send 40 requests at once: each is answered, or refused with 06."""
     numbers = [wire.next_transaction() for _ in range(40)]
-    await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
+    await wire.send(b"".join(_adu(wire, n) for n in numbers), wire.good)
     heard = await wire.hear(40)
     busy = [a for a in heard.answers if a.refusal == 0x06]
     if not busy and wire.good_reply[0] & 0x80:
@@ -63,8 +63,8 @@ async def more_than_allowed(wire: DeviceConnection) -> Finding:
 async def other_protocol(wire: DeviceConnection) -> Finding:
     """MB-054: send an ADU with protocol ID 1, then a good one."""
     odd, ours = wire.next_transaction(), wire.next_transaction()
-    await wire.say(_adu(wire, odd, protocol=1), wire.good)
-    await wire.say(_adu(wire, ours), wire.good)
+    await wire.send(_adu(wire, odd, protocol=1), wire.good)
+    await wire.send(_adu(wire, ours), wire.good)
     heard = await wire.hear()
     if any(a.transaction == odd for a in heard.answers):
         return failed(f"answers the ADU of another protocol: {heard}")
@@ -73,7 +73,7 @@ async def other_protocol(wire: DeviceConnection) -> Finding:
 
 async def _wrong_length(wire: DeviceConnection, adu: bytes) -> Finding:
     """Send an invalid ADU: it is discarded, or the connection is closed. A new connection has to be served in any case."""
-    await wire.say(adu, wire.good)
+    await wire.send(adu, wire.good)
     heard = await wire.hear()
     if heard.answers or heard.rest:
         return failed(f"{heard} instead of nothing, or an end of the connection")
@@ -113,7 +113,7 @@ async def length_ffff(wire: DeviceConnection) -> Finding:
 
 async def transaction_zero(wire: DeviceConnection) -> Finding:
     """MB-056: send transaction ID 0, which the device must echo."""
-    await wire.say(_adu(wire, 0), wire.good)
+    await wire.send(_adu(wire, 0), wire.good)
     heard = await wire.hear()
     good = answers_good(wire, heard, 1) and heard.answers[0].transaction == 0
     return passed() if good else failed(f"{_told(heard.first)} instead of an answer with id 0")
@@ -123,7 +123,7 @@ async def transaction_twice(wire: DeviceConnection) -> Finding:
     """MB-056: send two requests with the same transaction ID, the second after the answer to the first."""
     number = wire.next_transaction()
     for _ in range(2):
-        await wire.say(_adu(wire, number), wire.good)
+        await wire.send(_adu(wire, number), wire.good)
         heard = await wire.hear()
         if not answers_good(wire, heard, 1) or heard.answers[0].transaction != number:
             return failed(f"{_told(heard.first)} instead of an answer with id {number}")
@@ -163,7 +163,7 @@ async def unit_0(wire: DeviceConnection) -> Finding:
 async def half_and_gone(wire: DeviceConnection) -> Finding:
     """MB-064: send half a request and disconnect; the next client is served."""
     frame = wire.frame(wire.good)
-    await wire.say(frame[: len(frame) // 2], wire.good)
+    await wire.send(frame[: len(frame) // 2], wire.good)
     await wire.pause(0.05)
     return await _served_anew(wire, "left in the middle of a request")
 

@@ -198,7 +198,7 @@ async def broadcast_write(wire: DeviceConnection) -> Finding:
     async with _borrowed(wire, "holding") as (address, before):
         new = _other(before)
         pdu = _write("holding", address, new)
-        await wire.say(wire.frame(pdu, 0), pdu)
+        await wire.send(wire.frame(pdu, 0), pdu)
         heard = await wire.hear()
         if not heard.nothing:
             return failed(f"{heard} instead of silence")

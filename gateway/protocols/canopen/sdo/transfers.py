@@ -353,7 +353,8 @@ class SdoUpload(SdoTransfer):
 class SdoDownload(SdoTransfer):
     """A download: the client writes an object.
 
-    1 to 4 bytes are expedited; all else is segmented (an empty value: one empty segment, CO-030).
+    A value of 1 to 4 bytes is sent expedited. A longer value is sent in segments, and an empty value as one empty segment
+    (CO-030).
     """
 
     _reply = _DOWNLOAD_REPLY

@@ -207,7 +207,7 @@ class CanopenBus:
         driver = status.driver
         if not status.online or self._master is None or (self._allow_writes and driver.config.start):
             return ""
-        if not (tags := driver.unbrought):
+        if not (tags := driver.unreceived_tags):
             return ""
         why = "the system file has no `start: true`" if self._allow_writes else "a read-only plant starts no node"
         state = self._master.node_state(driver.node)
@@ -306,7 +306,7 @@ class CanopenBus:
         for tag in driver.profile.tags.values():
             if tag.readable:  # only now the gateway knows which tags a TPDO carries, and when the node sends it
                 self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
-        self._tags.put_bad([f"{driver.config.name}.{tag}" for tag in driver.unbrought], Reason.NOT_OPERATIONAL)
+        self._tags.put_bad([f"{driver.config.name}.{tag}" for tag in driver.unreceived_tags], Reason.NOT_OPERATIONAL)
         status.online, status.error = True, ""
         status.bring_ups += 1
         status.backoff.reset()

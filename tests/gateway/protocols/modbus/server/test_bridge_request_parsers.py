@@ -234,9 +234,9 @@ def test_without_permission_no_request_that_may_change_a_unit_passes(pdu: bytes)
     except ModbusExceptionReply:
         return
     everything = AllowRule(functions=frozenset(range(1, 128)))
-    assert (Policy((everything,)).judge("127.0.0.1", 1, asked) == ALLOWED) == (not asked.changes)
-    assert Policy((everything,), allow_writes=True).judge("127.0.0.1", 1, asked) == ALLOWED
-    if Policy((AllowRule(),), allow_writes=True).judge("127.0.0.1", 1, asked) == ALLOWED:
+    assert (Policy((everything,)).check("127.0.0.1", 1, asked) == ALLOWED) == (not asked.changes)
+    assert Policy((everything,), allow_writes=True).check("127.0.0.1", 1, asked) == ALLOWED
+    if Policy((AllowRule(),), allow_writes=True).check("127.0.0.1", 1, asked) == ALLOWED:
         assert not asked.changes  # a rule for reading passes no write, whatever the permissions
 
 

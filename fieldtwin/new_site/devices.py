@@ -82,7 +82,8 @@ class SiteDevice:
 
     @property
     def polled(self) -> dict[str, int]:
-        """Return the periods of the poll groups in ms: of the watched value and of `fast` 500 ms, of the others a second."""
+        """Return the periods of the poll groups in ms: 500 ms for the group of the watched value and for `fast`, 1000 ms for
+        the others."""
         first = self.watched.poll if self.watched is not None else ""
         groups = {
             g: 500 if g in (first, "fast") else 1000 for g in self.profile.groups if g == first or g not in NEVER_POLLED

@@ -118,7 +118,8 @@ class DeviceView:
 
     @property
     def is_simulated(self) -> bool:
-        """Return whether formulas compute the watched value: a measured number that is not a word or a scaled integer."""
+        """Return whether a formula in the prototype file computes the watched value. No formula computes a value with named
+        states, a bit, or a value whose scale factor is in a separate register."""
         tag, profile = self.watched, self._device.profile
         return (
             tag is not None and not tag.values and tag.type != "bool" and tag.scale_by is None and profile.inbox is None
@@ -253,7 +254,7 @@ def _with_header(path: str, text: str) -> str:
 
 
 def number(value: float) -> str:
-    """Return a number without a needless decimal point."""
+    """Return a number as text, without a decimal point if it is a whole number."""
     return f"{value:.10g}"
 
 

@@ -189,7 +189,7 @@ SystemKey = tuple[Path, str]
 
 
 def key_of(system: System) -> SystemKey:
-    """Return the identity of a system file, as it was read."""
+    """Return a key that identifies a system file with the content that was read."""
     return system.path, system.hash
 
 

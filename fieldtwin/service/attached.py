@@ -29,7 +29,8 @@ NEEDED = ("gateway", "plc")
 
 @dataclass(frozen=True)
 class ServiceOptions:
-    """`metrics` is ``HOST:PORT`` or empty; `log` is the format of events, empty for no log."""
+    """The options of a service. `metrics` is the address ``HOST:PORT`` of the metrics page, or empty; `log` is the format of
+    events, empty for no log."""
 
     metrics: str = ""
     log: Format | None = None

@@ -15,7 +15,8 @@ USEC_PER_S = 1_000_000
 
 
 class Notifier:
-    """`watchdog_s` is the watchdog timeout of the unit, 0 for none. Without a socket nothing is sent."""
+    """The sender of notifications to systemd. `watchdog_s` is the watchdog timeout of the systemd unit in seconds, 0 for none.
+    Without a socket nothing is sent."""
 
     def __init__(self, address: str = "", watchdog_s: float = 0.0) -> None:
         self.watchdog_s = watchdog_s

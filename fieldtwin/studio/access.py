@@ -50,7 +50,8 @@ def new_token() -> str:
 
 @dataclass(frozen=True)
 class Access:
-    """`operate` and `view` are the tokens of the roles; an empty one is not valid. `hosts` are the accepted ``Host`` headers.
+    """The rules of access to the server. `operate` and `view` are the tokens of the roles; an empty one is not valid. `hosts`
+    are the accepted ``Host`` headers.
 
     Without any token, every client has the role operate. That is only for loopback.
     """

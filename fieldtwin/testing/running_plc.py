@@ -20,8 +20,8 @@ WITHIN_S = 10.0
 class RunningPlc:
     """A running PLC.
 
-    ``plc["relay.state"]`` is the current value of a program's variable or a device's tag, a state by its name. It runs
-    by the wall clock; `wait` waits. Commands of a test are recorded like commands of a user, under the name ``test``.
+    ``plc["relay.state"]`` is the current value of a program's variable or a device's tag, a state by its name. It runs in real
+    time; `wait` waits for a value. Commands of a test are recorded like commands of a user, under the name ``test``.
     """
 
     def __init__(self, runner: WorkerProcess, bench: int, profiles: Sequence[str] = ()) -> None:

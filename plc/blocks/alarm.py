@@ -24,8 +24,7 @@ class _Limit:
         self.sign = sign
         self.violated = self.active = self.unacknowledged = False
         self._since_ns: int | None = None
-        """Since when it is violated. None also after a restart that kept the other state: then the delay starts
-        anew."""
+        """Since when it is violated. None also after a restart that kept the other state: then the delay starts again."""
 
     def watch(self, x: float, limit: float, hysteresis: float, delay_ns: int, now_ns: int) -> None:
         beyond = (x - limit) * self.sign

@@ -13,7 +13,7 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
     why       {"tag": ...}: which program last changed it, when, and what it saw; what that program waits for before it starts
     origin    {"tag": ..., "value": ...}: the program and the line of its source that set the tag to this value
     limits    {"tags": {name: [low, high] or null}}: limits in place of those in the image's layout, after a reload
-    restart   create the programs anew: {"cold": true} without retained variables
+    restart   create the programs again: {"cold": true} without retained variables
     sources   the programs whose files changed since the PLC read them
     about     of each program: variables, states with transitions, and the text of its source; this changes at a restart only
     stop      make the outputs safe, then end the process

@@ -1,10 +1,10 @@
 """The runner of a PLC's tasks: it runs the tasks by priority, one after the other, and restarts programs after some failures.
 
-Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one
-thread, so a task is never interrupted. Of the tasks that are due, the one with the smallest PRIORITY number runs first;
-among equals, the one that has waited longest. If one task stops by itself, all tasks stop, with the outputs safe. After
-a stop by the watchdog, or a scan that did not end, the programs are created anew and start warm, at most `max_restarts`
-times in a row. A program runs only after its inputs have been good once (fieldtwin.plc.cycle.start), also after a restart.
+Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one thread,
+so a task is never interrupted. Of the tasks that are due, the one with the smallest PRIORITY number runs first; among equals,
+the one that has waited longest. If one task stops by itself, all tasks stop, with the outputs safe. After a stop by the
+watchdog, or a scan that did not end, the programs are created again and start warm, at most `max_restarts` times in a row. A
+program runs only after its inputs have been good once (fieldtwin.plc.cycle.start), also after a restart.
 
 Like a `CyclicTask`, the runner provides `deadline_ns` and `run_once`. It cannot distinguish the wall clock from virtual time.
 """

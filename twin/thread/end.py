@@ -22,7 +22,8 @@ from fieldtwin.twin.thread.status import ReceivedLog, ThreadStatus
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S
-"""A link that lasts this long counts as good. Two followers of the same place alternate at this interval."""
+"""A link that lasts this long counts as good. If two followers use the same place, each displaces the other after about this
+time."""
 READ_BLOCK = 1000
 STORE_PAUSE_NS = NS_PER_S
 

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.run.emulate.fault_counts import struck
+from fieldtwin.run.emulate.fault_counts import effect_text
 
 BITRATE = 125_000
 """The bit rate of a bus that the link runs itself, if its endpoint has no ``bitrate=``."""
@@ -110,7 +110,7 @@ async def _run(
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
         for active in put_in:
-            stderr.print(struck(active), soft_wrap=True, markup=False)
+            stderr.print(effect_text(active), soft_wrap=True, markup=False)
     return 0
 
 

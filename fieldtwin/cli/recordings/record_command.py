@@ -227,7 +227,7 @@ class _Job:
         """Record a serial line that this process relays between two ports."""
 
         def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
-            return LineTap(near, far, sink, say=self._say, clock=self._clock).run
+            return LineTap(near, far, sink, on_message=self._print_message, clock=self._clock).run
 
         return self._line(far, tapped, "tapped", OF_TAP, "bytes to the device", "back")
 
@@ -235,7 +235,7 @@ class _Job:
         """Record a serial line between other devices, to which one adapter listens."""
         return self._line(
             port,
-            lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,
+            lambda sink: LineSniffer(port, sink, on_message=self._print_message, clock=self._clock).run,
             "sniffed",
             OF_SNIFFER,
             "bytes of requests",
@@ -243,7 +243,7 @@ class _Job:
         )
 
     @staticmethod
-    def _say(text: str) -> None:
+    def _print_message(text: str) -> None:
         stderr.print(text, soft_wrap=True, markup=False)
 
     def _line(

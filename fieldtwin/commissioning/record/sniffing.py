@@ -10,7 +10,7 @@ import asyncio
 
 from fieldtwin.capture.decoding.modbus_frames import ModbusFrame, splitter
 from fieldtwin.capture.recordings.sinks import LineSink
-from fieldtwin.commissioning.record.tapping import Say
+from fieldtwin.commissioning.record.tapping import OnMessage
 from fieldtwin.commissioning.scan.traffic import SETTLE_NS, is_reply
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -63,13 +63,13 @@ class LineSniffer:
     """A passive listener at `port` that passes every frame with its direction to `sink`."""
 
     def __init__(
-        self, port: Endpoint, sink: LineSink, *, say: Say = lambda text: None,
+        self, port: Endpoint, sink: LineSink, *, on_message: OnMessage = lambda text: None,
         connector: Connector | None = None, clock: Clock | None = None,
     ) -> None:  # fmt: skip
         framing = framing_of(port)
         if not port.is_serial or framing not in ("rtu", "ascii"):
             raise UsageError("--sniff needs a serial line", expected="such as rtu:/dev/ttyUSB0", got=str(port))
-        self._port, self._sink, self._say = port, sink, say
+        self._port, self._sink, self._on_message = port, sink, on_message
         self._directions = Directions(framing)
         self._connector, self._clock = connector or OsConnector(), clock or WallClock()
 
@@ -79,7 +79,7 @@ class LineSniffer:
         Raises `Unreachable` where the port cannot be opened, `ConnectionLost` when it is lost.
         """
         connection = await self._connector.open_bytes(self._port)
-        self._say(f"listening at {self._port}; nothing is sent")
+        self._on_message(f"listening at {self._port}; nothing is sent")
         try:
             while not stop.is_set():
                 data = await connection.read_within(SETTLE_NS / NS_PER_S)

@@ -20,23 +20,23 @@ from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
 
-Say = Callable[[str], None]
+OnMessage = Callable[[str], None]
 
 
 class LineTap:
-    """A relay between `near` and `far` that reports to `sink`. `say` is called with messages for the user.
+    """A relay between `near` and `far` that reports to `sink`. `on_message` is called with messages for the user.
 
     A TCP client that disconnects is not an error. A device that cannot be reached for a client is not an error either: the next
     client may connect.
     """
 
     def __init__(
-        self, near: Endpoint, far: Endpoint, sink: LineSink, *, say: Say = lambda text: None,
+        self, near: Endpoint, far: Endpoint, sink: LineSink, *, on_message: OnMessage = lambda text: None,
         connector: Connector | None = None, clock: Clock | None = None,
     ) -> None:  # fmt: skip
         if near.is_can or far.is_can or far.scheme == "pty":
             raise UsageError("only a byte stream can be tapped", expected="serial ports or TCP", got=f"{near}, {far}")
-        self._near, self._far, self._sink, self._say = near, far, sink, say
+        self._near, self._far, self._sink, self._on_message = near, far, sink, on_message
         self._connector = connector or OsConnector()
         self._clock = clock or WallClock()
         self._failed: asyncio.Future[None] | None = None
@@ -55,14 +55,14 @@ class LineTap:
             if self._near.scheme in ("tcp", "rtu+tcp"):
                 listener = await SocketListener.open(self._near, self._serve, 1)
                 closing.append(listener)
-                self._say(f"{listener.bound}  ⇄  {self._far}")
+                self._on_message(f"{listener.bound}  ⇄  {self._far}")
             else:
                 far = await self._connector.open_bytes(self._far)
                 closing.append(far)
                 near = await self._open_near()
                 closing.append(near)
                 running.append(asyncio.ensure_future(self._carry(near, far)))
-                self._say(f"{self._near.path}  ⇄  {self._far}")
+                self._on_message(f"{self._near.path}  ⇄  {self._far}")
             await asyncio.wait([stopping, *running], return_when=asyncio.FIRST_COMPLETED)
             for done in running:
                 if done.done():
@@ -88,13 +88,13 @@ class LineTap:
         try:
             far = await self._connector.open_bytes(self._far)
         except Unreachable as e:
-            self._say(f"{client.peer} was rejected: {e}")
+            self._on_message(f"{client.peer} was rejected: {e}")
             return
-        self._say(f"{client.peer} came")
+        self._on_message(f"{client.peer} came")
         try:
             await self._carry(client, far)
         except ConnectionLost as e:
-            self._say(f"{client.peer} is gone: {e}")
+            self._on_message(f"{client.peer} is gone: {e}")
         except FieldtwinError as e:
             if self._failed is not None and not self._failed.done():
                 self._failed.set_exception(e)

@@ -39,8 +39,8 @@ SHARED_QUIET_NS = 30 * NS_PER_MS
 QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
 """Default timeout of each reply, in seconds.
 
-libmodbus's servers take a frame within 500 ms after a question to another unit for its answer, and miss a question that
-comes sooner: a sweep that is to find them must be this slow.
+A server of libmodbus takes any frame that arrives within 500 ms after a question to another unit for the answer of that unit.
+Only a sweep that asks more slowly finds such servers.
 """
 MANY_FAILURES = 3
 MOST_BREAKS = 3

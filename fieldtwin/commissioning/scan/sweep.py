@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.modbus.requests.data import ReadRegisters
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 PROBE = ReadRegisters("holding", 0, 1)
-"""The request: to read a register that most devices have.
+"""The request of a sweep: it reads a register that most devices have.
 
 A device without it answers with an exception, which shows that it is present.
 """

@@ -76,7 +76,8 @@ class Heard:
 
 
 class LineListener:
-    """A listener for `framing` (rtu or ascii). `feed` received bytes; call `settle` from time to time, or during silence."""
+    """A listener for `framing` (rtu or ascii). Call `feed` with received bytes, and `settle` from time to time or during
+    silence."""
 
     def __init__(self, framing: Framing) -> None:
         self.heard = Heard(framing)

@@ -46,7 +46,7 @@ MANY = 1_000_000
 
 
 class Playable(Protocol):
-    """A case with its reply function, for any protocol: see `C` and `CanopenCase`."""
+    """A case with its reply function, for any protocol: see `ModbusCase` and `CanopenCase`."""
 
     @property
     def about(self) -> ClientCase: ...
@@ -71,7 +71,7 @@ C_contra = TypeVar("C_contra", bound=Playable, contravariant=True)
 
 
 class HostileDevice(Protocol[C_contra]):
-    """The test setup of the cases: see `modbus_stage.Stage`. Times are its `now_ns`."""
+    """The simulated device with which the cases run: see `HostileServer` and `HostileNode`. Times are its `now_ns`."""
 
     recorder: Recorder
     timeout_s: float

@@ -58,7 +58,7 @@ OWN = "fieldtwin"
 class Elsewhere:
     """The basis and the source of a case on one kind of transport, where they differ from those on all others.
 
-    `trait` is the transport's name in the program (see `Stage` and `ModbusWire`), `wire` its name for users.
+    `trait` is the transport's name in the program (see `HostileServer` and `RtuWire`), `wire` its name for users.
     """
 
     trait: str

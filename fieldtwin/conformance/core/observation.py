@@ -110,7 +110,7 @@ class ValuePublished:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """Raised when the program under test ended unexpectedly."""
+    """The unexpected end of the program under test. `status` is its exit code."""
 
     t_ns: int
     status: int

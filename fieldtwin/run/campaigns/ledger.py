@@ -1,4 +1,4 @@
-"""The ledger of virtual hours: one line per finished run, so that nights add up and no run is repeated.
+"""The ledger of virtual hours: one line per finished run, so that the hours of several nights add up and no run is repeated.
 
 A line belongs to a fingerprint of system and prototype file, version, virtual time and faults. Only lines with the same
 fingerprint mark a seed as done.

@@ -13,7 +13,7 @@ DEFAULT_BIT_RATE = 125_000
 
 
 def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
-    """Return the bus if `endpoints` is exactly one bus. Raises `UsageError` otherwise."""
+    """Return the only one of `wires`, which has to be a CAN bus. Raises `UsageError` otherwise."""
     if len(wires) != 1 or not wires[0].is_can:
         raise UsageError(
             "a CANopen node needs a CAN bus",

@@ -47,7 +47,7 @@ from fieldtwin.gateway.core.files.recording import looks_like_another_file, show
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.can_bus import only_bus, open_bus
 from fieldtwin.run.emulate.data_sheet import print_remarks, report_second_node
-from fieldtwin.run.emulate.fault_counts import struck
+from fieldtwin.run.emulate.fault_counts import effect_text
 from fieldtwin.run.emulate.serve_until import serve_until
 from fieldtwin.twin.site.data_files import find_recording
 
@@ -122,7 +122,7 @@ async def run_device(
     finally:
         await host.aclose()
         for active in faults.put_in if faults is not None else ():
-            stderr.print(struck(active), soft_wrap=True, markup=False)
+            stderr.print(effect_text(active), soft_wrap=True, markup=False)
     return 0
 
 

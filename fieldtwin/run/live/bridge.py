@@ -92,8 +92,8 @@ def instance_name(options: BridgeOptions) -> str:
     return options.instance or "bridge-" + re.sub(r"[^A-Za-z0-9.]+", "-", where).strip("-")[-32:]
 
 
-async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Run the bridge until SIGINT or SIGTERM and return its counters. `say` is called with each status message for the user.
+async def run_bridge(options: BridgeOptions, report: Callable[[str], None]) -> dict[str, Any]:
+    """Run the bridge until SIGINT or SIGTERM and return its counters. `report` is called with each status message for the user.
 
     Raises `UsageError` for endpoints that cannot form a bridge, `EndpointBusy` or `Unreachable` when it cannot listen.
     """
@@ -111,12 +111,12 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
             bus = ModbusBus(config, [], connector, clock, TagTable(clock), lambda driver: None)
             bridge = Bridge(bridge_config(options), {TARGET: bus}, connector, clock, audit)
             if options.allow_writes:
-                say(f"writes are recorded in {instance.path('audit.jsonl')}")
+                report(f"writes are recorded in {instance.path('audit.jsonl')}")
             async with Nursery() as nursery:
                 nursery.start(bus.run(), "target")
                 nursery.start(bridge.run(), "bridge")
                 stopping = nursery.start(stop.wait(), "until stopped")
-                nursery.start(_report(bridge, bus, clock, say), "report")
+                nursery.start(_report(bridge, bus, clock, report), "report")
                 failing = asyncio.ensure_future(nursery.wait())
                 try:
                     await asyncio.wait([stopping, failing], return_when=asyncio.FIRST_COMPLETED)
@@ -131,7 +131,7 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
             audit.close()
 
 
-async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, say: Callable[[str], None]) -> None:
+async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, report: Callable[[str], None]) -> None:
     """Report where the bridge listens, and each connection and disconnection of an end. A missing end is retried forever."""
     said: tuple[str, str] | None = None
     while True:
@@ -141,8 +141,8 @@ async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, say: Callabl
         settled = bus.connected or there
         if settled and (bound is not None or bridge.config.listen.is_serial) and (here, there) != said:
             if said is None or not (here or there):
-                say(f"{bound or bridge.config.listen}  →  {bus.config.endpoint}")
+                report(f"{bound or bridge.config.listen}  →  {bus.config.endpoint}")
             for error in filter(None, (here, there)):
-                say(f"waiting: {error}")
+                report(f"waiting: {error}")
             said = here, there
         await clock.sleep_until_ns(clock.monotonic_ns() + WATCH_NS)

@@ -44,7 +44,7 @@ class _Held:
 
 
 class AgeOracle:
-    """The check of one system. The caller reports `published` and `held` values in order of time, and then calls `judge`."""
+    """The check of one system. The caller reports `published` and `held` values in order of time, and then calls `check`."""
 
     def __init__(self) -> None:
         self.checked = 0

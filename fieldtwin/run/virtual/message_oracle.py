@@ -12,7 +12,7 @@ MOST_KEPT = 100_000
 class MessageOracle:
     """A comparison of the messages that arrived with those that were sent.
 
-    Call `watch`, then `judge`; `wrong` lists the differences.
+    Call `watch`, then `check`; `wrong` lists the differences.
 
     A command may be lost, because faults may lose it. It may not arrive twice, before an older one, or with different
     bytes.

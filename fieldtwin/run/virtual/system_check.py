@@ -49,7 +49,7 @@ _GOOD = Quality.GOOD  # module constants, because looking up members of an Enum 
 
 
 class SystemCheck:
-    """The checks of one system: `attach`, then `judge` from time to time, `finish`, and `summary`.
+    """The checks of one system. Call `attach`, then `check` from time to time, then `finish`, and then `summary`.
 
     `faults` are those that are injected into this system. `disturbed`: whether the counts of both sides may differ;
     by default if there are faults. `may_refuse`: tags of which a scenario expects that their outputs are refused.

@@ -53,7 +53,7 @@ def _command(run: VirtualPrototype, period_s: Number) -> None:
         run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
 
 
-def otherwise(run: VirtualPrototype, state: KnownState) -> list[str]:
+def not_restored(run: VirtualPrototype, state: KnownState) -> list[str]:
     """Return the programs that have started and whose state is not the known one."""
     waiting = {f"{start.name}.state" for start in run.plc.starts.waiting}
     outputs = {tag: value for tag, value in run.plc.outputs.last().items() if tag not in waiting}

@@ -26,7 +26,7 @@ from fieldtwin.plc.cycle.publishing import TagChange
 from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
-from fieldtwin.run.what_if.begin import begin, otherwise, retain_for
+from fieldtwin.run.what_if.begin import begin, not_restored, retain_for
 from fieldtwin.run.what_if.outcome import PlanOutcome, Requirement, Series
 from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
@@ -187,7 +187,7 @@ class _ForkRun:
             if not begun and (not run.plc.starts.waiting or loop.now_ns >= settled_ns):
                 begun = True
                 if all(c.at_s > max(BEGUN_S, self._now_s()) for c in self.plan.commands):
-                    self.outcome.not_taken.extend(otherwise(run, self.fork.state))
+                    self.outcome.not_taken.extend(not_restored(run, self.fork.state))
             if loop.now_ns >= settled_ns:
                 for requirement, expression in self._requirements:
                     self._judge(requirement, expression)

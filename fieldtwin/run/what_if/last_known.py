@@ -18,7 +18,8 @@ from fieldtwin.twin.site.system import System
 
 
 class LastKnown:
-    """Keeps the newest value of each name from `take`, which accepts events of one or several logs, each in order.
+    """Keeps the newest value of each name. Events are passed to `take`, which accepts events of one or several logs, each in
+    order.
 
     A value that turned bad is not known.
     """

@@ -19,7 +19,7 @@ def fault_id(n: int, step: Step) -> str:
 def without_effect(scenario: Scenario, struck: Sequence[Struck], now_ns: int) -> Iterator[tuple[CheckResult, str]]:
     """Yield an inconclusive result for each fault that never took effect, then for each value that was set without effect.
 
-    Each comes with the reason that it is for the verdict on the scenario.
+    Each comes with the reason that is given for the verdict on the scenario.
     """
     steps = {fault_id(n, step): n for n, step in enumerate(scenario.form.steps) if step.fault is not None}
     for one in struck:

@@ -15,7 +15,7 @@ from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.language.expression import Expression
 
 BUDGET = 2.0
-"""The time budget of a late host: a check takes at most this many times its own time longer. After that it is
+"""The limit for a late host: a check takes longer than its own time by at most this multiple of that time. After that it is
 INCONCLUSIVE.
 """
 LOOK_S = 0.03

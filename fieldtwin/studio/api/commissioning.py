@@ -101,7 +101,7 @@ async def get_file(request: Request) -> Response:
 
 
 async def get_draft(request: Request) -> dict[str, Any]:
-    """Return the text of a profile with what is wrong with it."""
+    """Return the text of a profile, and its errors."""
     folder = _jobs(request).folder
     name = request.path_params["name"]
     text, version = folder.draft(name)
@@ -118,7 +118,7 @@ async def check_text(request: Request) -> dict[str, Any]:
 
 
 async def save_draft(request: Request) -> dict[str, Any]:
-    """Write a profile to the working folder, even with errors, and return what is wrong with it."""
+    """Write a profile to the working folder, even with errors, and return its errors."""
     form = await body_of(request, DraftForm)
     folder = _jobs(request).folder
     name = request.path_params["name"]

@@ -32,7 +32,8 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Operation:
-    """`path` begins after /api/v1. `body` is the form of a request with content. `changes`: the role operate is required.
+    """An operation of the interface. `path` begins after /api/v1. `body` is the form of a request with content. `changes`: the
+    role operate is required.
 
     `handler` returns data for JSON, or a complete response.
     """

@@ -20,7 +20,7 @@ from fieldtwin.studio.live.subscription import Subscription
 FULL = 4503
 """The code with which a further client is refused."""
 SENT_WITHIN_S = 10.0
-"""A client that takes nothing for so long is disconnected."""
+"""A client that takes no data for this many seconds is disconnected."""
 
 
 async def stream(socket: WebSocket) -> None:

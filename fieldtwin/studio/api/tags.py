@@ -82,7 +82,7 @@ async def set_value(request: Request) -> dict[str, Any]:
 
 
 async def release_value(request: Request) -> dict[str, Any]:
-    """Give a simulated device its own value back."""
+    """Release a value that was set: the simulated device holds its own value again."""
     attachment = await prototype(request)
     device, name = tag_of(request, attachment)
     now_ns = attachment.now_ns()

@@ -29,7 +29,8 @@ async def list_traces(request: Request) -> list[dict[str, Any]]:
 
 
 async def get_trace(request: Request) -> dict[str, Any]:
-    """Return what a trace is of: the system, the extent, and the marks. The extent grows while the run continues."""
+    """Return the description of a trace: its system, its first and last time, and its marks. The last time increases while the
+    run continues."""
     replay = await _opened(request)
     marks, left_out = marks_of(replay.log, replay.about, list(replay.system.plc.programs))
     about = replay.about
@@ -76,7 +77,7 @@ async def get_trace_state(request: Request) -> dict[str, Any]:
 
 
 async def get_trace_recent(request: Request) -> dict[str, Any]:
-    """Return of each tag the numbers of the minute before an instant: [time in ns, number, or null for a bad value]."""
+    """Return, for each tag, its numbers in the minute before an instant: [time in ns, number, or null for a bad value]."""
     replay = await _opened(request)
     return recent(replay.history, replay.tag_names, _instant(request, replay))
 
@@ -116,7 +117,7 @@ async def get_trace_frame(request: Request) -> dict[str, Any]:
 
 
 async def get_trace_programs(request: Request) -> dict[str, Any]:
-    """Return of each program its variables, its states and transitions, and the text of its source as the run read it."""
+    """Return, for each program, its variables, its states and transitions, and the text of its source as the run read it."""
     replay = await _opened(request)
     return msgspec.to_builtins(replay.about.programs) if replay.about is not None else {}
 

@@ -46,7 +46,7 @@ class Command:
     out: str = ""
     as_json: bool = True
     lasts: bool = field(default=False)
-    """It runs until it is stopped."""
+    """Whether the command runs until it is stopped."""
 
     @property
     def line(self) -> str:
@@ -56,7 +56,7 @@ class Command:
 
 
 class Step(Struct, tag_field="step", forbid_unknown_fields=True, kw_only=True):
-    """A form of a step."""
+    """The form of one step of the guide."""
 
     def command(self, folder: WorkFolder) -> Command:
         """Return the command line of the filled form. Raises `UsageError` for a value that it must not contain."""
@@ -98,7 +98,7 @@ class Scan(Step, tag="scan"):
 
 
 class Identify(Step, tag="identify"):
-    """Ask one device who it is. `address` is its unit ID, on a CAN bus its node ID."""
+    """Ask one device for its identification. `address` is its unit ID, on a CAN bus its node ID."""
 
     endpoint: Url
     address: Address = 1
@@ -256,7 +256,7 @@ class Report(Step, tag="report"):
     customer: Text = ""
     remarks: Text = ""
     device: Text = ""
-    """The device as the document numbers it, such as ``unit 3``, for label and serial number."""
+    """The name of the device in the document, such as ``unit 3``, to which label and serial number belong."""
     label: Text = ""
     serial: Text = ""
 

@@ -49,7 +49,7 @@ BUCKETS_EVERY_S = 2.0
 """The distribution of scan times is read less often, because it takes the PLC longer than the rest of its brief status."""
 FIELD_EVERY_S = 0.5
 FRAMES_EVERY_S = 0.02
-TOLD_EVERY_S = 0.04
+FRAME_COUNT_EVERY_S = 0.04
 """The shortest time between two messages with the number of frames."""
 RECORD_EVERY_S = 0.5
 AGAIN_AFTER_S = 1.0
@@ -285,7 +285,7 @@ class Attachment:
         told, told_ns = -1, 0
         while True:
             new = frames.follow()
-            if len(frames) != told and self.now_ns() - told_ns >= TOLD_EVERY_S * NS_PER_S:
+            if len(frames) != told and self.now_ns() - told_ns >= FRAME_COUNT_EVERY_S * NS_PER_S:
                 told, told_ns = len(frames), self.now_ns()
                 self.updates.publish({"type": "frames"} | _counts(frames))
             await asyncio.sleep(0 if new else FRAMES_EVERY_S)

@@ -19,7 +19,7 @@ BAD = "bad"
 NEVER = Point(0, None, BAD, "never_read")
 RATE_OVER_NS = 5 * NS_PER_S
 LOOKS_BACK = 200
-"""Frames of a device among which a later reading of an unchanged value is searched for."""
+"""Number of frames of a device that are searched for a later reading of an unchanged value."""
 
 
 def state_at(replay: Replay, t_ns: int) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from fieldtwin.twin.site.data_files import search_path
 from fieldtwin.twin.site.system import System, load_system
 
 LOOK_EVERY_S = 0.25
-"""How often a file that has been read to its end is looked at again."""
+"""Interval in seconds at which a file that has been read to its end is examined again."""
 ABOUT_EVERY_S = 1.0
 
 

@@ -28,9 +28,10 @@ MOST_VALUES = 10_000_000
 """Events of tags and variables: 180 MB."""
 MOST_NAMES = 20_000
 MOST_EVENTS = 50_000
-"""Faults, and steps of scenarios; each of them."""
+"""Largest number of fault events, and of step events of scenarios."""
 LATE_NS = 60 * NS_PER_S
-"""How much older than the latest event one may be. Events of several processes are not exactly in order."""
+"""An event may be older than the latest one by at most this much (ns), because events of several processes are not exactly in
+order."""
 LONGEST_NS = 1 << 53
 """The latest time that a page can show exactly: 104 days."""
 BAD_VERDICTS = frozenset(verdict.value for verdict in Verdict if verdict.bad)
@@ -56,9 +57,9 @@ class StepEvent(NamedTuple):
 
 
 class AfterCheck:
-    """Separates a failed check from what the run did after it at the same instant, such as to stop the gateway.
+    """Separates a failed check from later actions of the run at the same instant, such as stopping the gateway.
 
-    Those events are shown 1 ns later, so that the instant of the check shows what the check has judged.
+    Those events are shown 1 ns later, so that the instant of the check shows the state that the check has examined.
     """
 
     def __init__(self) -> None:
@@ -104,7 +105,7 @@ class TraceLog:
 
     @property
     def is_replaced(self) -> bool:
-        """Return whether a file of this name is not the one that is read any more, or was written anew."""
+        """Return whether the file was replaced by another file of the same name, or was written again from its beginning."""
         try:
             now, own = self.path.stat(), os.fstat(self._file.fileno())
         except OSError:

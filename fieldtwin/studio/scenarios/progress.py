@@ -9,7 +9,7 @@ import msgspec
 
 AT_ONCE_BYTES = 1 << 20
 MOST_VALUES = 20_000
-"""As many as a run writes."""
+"""The largest number of values that are kept: as many as a run writes."""
 MOST_LINE_BYTES = 1 << 20
 
 

@@ -21,7 +21,7 @@ BRIEF_NS = 500_000_000
 MOST_OF_A_PERIOD = 40
 """Expectations after one action."""
 RESTLESS = 3
-"""A tag whose quality changes more often after one action is not expected to have one."""
+"""A tag whose quality changes more often than this after one action is not expected to have a certain quality."""
 SLACK_S = 4.0
 """An effect may take twice as long as observed, and this much longer: polls have another phase in each run."""
 RECOVERY_SLACK_S = 10.0

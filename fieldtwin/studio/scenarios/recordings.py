@@ -102,7 +102,8 @@ class Recordings:
 
 
 def named_from(folder: Path, system: Path) -> str:
-    """Return what a scenario in `folder` says under `system`: the name of a shipped system, or a path from the folder."""
+    """Return the value of the key `system` for a scenario in `folder`. It is the name of a shipped system, or a path from the
+    folder."""
     name = system.name.removesuffix(".yaml")
     shipped = next((f for place in search_path() if (f := place / "systems" / system.name).is_file()), None)
     if shipped is not None and shipped.resolve() == system.resolve():

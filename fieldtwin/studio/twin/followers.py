@@ -116,7 +116,7 @@ def starting_commands(attachment: Attachment, thread: PlantThreadStatus | None) 
 
 
 def short_system(record: RunRecord) -> str:
-    """Return what names the system of a run on a command line: the name of a shipped system, or the path of its file."""
+    """Return the text that names the system of a run on a command line: the name of a shipped system, or the path of its file."""
     path = Path(record.path)
     shipped = any(path.is_relative_to(place) for place in search_path())
     return path.stem if shipped else record.path

@@ -293,8 +293,8 @@ class Expressions:
     def in_out(
         self, expr: t.Expr | None, name: str, kind: ty.Type, call: t.Call, of: str, cells: dict[str, str]
     ) -> str:
-        """Return the Python expression of the argument for VAR_IN_OUT `name` of `of`. A function's own variables are
-        passed in cells: `cells` receives each variable with its cell, until `take_back`."""
+        """Return the Python expression of the argument for VAR_IN_OUT `name` of `of`. A function's own variables are passed in
+        cells: `cells` receives each variable with its cell, so that `take_back` can assign the values back after the call."""
         if not isinstance(expr, t.Ref):
             self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
         target = self.writable(expr)

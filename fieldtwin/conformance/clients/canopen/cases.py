@@ -53,7 +53,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, check: CheckFunction,
 RESTART_S = 2.0
 """Time within which a master has to notice that a node booted, and to start it."""
 SILENT = _case("CO-000", "no reply", ROBUST, "", READ, plays.nothing, checks.rejects, "is silent", "")
-"""This is not a test case: it measures the master's timeout."""
+"""A pseudo case, which is not in the test-case list: it measures the master's timeout."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
 DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 
@@ -156,4 +156,4 @@ CASES: tuple[CanopenCase, ...] = (
     _watch("CO-047", "SYNC of the wrong length", REQUIRED, "7.2.5", legal_sync,
           "send SYNC with no byte, or with the counter alone"),
 )  # fmt: skip
-"""In the order of execution; observers check the whole run at the end."""
+"""All cases in the order of execution. Cases that only observe come last and check the whole run."""

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Collection
 
 from fieldtwin.conformance.clients.canopen.device import BOOT_UP, STOPPED, HonestNode
-from fieldtwin.conformance.clients.canopen.setup import CanopenCase, SayFrame, SdoRequestContext
+from fieldtwin.conformance.clients.canopen.setup import CanopenCase, SdoRequestContext, SendFrame
 from fieldtwin.conformance.clients.recorder import Recorder
 from fieldtwin.conformance.core.observation import Garbled, ReplySent, RequestSeen, Sent, Word
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -28,7 +28,7 @@ MASTER = 1
 
 
 class HostileNode:
-    """The CANopen counterpart of `modbus_stage.Stage`.
+    """The CANopen counterpart of `fieldtwin.conformance.clients.modbus.hostile_server.HostileServer`.
 
     `size` is the number of bytes of an object, `heartbeat_s` the heartbeat period of known nodes (0: none), `nodes` are
     those that boot by themselves.
@@ -129,7 +129,7 @@ class HostileNode:
         true = (*server.answer(request, now_ns), *(self._early(server, now_ns) if receiving else ()))
         case = self._playing
         if case is None or self._memory is None or not true:
-            self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
+            self._send([SendFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
             return
         poison = self._words[2]
         scene = SdoRequestContext(
@@ -204,7 +204,7 @@ class HostileNode:
         self.last_ns = self.now_ns()
         self.pending -= 1
 
-    def _send(self, moves: list[SayFrame], now_ns: int) -> None:
+    def _send(self, moves: list[SendFrame], now_ns: int) -> None:
         """Send frames in order; correct answers wait until pending faulty ones were sent."""
         if not moves:
             return
@@ -216,7 +216,7 @@ class HostileNode:
         self.pending += len(timed)
         self._nursery.start(self._make(timed), "frames")
 
-    async def _make(self, timed: list[tuple[int, SayFrame]]) -> None:
+    async def _make(self, timed: list[tuple[int, SendFrame]]) -> None:
         left = len(timed)
         try:
             for t_ns, move in timed:

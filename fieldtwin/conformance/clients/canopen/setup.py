@@ -13,8 +13,8 @@ SDO_REPLY = 0x580
 
 
 @dataclass(frozen=True, slots=True)
-class SayFrame:
-    """Send `frame`, `after_s` seconds after the request."""
+class SendFrame:
+    """A step of a hostile node: send `frame`, `after_s` seconds after the request."""
 
     frame: CanFrame
     after_s: float = 0.0
@@ -40,26 +40,26 @@ class SdoRequestContext:
     timeout_s: float = 1.0
     memory: dict[str, int] = field(default_factory=dict)
 
-    def reply(self, data: bytes, after_s: float = 0.0, *, good: bool = False) -> SayFrame:
+    def reply(self, data: bytes, after_s: float = 0.0, *, good: bool = False) -> SendFrame:
         """Return an SDO reply of this node."""
-        return SayFrame(CanFrame(SDO_REPLY + self.node, data), after_s, good)
+        return SendFrame(CanFrame(SDO_REPLY + self.node, data), after_s, good)
 
-    def honest(self, after_s: float = 0.0) -> list[SayFrame]:
+    def honest(self, after_s: float = 0.0) -> list[SendFrame]:
         """Return the correct replies, in plain frames."""
         return [self.reply(data, after_s, good=True) for data in self.true]
 
-    def frame(self, base: int, data: bytes) -> SayFrame:
+    def frame(self, base: int, data: bytes) -> SendFrame:
         """Return a frame with an identifier of the predefined connection set."""
-        return SayFrame(CanFrame(base + self.node, data))
+        return SendFrame(CanFrame(base + self.node, data))
 
 
-SdoReplyFunction = Callable[[SdoRequestContext], list[SayFrame]]
+SdoReplyFunction = Callable[[SdoRequestContext], list[SendFrame]]
 CanWants = Literal["upload", "download", "block upload", "block download", "guard request", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class CanopenCase:
-    """A `scene.ModbusCase` for SDO transfers.
+    """The CANopen counterpart of `fieldtwin.conformance.clients.modbus.setup.ModbusCase`, for SDO transfers.
 
     `misses`: the segment of a block download that the node ignores, 0 for none; `early`: the segment after which it
     acknowledges the sub-block although more follow; `mutes`: the messages that the node omits for `mute_s` from the

@@ -68,7 +68,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, check: CheckFunction,
 
 
 SILENT = _bad("MB-000", "no reply", ROBUST, "", line_plays.nothing, "is silent")
-"""This is not a test case: it measures the client's timeout."""
+"""A pseudo case, which is not in the test-case list: it measures the client's timeout."""
 
 CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", REQUIRED, "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),
@@ -195,4 +195,4 @@ CASES: tuple[ModbusCase, ...] = (
     _bad("MB-070c", "ASCII: a gap over 1 s", REQUIRED, "SL 2.5.2.1", line_plays.long_gap, "pauses 1.2 s inside a reply",
          "discard it; go on").on(framings=ASCII),
 )  # fmt: skip
-"""In the order of execution; observers check the whole run at the end."""
+"""All cases in the order of execution. Cases that only observe come last and check the whole run."""

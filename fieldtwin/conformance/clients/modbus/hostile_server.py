@@ -18,7 +18,15 @@ from fieldtwin.conformance.clients.modbus.device import (
     ModbusWire,
     RtuWire,
 )
-from fieldtwin.conformance.clients.modbus.setup import Deaf, HangUp, ModbusCase, Move, RequestContext, Say, Unplug
+from fieldtwin.conformance.clients.modbus.setup import (
+    GoSilent,
+    HangUp,
+    ModbusCase,
+    Move,
+    RequestContext,
+    SendBytes,
+    Unplug,
+)
 from fieldtwin.conformance.clients.recorder import Recorder
 from fieldtwin.conformance.core.observation import Garbled, Left, ObservedConnection, ReplySent, RequestSeen, Word
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
@@ -101,7 +109,7 @@ class HostileServer:
         case = self.play
         if request[0] == 0 and not isinstance(wire, MbapWire):
             return []  # a broadcast is not answered
-        honest: list[Move] = [Say(wire.frame(request, tag, true), good=True)] if true else []
+        honest: list[Move] = [SendBytes(wire.frame(request, tag, true), good=True)] if true else []
         if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
             return honest
         false = self.device.answer_with(self.poison, request[1:], now_ns) if request[1] in READS else true
@@ -165,10 +173,10 @@ class _Client:
     def _answer(self, moves: list[Move], now_ns: int) -> None:
         """Schedule moves in order; correct answers wait until pending faulty ones were sent, as a real device would."""
         start_ns = now_ns
-        if self._free_ns > now_ns and any(isinstance(m, Say) and m.good for m in moves):
+        if self._free_ns > now_ns and any(isinstance(m, SendBytes) and m.good for m in moves):
             start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)
         timed = [(start_ns + round(move.after_s * NS_PER_S), move) for move in moves]
-        odd = [t for t, move in timed if not (isinstance(move, Say) and move.good)]
+        odd = [t for t, move in timed if not (isinstance(move, SendBytes) and move.good)]
         self._free_ns = max([self._free_ns, *odd])
         if not timed:
             return
@@ -194,7 +202,7 @@ class _Client:
         now_ns = self._stage.now_ns()
         if self._deaf:
             return
-        if isinstance(move, Deaf):
+        if isinstance(move, GoSilent):
             self._stage.last_ns = now_ns
             self._deaf = True
             return

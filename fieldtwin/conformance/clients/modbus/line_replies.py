@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from fieldtwin.conformance.clients.modbus.setup import Move, ReplyFunction, RequestContext, Say, Unplug
+from fieldtwin.conformance.clients.modbus.setup import Move, ReplyFunction, RequestContext, SendBytes, Unplug
 from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 
 SPLIT_S = 0.016
@@ -23,50 +23,50 @@ def nothing(scene: RequestContext) -> list[Move]:
 
 def bad_crc(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
-    return [Say(frame[:-2] + bytes(b ^ 0xFF for b in frame[-2:]))]
+    return [SendBytes(frame[:-2] + bytes(b ^ 0xFF for b in frame[-2:]))]
 
 
 def truncated(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
-    return [Say(frame[: max(len(frame) - 3, 4)])]
+    return [SendBytes(frame[: max(len(frame) - 3, 4)])]
 
 
 def paused(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.true)
-    return [Say(frame[:4]), Say(frame[4:], 0.010)]
+    return [SendBytes(frame[:4]), SendBytes(frame[4:], 0.010)]
 
 
 def split_16_ms(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.true)
     cuts = (0, 1, 3, 5, len(frame))
-    return [Say(frame[a:b], i * SPLIT_S) for i, (a, b) in enumerate(itertools.pairwise(cuts))]
+    return [SendBytes(frame[a:b], i * SPLIT_S) for i, (a, b) in enumerate(itertools.pairwise(cuts))]
 
 
 def glued(scene: RequestContext) -> list[Move]:
-    return [Say(scene.from_unit(scene.neighbour, scene.false) + scene.frame(scene.true))]
+    return [SendBytes(scene.from_unit(scene.neighbour, scene.false) + scene.frame(scene.true))]
 
 
 def leading_noise(scene: RequestContext) -> list[Move]:
-    return [Say(b"\x00\xff\x00" + scene.frame(scene.true))]
+    return [SendBytes(b"\x00\xff\x00" + scene.frame(scene.true))]
 
 
 def trailing_zeros(scene: RequestContext) -> list[Move]:
-    return [Say(scene.frame(scene.true) + b"\0\0")]
+    return [SendBytes(scene.frame(scene.true) + b"\0\0")]
 
 
 def echo(scene: RequestContext) -> list[Move]:
-    return [Say(with_crc(scene.request)), Say(scene.frame(scene.true), 0.005)]
+    return [SendBytes(with_crc(scene.request)), SendBytes(scene.frame(scene.true), 0.005)]
 
 
 def corrupt_echo(scene: RequestContext) -> list[Move]:
     sent = bytearray(with_crc(scene.request))
     sent[3] ^= 0x10
-    return [Say(bytes(sent))]
+    return [SendBytes(bytes(sent))]
 
 
 def late(scene: RequestContext) -> list[Move]:
     """Answer the first request too late, with the poison value. Requests that arrive meanwhile are answered after it."""
-    return [Say(scene.frame(scene.false), LATE * scene.timeout_s)]
+    return [SendBytes(scene.frame(scene.false), LATE * scene.timeout_s)]
 
 
 def late_other(scene: RequestContext) -> list[Move]:
@@ -75,65 +75,65 @@ def late_other(scene: RequestContext) -> list[Move]:
         return []
     if scene.first.request == scene.request:
         return [scene.good()]
-    return [Say(scene.first.frame(scene.first.false)), scene.good(0.050)]
+    return [SendBytes(scene.first.frame(scene.first.false)), scene.good(0.050)]
 
 
 def second_reply(scene: RequestContext) -> list[Move]:
-    return [scene.good(), Say(scene.frame(scene.false), 0.003)]
+    return [scene.good(), SendBytes(scene.frame(scene.false), 0.003)]
 
 
 def other_unit(scene: RequestContext) -> list[Move]:
-    return [Say(scene.from_unit(scene.neighbour, scene.false))]
+    return [SendBytes(scene.from_unit(scene.neighbour, scene.false))]
 
 
 def other_unit_first(scene: RequestContext) -> list[Move]:
     """Reply after another unit's reply, with a changing delay, so that no pause of the client hides its reaction."""
     after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
-    return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), after_s)]
+    return [SendBytes(scene.from_unit(scene.neighbour, scene.false)), SendBytes(scene.frame(scene.true), after_s)]
 
 
 def other_function(scene: RequestContext) -> list[Move]:
-    return [Say(scene.frame(bytes((scene.function ^ 0x07,)) + scene.false[1:]))]  # 03 and 04 change places
+    return [SendBytes(scene.frame(bytes((scene.function ^ 0x07,)) + scene.false[1:]))]  # 03 and 04 change places
 
 
 def too_few(scene: RequestContext) -> list[Move]:
     data = scene.false[2:-2]
-    return [Say(scene.frame(bytes((scene.function, len(data))) + data))]
+    return [SendBytes(scene.frame(bytes((scene.function, len(data))) + data))]
 
 
 def too_many(scene: RequestContext) -> list[Move]:
     data = scene.false[2:] + scene.false[-2:]
-    return [Say(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
+    return [SendBytes(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
 
 
 def count_255(scene: RequestContext) -> list[Move]:
-    return [Say(scene.frame(scene.false[:1] + b"\xff" + scene.false[2:]))]
+    return [SendBytes(scene.frame(scene.false[:1] + b"\xff" + scene.false[2:]))]
 
 
 def odd_count(scene: RequestContext) -> list[Move]:
     data = scene.false[2:] + scene.false[-1:]
-    return [Say(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
+    return [SendBytes(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
 
 
 def other_echo(scene: RequestContext) -> list[Move]:
-    return [Say(scene.frame(scene.true[:-1] + bytes((scene.true[-1] ^ 0x01,))))]
+    return [SendBytes(scene.frame(scene.true[:-1] + bytes((scene.true[-1] ^ 0x01,))))]
 
 
 def other_exception(scene: RequestContext) -> list[Move]:
-    return [Say(scene.refuse(2, scene.function ^ 0x07))]
+    return [SendBytes(scene.refuse(2, scene.function ^ 0x07))]
 
 
 def exception(code: int) -> ReplyFunction:
-    return lambda scene: [Say(scene.refuse(code))]
+    return lambda scene: [SendBytes(scene.refuse(code))]
 
 
 def exception_at_once_and_later(code: int) -> ReplyFunction:
     """Send the first exception frame at once, the second one half a timeout after its request."""
-    return lambda scene: [Say(scene.refuse(code), LATER * scene.timeout_s if scene.nth else 0.0)]
+    return lambda scene: [SendBytes(scene.refuse(code), LATER * scene.timeout_s if scene.nth else 0.0)]
 
 
 def hole(scene: RequestContext) -> list[Move]:
-    return [Say(scene.refuse(2))]
+    return [SendBytes(scene.refuse(2))]
 
 
 def garbage(scene: RequestContext) -> list[Move]:
@@ -143,29 +143,29 @@ def garbage(scene: RequestContext) -> list[Move]:
     for byte in frame:
         spread = sum(3 << 2 * bit for bit in range(8) if byte >> bit & 1)
         out += bytes((spread & 0xFF | 0x80, spread >> 8 | 0xC0))
-    return [Say(bytes(out))]
+    return [SendBytes(bytes(out))]
 
 
 def collision(scene: RequestContext) -> list[Move]:
     """Send the overlap of two senders: a bit is 0 where either of them sends 0."""
     ours, other = scene.frame(scene.false), scene.from_unit(scene.neighbour, scene.true[:1] + scene.true[1:])
-    return [Say(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]
+    return [SendBytes(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]
 
 
 def bad_lrc(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
-    return [Say(frame[:-3] + (b"0" if frame[-3:-2] != b"0" else b"1") + frame[-2:])]
+    return [SendBytes(frame[:-3] + (b"0" if frame[-3:-2] != b"0" else b"1") + frame[-2:])]
 
 
 def second_colon(scene: RequestContext) -> list[Move]:
     """Send the beginning of a frame, then the whole reply."""
-    return [Say(scene.frame(scene.false)[:7] + scene.frame(scene.true))]
+    return [SendBytes(scene.frame(scene.false)[:7] + scene.frame(scene.true))]
 
 
 def long_gap(scene: RequestContext) -> list[Move]:
     """Send two halves of a frame, further apart than the second that SL 2.5.2.1 allows."""
     frame = scene.frame(scene.false)
-    return [Say(frame[:7]), Say(frame[7:], 1.2)]
+    return [SendBytes(frame[:7]), SendBytes(frame[7:], 1.2)]
 
 
 def unplugged(held_s: float = 0.0) -> ReplyFunction:

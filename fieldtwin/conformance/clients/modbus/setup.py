@@ -11,8 +11,8 @@ from fieldtwin.conformance.core.case import TRAIL_S, Basis, ClientCase, Elsewher
 
 
 @dataclass(frozen=True, slots=True)
-class Say:
-    """The move: send `data`, `after_s` seconds after the request."""
+class SendBytes:
+    """A step of a hostile server: send `data`, `after_s` seconds after the request."""
 
     data: bytes
     after_s: float = 0.0
@@ -21,15 +21,15 @@ class Say:
 
 @dataclass(frozen=True, slots=True)
 class HangUp:
-    """The move: close the connection, by a reset if the transport has one."""
+    """A step of a hostile server: close the connection, by a reset if the transport has one."""
 
     after_s: float = 0.0
     reset: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Deaf:
-    """The move: leave the connection open, and send nothing on it any more."""
+class GoSilent:
+    """A step of a hostile server: leave the connection open, and send nothing on it any more."""
 
     after_s: float = 0.0
 
@@ -45,7 +45,7 @@ class Unplug:
     after_s: float = 0.0
 
 
-Move = Say | HangUp | Deaf | Unplug
+Move = SendBytes | HangUp | GoSilent | Unplug
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +74,9 @@ class RequestContext:
     def function(self) -> int:
         return self.request[1]
 
-    def good(self, after_s: float = 0.0) -> Say:
+    def good(self, after_s: float = 0.0) -> SendBytes:
         """Return the correct answer in a plain frame."""
-        return Say(self.frame(self.true), after_s, good=True)
+        return SendBytes(self.frame(self.true), after_s, good=True)
 
     def frame(self, pdu: bytes) -> bytes:
         """Return a plain frame around any PDU."""

@@ -3,47 +3,47 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.clients.modbus.device import mbap
-from fieldtwin.conformance.clients.modbus.setup import Deaf, HangUp, Move, ReplyFunction, RequestContext, Say
+from fieldtwin.conformance.clients.modbus.setup import GoSilent, HangUp, Move, ReplyFunction, RequestContext, SendBytes
 
 BYTE_S = 0.002
 
 
 def bytewise(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.true)
-    return [Say(frame[i : i + 1], i * BYTE_S) for i in range(len(frame))]
+    return [SendBytes(frame[i : i + 1], i * BYTE_S) for i in range(len(frame))]
 
 
 def with_stranger(scene: RequestContext) -> list[Move]:
-    return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false) + scene.frame(scene.true))]
+    return [SendBytes(mbap(scene.tag ^ 0x4000, scene.unit, scene.false) + scene.frame(scene.true))]
 
 
 def other_protocol(scene: RequestContext) -> list[Move]:
-    return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1))]
+    return [SendBytes(mbap(scene.tag, scene.unit, scene.false, protocol=1))]
 
 
 def other_protocol_first(scene: RequestContext) -> list[Move]:
-    return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1)), Say(scene.frame(scene.true), 0.020)]
+    return [SendBytes(mbap(scene.tag, scene.unit, scene.false, protocol=1)), SendBytes(scene.frame(scene.true), 0.020)]
 
 
 def length(counted: int) -> ReplyFunction:
-    return lambda scene: [Say(mbap(scene.tag, scene.unit, scene.false, length=counted))]
+    return lambda scene: [SendBytes(mbap(scene.tag, scene.unit, scene.false, length=counted))]
 
 
 def other_tag(change: int) -> ReplyFunction:
-    return lambda scene: [Say(mbap(scene.tag ^ change, scene.unit, scene.false))]
+    return lambda scene: [SendBytes(mbap(scene.tag ^ change, scene.unit, scene.false))]
 
 
 def zero_tag(scene: RequestContext) -> list[Move]:
-    return [Say(mbap(0, scene.unit, scene.false))]
+    return [SendBytes(mbap(0, scene.unit, scene.false))]
 
 
 def other_tag_first(scene: RequestContext) -> list[Move]:
-    return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false)), Say(scene.frame(scene.true), 0.020)]
+    return [SendBytes(mbap(scene.tag ^ 0x4000, scene.unit, scene.false)), SendBytes(scene.frame(scene.true), 0.020)]
 
 
 def reset(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
-    return [Say(frame[: len(frame) // 2]), HangUp(0.005, reset=True)]
+    return [SendBytes(frame[: len(frame) // 2]), HangUp(0.005, reset=True)]
 
 
 def hang_up(scene: RequestContext) -> list[Move]:
@@ -51,7 +51,7 @@ def hang_up(scene: RequestContext) -> list[Move]:
 
 
 def half_open(scene: RequestContext) -> list[Move]:
-    return [Deaf()]
+    return [GoSilent()]
 
 
 def closed_while_unused(scene: RequestContext) -> list[Move]:

@@ -1,7 +1,7 @@
 """The data that a profile states about an emulated device.
 
-These are the cells and the encoding of values in them, the effects of reads and writes, and the answers of functions without
-registers.
+These are the cells (registers and bits) and the encoding of values in them, the effects of reads and writes, and the answers of
+functions without registers.
 
 Pure; like all emulator code, it has its own encoder. It knows neither banks nor recordings.
 """

@@ -31,7 +31,7 @@ class _Console(Console):
             yield segment if text is segment.text else Segment(text, segment.style)
 
 
-# emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.
+# emoji=False: `model.py:Boom:` in a text is the name of a user's class and must not become a picture of an explosion.
 stderr = _Console(stderr=True, highlight=False, emoji=False)
 stdout = _Console(highlight=False, emoji=False)
 

@@ -73,7 +73,7 @@ def check_can_effect(spec: FaultSpec, node: int | None, index: int | None = None
         for key in _OF_CHANGED_FRAMES:
             if key in aim.model_fields_set:
                 raise WrongAim(
-                    key, f"fault {spec.kind.name} sends frames of its own; {key} is about frames that it changes"
+                    key, f"fault {spec.kind.name} only sends additional frames, but {key} selects frames to change"
                 )
     if aim.cob_id is not None and not _aims(fault, (_payloads(aim.cob_id)), nodes):
         raise WrongAim("cob_id", f"fault {spec.kind.name} changes no frame with the COB-ID {aim.cob_id:03X}h")

@@ -115,7 +115,9 @@ def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, dict[str,
     names = tuple(model.step(0.0, 0.0, dict.fromkeys(inputs, 0.0)))
     for name in names:
         if name in inputs:
-            raise FileInvalid(f"step() returned the input {name!r}", path=model.where, expected="a name of its own")
+            raise FileInvalid(
+                f"step() returned the input {name!r}", path=model.where, expected="a name that no input has"
+            )
 
     def step(t_s: float, dt_s: float, values: Mapping[str, float]) -> Mapping[str, float]:
         out = model.step(t_s, dt_s, {name: values[name] for name in inputs})

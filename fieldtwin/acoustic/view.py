@@ -141,7 +141,7 @@ async def _show(session: NetworkSession, quiet: bool) -> None:
 def _table(session: NetworkSession) -> Group:
     table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
     for column, right in (
-        ("system", 0), ("state", 0), ("outputs", 0), ("devices", 0), ("said", 1), ("heard", 1), ("lost", 1)
+        ("system", 0), ("state", 0), ("outputs", 0), ("devices", 0), ("sent", 1), ("received", 1), ("lost", 1)
     ):  # fmt: skip
         table.add_column(column, justify="right" if right else "left", no_wrap=True)
     counters = session.counters()
@@ -202,7 +202,7 @@ def print_network_summary(summary: dict[str, Any]) -> None:
             stdout.print(f"  {'':<14} [red]error[/red] {error}", soft_wrap=True, highlight=False)
     for name, sea in summary["water"].items():
         lost = ", ".join(f"{sea[why]} by {why}" for why in ("chance", "collision", "speaking", "fault") if sea[why])
-        text = f"said {sea['said']}, heard {sea['heard']}" + (f"; missed {lost}" if lost else "")
+        text = f"sent {sea['said']}, received {sea['heard']}" + (f"; missed {lost}" if lost else "")
         stdout.print(
             f"  {'water' if name == next(iter(summary['water'])) else '':<14} {name}: {text}",
             soft_wrap=True,

@@ -77,7 +77,9 @@ class Struck:
     @property
     def text(self) -> str:
         times = (
-            "never struck" if not self.struck else f"struck {'once' if self.struck == 1 else f'{self.struck} times'}"
+            "never took effect"
+            if not self.struck
+            else f"took effect {'once' if self.struck == 1 else f'{self.struck} times'}"
         )
         return f"{self.id} ({self.name} on {self.on}): {times}{', optional' if self.optional else ''}"
 

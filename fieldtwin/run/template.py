@@ -105,7 +105,9 @@ def agree(
     if beside is not None and _templates_above(beside):
         reaches |= dict.fromkeys(opens)
     if (code or reaches) and not ask(ForeignParts(shown, tuple(code), tuple(reaches))):
-        raise NotAllowed("nothing of this template was run", where=str(shown), hint="--trust says yes beforehand")
+        raise NotAllowed(
+            "nothing of this template was run", where=str(shown), hint="--trust gives the consent beforehand"
+        )
 
 
 def _templates_above(*files: Path | None) -> list[Path]:

@@ -143,7 +143,9 @@ class PostgresKnowledge:
         async def work(db: asyncpg.Connection) -> int:
             number = self._origins.get(origin)
             if number is None:
-                raise UsageError("no origin of ours", got=origin, expected=", ".join(self._origins) or "one from own()")
+                raise UsageError(
+                    "not an origin of this side", got=origin, expected=", ".join(self._origins) or "one from own()"
+                )
             async with db.transaction():
                 await db.execute("SELECT 1 FROM origin WHERE id = $1 FOR UPDATE", number)
                 last = (await self._span(db, number))[1]

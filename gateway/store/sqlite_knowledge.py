@@ -163,7 +163,9 @@ class SqliteKnowledge:
         def work() -> int:
             number = self._origins.get(origin)
             if number is None:
-                raise UsageError("no origin of ours", got=origin, expected=", ".join(self._origins) or "one from own()")
+                raise UsageError(
+                    "not an origin of this side", got=origin, expected=", ".join(self._origins) or "one from own()"
+                )
             self._db.execute("BEGIN IMMEDIATE")
             last = self._span(number)[1]
             self._insert(number, (e._replace(sequence=n) for n, e in enumerate(events, last + 1)), "")

@@ -160,9 +160,9 @@ def test_emulate_injects_faults_and_reports_how_often_they_took_effect(tmp_path:
         assert ask(port, "03 0003 0001") == bytes.fromhex("83 06")
         assert ask(port, "03 0001 0002") == bytes.fromhex("03 04 0000 0001")
     told = "".join(said)
-    assert "fewer-registers-1: struck 1 of 1 frames" in told
-    assert "exception-2: struck 1 of 1 frames" in told
-    assert "silence-4: struck 0 of 0 frames" in told
+    assert "fewer-registers-1: took effect on 1 of 1 frames" in told
+    assert "exception-2: took effect on 1 of 1 frames" in told
+    assert "silence-4: took effect on 0 of 0 frames" in told
 
 
 def test_a_fault_changes_the_values_of_a_device_that_replays_a_recording(tmp_path: Path) -> None:

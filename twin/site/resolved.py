@@ -31,6 +31,6 @@ def read_resolved(path: str) -> tuple[object, ...]:
     try:
         files = pickle.loads(Path(path).read_bytes())
     except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError) as e:
-        raise Bug(f"cannot read what the run handed over: {e}", where=path) from e
+        raise Bug(f"cannot read the system that the run has written for its processes: {e}", where=path) from e
     assert isinstance(files, tuple)
     return files

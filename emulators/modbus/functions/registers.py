@@ -48,7 +48,7 @@ class UnitLimits:
         if no_function:
             raise UsageError(
                 "function codes of a device",
-                expected="1 to 127; those of its own are registered with the unit",
+                expected="1 to 127; device-specific functions are registered with the unit",
                 got=", ".join(f"{f:02X}h" for f in no_function),
             )
 

@@ -81,7 +81,7 @@ def _copy(
     for number, row in rows:
         t_s = clock.seconds(number, row)
         if t_s < last_s:
-            raise FileInvalid("the time decreases", path=str(path), line=number, got=f"{t_s} s behind {last_s} s")
+            raise FileInvalid("the time decreases", path=str(path), line=number, got=f"{t_s} s after {last_s} s")
         last_s = t_s
         values = [_value(row[i]) if i < len(row) else math.nan for i in chosen.values()]
         bad += sum(map(math.isnan, values))

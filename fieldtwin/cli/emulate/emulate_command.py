@@ -57,7 +57,7 @@ def command(
         raise UsageError(
             "--values, --faults and --any-unit are for a single Modbus device or recording",
             got=f"a {kind}",
-            hint="a system's prototype file has `values`, and `fieldtwin run --faults` puts faults in",
+            hint="a system's prototype file has `values`, and `fieldtwin run --faults` injects faults",
         )
     if (device.model, device.defaults) != (None, False) and kind not in ("device", "data sheet"):
         raise UsageError("--model and --defaults are for a CANopen device or data sheet", got=f"a {kind}")

@@ -79,7 +79,7 @@ def _tolerances(texts: tuple[str, ...]) -> tuple[Tolerance, dict[str, Tolerance]
     plain = [t for t in texts if "=" not in t]
     named = pairs(tuple(t for t in texts if "=" in t), "--tolerance")
     if len(plain) > 1:
-        raise UsageError("one tolerance for all, others by tag", got=", ".join(plain))
+        raise UsageError("several tolerances without a tag; at most one is possible", got=", ".join(plain))
     return (_tolerance(plain[0]) if plain else Tolerance()), {tag: _tolerance(text) for tag, text in named.items()}
 
 

@@ -41,7 +41,7 @@ def print_comparison(result: Comparison, recording: Path, other: str, everything
     if result.extra:
         stdout.print(f"{result.extra} more in the other one, which the recording does not contain", soft_wrap=True)
     if result.left_out:
-        stdout.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
+        stdout.print(f"{result.left_out} left out: they may change the device, or cannot be sent", soft_wrap=True)
     if result.left_out_writes and result.by_kind:
         stdout.print(
             f"{result.after_left_out} of the differences are in what {result.left_out_writes} left-out writes had set; "

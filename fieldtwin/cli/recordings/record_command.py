@@ -356,7 +356,7 @@ class _Job:
         for profile in said.get("profiles", ()):
             stdout.print(f"  draft profile: {profile}", soft_wrap=True, markup=False)
         if "raw" in said:
-            stdout.print(f"  the bytes as they were: {said['raw']}", soft_wrap=True, markup=False)
+            stdout.print(f"  the unchanged bytes: {said['raw']}", soft_wrap=True, markup=False)
         if len(file.parts) > 1:
             gone = f", {file.removed} older ones removed" if file.removed else ""
             stderr.print(f"in {len(file.parts)} parts{gone}", soft_wrap=True)

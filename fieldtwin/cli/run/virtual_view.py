@@ -161,7 +161,9 @@ def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
     if not faults:
         return "none was injected"
     of = {name: [(put_in, struck) for other, put_in, struck in faults if other == name] for name, _, _ in faults}
-    parts = [f"{name} {sum(n for n, _ in each)} (struck {sum(m for _, m in each)} times)" for name, each in of.items()]
+    parts = [
+        f"{name} {sum(n for n, _ in each)} (took effect {sum(m for _, m in each)} times)" for name, each in of.items()
+    ]
     return f"{sum(n for _, n, _ in faults)} injected: {', '.join(sorted(parts))}"
 
 

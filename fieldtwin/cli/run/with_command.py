@@ -63,7 +63,8 @@ def command(
         raise UsageError("`fieldtwin with` needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
     if words[0].startswith("-"):
         raise UsageError(
-            f"{words[0]!r} is no program", expected=f"options before SYSTEM: fieldtwin with [OPTION]... {system} -- CMD"
+            f"{words[0]!r} is not a program",
+            expected=f"options before SYSTEM: fieldtwin with [OPTION]... {system} -- CMD",
         )
     file = replay.prototype_file
     loaded = load_system(

@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import UsageError
     help="The document, HTML.",
 )
 @click.option("--site", default="", help="Name of the site.  [default: the name of the folder]")
-@click.option("--by", default="", help="Name of the person who carried it out.  [default: as the files say]")
+@click.option("--by", default="", help="Name of the person who carried it out.  [default: the name in the files]")
 @click.option("--for", "customer", default="", help="Name of the operator, printed at the signature.")
 @click.option("--remarks", default="", help="Additional remarks.")
 @click.option(

@@ -38,7 +38,7 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
         "writes",
         multiple=True,
         metavar="TABLE:ADDRESS[+COUNT]",
-        help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
+        help="A cell that may be written, holding or coil, also in hexadecimal; its value is restored afterwards. Repeatable.",
     ),
     click.option(
         "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Timeout for each reply."
@@ -119,7 +119,7 @@ def modbus(
         "writes",
         multiple=True,
         metavar="INDEX:SUB",
-        help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
+        help="An object that may be written, such as 2000:00 or 1017:00; its value is restored afterwards. Repeatable.",
     ),
     click.option(
         "--timeout",

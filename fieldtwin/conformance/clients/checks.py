@@ -207,7 +207,7 @@ def answers_at_once(seen: Observation) -> Finding | None:
     delay_s = later_s - at_once_s
     if len(gaps_s) < 2 or not seen.timeout_s or not 0 < delay_s < seen.timeout_s:
         return inconclusive(
-            f"{said}: it waits for silence or backs off" + ("" if seen.timeout_s else "; say --timeout")
+            f"{said}: it waits for silence or backs off" + ("" if seen.timeout_s else "; give --timeout")
         )
     if later_s + later_gap_s - at_once_s - gap_s < 0.25 * delay_s:
         return failed(f"{said}, and equally soon when the frame came {delay_s:.2f} s later: it waits out its timeout")
@@ -268,7 +268,9 @@ def late_is_not_data(seen: Observation) -> Finding | None:
     """
     bad = publishes_nothing_bad(seen)
     if bad is not None and not seen.timeout_s:
-        return inconclusive(f"{bad.reason}; a failure if its timeout is {seen.habit.silent_gap_s:.2f} s: say --timeout")
+        return inconclusive(
+            f"{bad.reason}; a failure if its timeout is {seen.habit.silent_gap_s:.2f} s: give --timeout"
+        )
     return bad
 
 

@@ -380,7 +380,7 @@ class ControlBench(AsyncResource):
 
     async def _to_field(self, command: str, **args: Any) -> Any:
         if self._field is None:
-            raise UsageError("there is no emulated field", expected="a prototype")
+            raise UsageError("there are no simulated field devices", expected="a prototype")
         try:
             async with self._naming_causes():
                 return await self._field.call(command, **args)

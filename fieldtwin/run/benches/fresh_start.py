@@ -65,7 +65,7 @@ async def _all_read(gateway: ControlClient, since_ns: int) -> None:
         if loop.time() > deadline_s:
             raise ReplyTimeout(
                 f"no fresh start: the gateway has not read {', '.join(missing)} within {WITHIN_S:g} s after the devices "
-                "were made anew"
+                "were created again"
             )
         await asyncio.sleep(LOOK_EVERY_S)
 

@@ -10,4 +10,4 @@ def effect_text(active: Active) -> str:
     named = active.id if active.id.startswith(active.fault.name) else f"{active.id} ({active.fault.name})"
     if active.struck and not active.matched:
         return f"{named}: {active.struck} times"
-    return f"{named}: struck {active.struck} of {active.matched} frames"
+    return f"{named}: took effect on {active.struck} of {active.matched} frames"

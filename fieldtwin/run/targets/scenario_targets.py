@@ -151,7 +151,7 @@ def _attempt(
 def _of_a_group(kind: str, target: ScenarioTarget) -> str:
     """Return the reason why the target cannot run a scenario of several systems; empty if it can."""
     if target.name != "local":
-        return f"a {kind} is a prototype, and the target {target.name} is none: each of its systems is a plant"
+        return f"a {kind} runs as prototypes, on --target virtual or local only, not on {target.name}"
     if target.can:
         return f"--can needs a single system, and this is a {kind}"
     return (
@@ -199,8 +199,8 @@ def _of_a_foreign_controller(scenario: Scenario) -> str:
         return ""
     told = f"{', '.join(ours[:5])}{', ...' if len(ours) > 5 else ''}"
     return (
-        f"the scenario looks at {told}: fieldtwin's own gateway and PLC publish that, and here a program of yours "
-        "controls. Let the scenario look at registers through `probes`"
+        f"the scenario reads {told}, which fieldtwin's own gateway and PLC publish. In this run your program controls "
+        "the devices, so read registers through `probes` instead"
     )
 
 

@@ -26,7 +26,7 @@ def without_effect(scenario: Scenario, struck: Sequence[Struck], now_ns: int) ->
         if one.is_set or one.struck or one.optional:
             continue
         where = scenario.line("steps", steps[one.id]) if one.id in steps else ""
-        text = f"{one.name} strikes {one.on}"
+        text = f"{one.name} takes effect on {one.on}"
         got = "never took effect, so it tested nothing; if this is acceptable, set optional: true"
         result = CheckResult(
             f"fault {one.id}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, where=where, vacuous=True

@@ -242,7 +242,7 @@ def _system(
     if form.prototype is not None and not (folder / form.prototype).is_file():
         there = [one.name for one in sorted(folder.glob("*.yaml"))]
         hint = did_you_mean(form.prototype, there)
-        errors.add(file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint))
+        errors.add(file.error(("prototype",), f"no file {form.prototype!r} in the same folder", hint=hint))
     return system, None
 
 

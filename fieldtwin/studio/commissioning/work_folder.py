@@ -112,7 +112,7 @@ class WorkFolder:
         self.checked(name)
         path = self.existing(name)
         if not self._kind(path):
-            raise UsageError(f"{name} is no file of the guide", expected="a file that a step writes or reads")
+            raise UsageError(f"{name} is not a file of the guide", expected="a file that a step writes or reads")
         return path
 
     def draft(self, name: str) -> tuple[str, str]:

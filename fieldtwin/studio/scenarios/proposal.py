@@ -57,7 +57,7 @@ def as_scenario(recording: Recording, name: str, system: str) -> str:
 
 
 def _steps(recording: Recording, expected: list[list[_Expected]]) -> Iterator[str]:
-    yield "  # The scenario starts the system anew; the recording began with these states and values."
+    yield "  # The scenario restarts the system; the recording began with these states and values."
     yield from _beginning(recording)
     now_ns = recording.begin_ns
     for n, action in enumerate(recording.actions):

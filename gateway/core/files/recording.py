@@ -218,7 +218,7 @@ class RecordingReader:
             nonlocal last_t
             row = _read_row(line, width)
             if row.t_s < last_t:
-                raise ValueError(f"time went back from {last_t} s to {row.t_s} s")
+                raise ValueError(f"the time decreased from {last_t} s to {row.t_s} s")
             last_t = row.t_s
             return row
 

@@ -152,7 +152,7 @@ def test_invalid_tolerances_and_missing_files(tmp_path: Path) -> None:
     for tolerance in ("x", "-1", "nan%", "1,5"):
         with pytest.raises(UsageError, match="tolerance"):
             called(compare, path, path, f"--tolerance={tolerance}")
-    with pytest.raises(UsageError, match="one tolerance for all"):
+    with pytest.raises(UsageError, match="several tolerances without a tag"):
         called(compare, path, path, "--tolerance=1", "--tolerance=2")
     with pytest.raises(FileInvalid, match="cannot read"):
         called(compare, path, tmp_path / "no.jsonl")

@@ -211,7 +211,7 @@ def test_two_processes_share_a_store(place: str) -> None:
 def test_an_origin_that_is_not_ours_is_not_written(place: str) -> None:
     async def main() -> None:
         store = await opened(place)
-        with pytest.raises(UsageError, match="no origin of ours"):
+        with pytest.raises(UsageError, match="not an origin of this side"):
             await store.append("plant:xx", [value(1)])
         await store.aclose()
 

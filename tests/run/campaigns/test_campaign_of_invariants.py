@@ -143,7 +143,7 @@ def test_a_missing_dry_run_protection_is_found_and_shrunk_and_the_repaired_progr
     code, told = judge("dry.scenario.yaml", "--seeds", "1..4", *RANDOM)
     assert code == 0, told
     assert "4 of 4 passed" in told
-    assert "struck" in told
+    assert "took effect" in told
 
 
 def test_an_invariant_of_the_system_file_holds_in_scenarios_campaigns_and_runs(folder: Path) -> None:

@@ -129,8 +129,8 @@ def test_random_faults_of_a_run_outside_of_virtual_time_are_refused(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--target", "compose"), "a network is a prototype, and the target compose is none"),
-        (("--target", "real"), "a network is a prototype, and the target real is none"),
+        (("--target", "compose"), "a network runs as prototypes, on --target virtual or local only, not on compose"),
+        (("--target", "real"), "a network runs as prototypes, on --target virtual or local only, not on real"),
         (("--with", "--", "true"), "--with starts one program"),
     ],
 )

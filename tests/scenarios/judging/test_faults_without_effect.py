@@ -85,7 +85,7 @@ def test_faults_are_counted_in_processes_too(tmp_path: Path, monkeypatch: pytest
 def test_terminal_json_junit_and_html_report_the_counts(tmp_path: Path) -> None:
     path = written(tmp_path, GOOD + fault("name: lost-frame, device: inclinometer"))
     told = CliRunner().invoke(judge_command, [str(path)], standalone_mode=False)
-    assert "fault f (lost-frame on inclinometer): struck" in told.output
+    assert "fault f (lost-frame on inclinometer): took effect" in told.output
     plain = json.loads(CliRunner().invoke(judge_command, [str(path), "--json"], standalone_mode=False).output)
     assert plain[0]["faults"][0]["struck"] > 0
     result = run(tmp_path, GOOD + fault("name: lost-frame, device: inclinometer"))
@@ -105,8 +105,8 @@ def test_a_run_reports_how_often_each_of_its_faults_took_effect(tmp_path: Path) 
     )
     words = ["observatory", "--for", "5s", "--faults", str(faults)]
     told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
-    assert "lost (lost-frame on inclinometer): struck" in told.output
-    assert "idle (silence on modem): never struck" in told.output
+    assert "lost (lost-frame on inclinometer): took effect" in told.output
+    assert "idle (silence on modem): never took effect" in told.output
     summary = json.loads(CliRunner().invoke(simulate_command, [*words, "--json"], standalone_mode=False).stdout)
     assert [(one["id"], one["struck"] > 0) for one in summary["faults"]] == [("lost", True), ("idle", False)]
 

@@ -81,7 +81,7 @@ def _waits_for_each(seen: Observation) -> Finding | None:
         return (
             failed(said)
             if seen.timeout_s
-            else inconclusive(f"{said}: a failure if its timeout is longer: say --timeout")
+            else inconclusive(f"{said}: a failure if its timeout is longer: give --timeout")
         )
     return None
 

@@ -165,7 +165,7 @@ def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
                 before = sections[current.name].line
                 raise FileInvalid(f"[{current.name}] is there twice", path=path, line=number, got=f"also line {before}")
             if current.name in sections:
-                mended.append(f"[{current.name}]: there twice, the last one counts")
+                mended.append(f"[{current.name}]: the section occurs twice; the last one is used")
             sections[current.name] = current
             continue
         key, equals, value = line.partition("=")

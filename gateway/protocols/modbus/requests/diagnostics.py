@@ -175,7 +175,7 @@ def _check_echo(sub_function: int, sent: bytes, pdu: bytes) -> None:
     if pdu[1:3] != sent[1:3]:
         raise Desync("a reply to another diagnostics sub-function", expected=sent[1:3].hex(), got=short_hex(pdu))
     if sub_function in _ECHOED and pdu != sent:
-        raise Desync("the loopback data came back changed", expected=short_hex(sent), got=short_hex(pdu))
+        raise Desync("the loopback data was changed in the reply", expected=short_hex(sent), got=short_hex(pdu))
 
 
 def _busy(status: bytes) -> bool:

@@ -180,7 +180,7 @@ class CanopenNode:
 
     @property
     def changes(self) -> deque[ObjectChange]:
-        """NMT states, writes and errors, oldest first, bounded."""
+        """Return the latest NMT states, writes and errors, oldest first."""
         return self._core.changes
 
     @property

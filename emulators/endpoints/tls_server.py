@@ -1,4 +1,4 @@
-"""The parts of a TLS listener besides sockets: its certificates, and the role in a client's certificate.
+"""The parts of a TLS listener except its sockets: its certificates, and the role in a client's certificate.
 
 MODBUS/TCP Security Protocol Specification (MBTLS): TLS 1.2 or later, certificates on both sides, a role in an extension
 of the client's. It reads files; it opens no socket and knows no function codes.

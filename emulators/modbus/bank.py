@@ -77,7 +77,7 @@ class RegisterBank(ABC):
 
     @abstractmethod
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
-        """Return the values of `count` cells, starting at `address`."""
+        """Return the values of `count` cells (bits or registers), starting at `address`."""
 
     @abstractmethod
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:

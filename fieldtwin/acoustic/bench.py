@@ -60,7 +60,7 @@ class Part:
 class NetworkBench:
     """A `fieldtwin.scenarios.bench.Bench`.
 
-    `parts` by the names of the network's members; `topside` sends from the topside modem.
+    `parts` maps the name of each member of the network to its part; `topside` sends from the topside modem.
     """
 
     def __init__(self, network: Network, trace: Trace, target: str, faults: AcousticFaults) -> None:

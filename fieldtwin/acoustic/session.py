@@ -52,7 +52,8 @@ class NetworkOptions:
 
 
 class NetworkSession(AsyncResource):
-    """``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` by the names of the members."""
+    """A run of a network. Use it as ``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` maps the
+    name of each member to its run."""
 
     def __init__(self, network: Network, options: NetworkOptions) -> None:
         super().__init__()

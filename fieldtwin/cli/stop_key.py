@@ -11,7 +11,8 @@ from types import FrameType
 
 
 class StopKey:
-    """``with StopKey() as stop:`` inside a running loop; `pressed` becomes true on `q` or Ctrl-C."""
+    """The request of the user to stop. Use it as ``with StopKey() as stop:`` inside a running loop; `pressed` becomes true on
+    `q` or Ctrl-C."""
 
     def __init__(self) -> None:
         self._pressed = False

@@ -84,7 +84,7 @@ class Bench(Protocol):
 
     @property
     def target(self) -> str:
-        """The kind of the target: virtual, local, compose or real."""
+        """Return the kind of the target: virtual, local, compose or real."""
         ...
 
     @property
@@ -92,8 +92,8 @@ class Bench(Protocol):
 
     @property
     def allowed(self) -> Impact:
-        """The highest impact level that steps may have: `expect`, `wait` and `pause` only observe; probes read; `send` and
-        `set` write; `fault` and `clear` disrupt.
+        """Return the highest impact level that steps may have: `expect`, `wait` and `pause` only observe; probes read; `send`
+        and `set` write; `fault` and `clear` disrupt.
         """
         ...
 

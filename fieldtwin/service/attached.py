@@ -69,7 +69,8 @@ def short(seen: RunState) -> str:
 
 
 class RunService:
-    """``async with Service(session, options)`` around the run's waiting; `url` is the address of the metrics, or empty."""
+    """A run as a system service. It works during ``async with RunService(session, options)``; `url` is the address of the
+    metrics, or empty."""
 
     def __init__(self, session: RunSession, options: ServiceOptions, notifier: Notifier) -> None:
         self._session = session

@@ -21,7 +21,8 @@ LOOK_S = 0.05
 
 
 class StudioChild:
-    """``async with StudioChild(instance, run_dir, listen) as studio``: `url` is the address of the page, with its token."""
+    """The child process. It runs during ``async with StudioChild(instance, run_dir, listen) as studio``; `url` is the address
+    of the page, with its token."""
 
     def __init__(self, instance: str, run_dir: Path, listen: str) -> None:
         self.url = ""

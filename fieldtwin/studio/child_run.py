@@ -16,7 +16,8 @@ LONGEST_S = 1800.0
 
 
 class ChildRun:
-    """``await ChildRun.started(arguments, parse)``: the run ends by itself, after `LONGEST_S`, or with `stop`.
+    """A run of a command, started with ``await ChildRun.started(arguments, parse)``. It ends by itself, after `LONGEST_S`, or
+    with `stop`.
 
     `parse` returns the result from the standard output, or raises `msgspec.MsgspecError` or `ValueError`; the messages of the
     process are then the reason (`trouble`).

@@ -132,7 +132,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """A structure. `fields`: name as declared and type, by the name in lower case."""
+    """A structure. `fields` maps the name of each field, in lower case, to the name as declared and the type."""
 
     name: str
     fields: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -145,8 +145,8 @@ class Struct:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A function block: one of the standard (`standard` set) or the user's. Members by name in lower case: name,
-    type."""
+    """A function block: a block of the standard, whose class is `standard`, or a block of the user. The mappings give for each
+    name in lower case the name as declared and the type."""
 
     name: str
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)

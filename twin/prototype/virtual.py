@@ -46,8 +46,8 @@ _IN_MEMORY = Path(":memory:")
 
 
 class VirtualPrototype(AsyncResource):
-    """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit
-    log and retained values; the exchange log is in memory.
+    """A prototype that runs in virtual time. Use it as ``async with VirtualPrototype(system, prototype, loop, run_dir) as run``
+    inside `loop`. `run_dir` takes the audit log and retained values; the exchange log is in memory.
 
     `seed` replaces the prototype file's. `taps` observe the gateway's connections. `prepare` is called when everything is
     created and nothing has run yet. `water`: the acoustic connections of transmitters that are in a network. After entering,

@@ -416,7 +416,8 @@ class EmulatedForm(SiteModel):
 
 
 class PrototypeForm(SiteModel):
-    """Which devices are emulated, from which data source, and at which endpoint. The plant never opens this file."""
+    """The form of a prototype file: the emulated devices, their data sources and their endpoints. The plant never opens this
+    file."""
 
     prototype_of: str = Field(examples=["mysite.yaml"])
     unmapped: Literal["refuse"] = "refuse"

@@ -77,7 +77,7 @@ class Software(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """``template.json``. `system_file` and `prototype_file` are paths inside the package; a template may have no
+    """The content of ``template.json``. `system_file` and `prototype_file` are paths inside the package; a template may have no
     prototype.
     """
 

@@ -34,7 +34,8 @@ between storing it and passing it on.
 
 
 class ThreadEnd:
-    """``ThreadEnd(store, carrier, schema, clock, origin=...)``; `run` until cancelled.
+    """One side of a thread. Create it as ``ThreadEnd(store, carrier, schema, clock, origin=...)`` and call `run`, which
+    continues until cancelled.
 
     `origin` is the log that this side sends (`KnowledgeStore.own`), empty for a side that only receives. Call
     `appended` when the log has grown. Without `insists`, `run` ends if the other side refuses this one before a link

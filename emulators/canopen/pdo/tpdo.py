@@ -133,7 +133,7 @@ class Tpdos(NodeService):
         return overdue
 
     def dropped(self, frames: Iterable[CanFrame]) -> None:
-        """Subtract frames that never got onto the bus from the count of sent frames."""
+        """Subtract frames that were never sent on the bus from the count of sent frames."""
         for frame in frames:
             self._core.counters.tpdos_late += 1
             self._core.counters.tpdos -= 1

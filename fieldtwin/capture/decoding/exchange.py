@@ -19,8 +19,8 @@ Access = Literal["read", "write"]
 
 @dataclass(frozen=True, slots=True)
 class TouchedSpan:
-    """A piece of a device that an exchange touched: `count` registers or bits of `table` from `address`, or (table
-    ``object``) one CANopen object, `address` its index."""
+    """A piece of a device that an exchange touched: `count` registers or bits of `table` from `address`, or (table ``object``)
+    one CANopen object, whose index is `address`."""
 
     access: Access
     table: Table | Literal["object", "file"]
@@ -45,10 +45,10 @@ class TouchedSpan:
 class DecodedExchange:
     """A request and its answer on a bus, or a message that has no answer (broadcast, heartbeat, PDO).
 
-    `unit` is the Modbus unit ID or CANopen node ID (0: all), `device` the system's name of it, "" where it has none.
-    `function` is the Modbus function code, 0 on CANopen; `service` is the operation in words, the same for all of a
-    kind: ``read holding registers``, ``SDO upload``, ``TPDO1``. `tags` are the values that the exchange carried, in
-    engineering units, None for those that were requested but not returned; `registers` the words, or for bits 0 and 1.
+    `unit` is the Modbus unit ID or CANopen node ID (0: all), `device` the system's name of it, "" where it has none. `function`
+    is the Modbus function code, 0 on CANopen; `service` is the operation in words, the same for all of a kind: ``read holding
+    registers``, ``SDO upload``, ``TPDO1``. `tags` are the values that the exchange carried, in engineering units, None for
+    those that were requested but not returned; `registers` are the register words, or 0 and 1 for bits.
 
     `problem` is the reason why there is no good answer, "" for a good answer: ``no reply``, ``check sum``, ``exception``,
     ``abort``, ``stray`` (a frame that answers no request), ``malformed``; ``pending`` while the answer may still come,

@@ -68,7 +68,8 @@ def _print_thread(session: RunSession) -> None:
 
 
 class LiveView:
-    """``async with LiveView(session)``: show the run while the body runs, on a terminal as a table, else as lines."""
+    """The display of a run in progress: a table on a terminal, otherwise lines. It is updated during ``async with
+    LiveView(session)``."""
 
     def __init__(self, session: RunSession, quiet: bool) -> None:
         self._session = session

@@ -15,7 +15,7 @@ _SHOWN = 40
 
 
 def show(console: Console, outcomes: Sequence[PlanOutcome], units: Mapping[str, str]) -> None:
-    """Print each plan: its verdict, requirements, states and variables. `units` by tag name."""
+    """Print each plan: its verdict, requirements, states and variables. `units` maps tag names to units."""
     for outcome in outcomes:
         console.print()
         console.print(f"[bold]{escape(outcome.plan)}[/]: {'met' if outcome.met else 'not met'}", soft_wrap=True)

@@ -65,7 +65,7 @@ class PointValue:
 
 
 class Point(Protocol):
-    """A device that can be queried. Frames are as on the bus, one line of hex or candump's text each."""
+    """A device that can be queried. Each frame is given as on the bus, in one line: as hex digits, or in candump's notation."""
 
     protocol: str
     where: str

@@ -51,7 +51,8 @@ class Level(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Interpretation:
-    """A stretch of registers read as one value. `probability` against all others; `rivals` the next best, best first.
+    """A stretch of registers read as one value. `probability` compares this reading with all other readings, and `rivals` holds
+    the next best readings, the best first.
 
     `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value
     was seen that distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is

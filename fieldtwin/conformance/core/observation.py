@@ -124,8 +124,9 @@ E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, ObservedConnection, Left
 class Habit:
     """The polling behaviour of the client without faults; times are in seconds.
 
-    `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests;
-    `silent_gap_s`: from an unanswered request to the next request, 0 if not measured; `rate_per_s`: requests.
+    `period_s` maps each shape of request to the usual time between two such requests. `longest_gap_s` is the longest time
+    between any two requests. `silent_gap_s` is the time from an unanswered request to the next request, 0 if it was not
+    measured. `rate_per_s` is the number of requests per second.
     """
 
     period_s: dict[bytes, float] = field(default_factory=dict)

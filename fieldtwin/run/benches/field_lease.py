@@ -1,6 +1,6 @@
 """A scenario's lease on the simulated field devices.
 
-`fieldtwin.twin.prototype.field_leases` is the other side. All faults and values of the scenario are removed when the lease
+The other side is `fieldtwin.twin.prototype.field_leases`. All faults and values of the scenario are removed when the lease
 ends: at the end of the scenario, or `LEASE_S` seconds after the last renewal if the testing process died.
 """
 

@@ -74,7 +74,7 @@ class WholeRun:
 
     @property
     def pending_until_s(self) -> float:
-        """Time until which the run must continue so that every `within` is decided; 0 if none is open."""
+        """Return the time until which the run must continue so that every `within` is decided; 0 if none is open."""
         return max((one.due_s for one in self.withins if one.due_s is not None), default=0.0)
 
     def look(self) -> Violation | None:
@@ -152,12 +152,13 @@ class WithinRule:
 
     @property
     def never_came(self) -> bool:
-        """Whether `after` never became true, and was not unknown after it was known."""
+        """Return whether `after` never became true. The result is False if `after` was unknown for a while after it had been
+        known."""
         return not self.times and self._unknown_s is None
 
     @property
     def known(self) -> bool:
-        """Whether `after` was ever known."""
+        """Return whether `after` was ever known."""
         return self._known
 
     @property

@@ -55,7 +55,7 @@ class Invariants:
 
     @property
     def names(self) -> set[str]:
-        """The tags and variables that the invariants use."""
+        """Return the tags and variables that the invariants use."""
         every = [one.expression for one in self.stated]
         every += [part for one in self.followed for part in (one.after, one.then)]
         return {name for expression in every for name in expression.names}

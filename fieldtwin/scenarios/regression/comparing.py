@@ -51,7 +51,7 @@ class RunDifference:
     """A difference.
 
     `what` is field, value, quality, order, time, latency or problem; `where` the field, or the device and the request; `times`
-    how often, `t_s` the first time.
+    is how often it occurred, and `t_s` the time of the first occurrence.
     """
 
     what: str

@@ -44,8 +44,8 @@ class CheckedDraft:
 
 
 def check_draft(text: str, folder: Path, name: str) -> CheckedDraft:
-    """Return the errors of a profile, or, if there are none, the device that it describes. References to other files begin in
-    `folder`."""
+    """Return the errors of a profile. The result of a profile without errors describes its device. References to other files
+    begin in `folder`."""
     try:
         profile = resolve(parse(text, str(folder / name)))
     except FileInvalid as e:

@@ -36,7 +36,7 @@ RUNNING, DONE, FINDINGS, STOPPED, FAILED = "running", "done", "findings", "stopp
 
 
 class Jobs:
-    """``async with Jobs(folder) as jobs``: leaving stops every job that still runs."""
+    """All jobs of the guide. Use it as ``async with Jobs(folder) as jobs``; leaving the block stops every job that still runs."""
 
     def __init__(self, folder: WorkFolder) -> None:
         self.folder = folder

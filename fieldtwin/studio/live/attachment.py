@@ -59,7 +59,7 @@ NONE_OF_THEM = 1 << 62
 
 
 class Attachment:
-    """``async with Attachment(found, clock) as attachment``: one instance, observed until the block ends.
+    """The observation of one instance. It lasts as long as the block ``async with Attachment(found, clock) as attachment``.
 
     `gateway`, `plc` and `field` are the latest statuses, None while a process does not answer; `troubles` gives the reasons.
     """

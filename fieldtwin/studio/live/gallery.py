@@ -18,7 +18,7 @@ class NoInstance(UsageError):
 
 
 class Gallery:
-    """``async with Gallery(clock) as gallery``: the attached instances by name."""
+    """The attached instances by name. Use it as ``async with Gallery(clock) as gallery``."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

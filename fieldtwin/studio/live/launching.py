@@ -60,7 +60,7 @@ def instance_name(system: Path) -> str:
 
 
 class Launcher:
-    """The runs that Studio has started. ``async with Launcher() as launcher``: leaving stops them all."""
+    """The runs that Studio has started. Use it as ``async with Launcher() as launcher``; leaving the block stops them all."""
 
     def __init__(self) -> None:
         self._runs: dict[str, _Run] = {}

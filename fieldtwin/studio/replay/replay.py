@@ -22,7 +22,7 @@ ABOUT_EVERY_S = 1.0
 
 
 class Replay:
-    """``async with Replay(name, path) as replay``: a trace that is indexed, and followed until the block ends.
+    """An opened trace. During ``async with Replay(name, path) as replay`` it is indexed, and its file is followed.
 
     `system` names the system for a trace without a description. Raises `FileInvalid` and `UsageError`.
     """

@@ -55,7 +55,7 @@ def is_trace(path: Path) -> bool:
 
 
 class Traces:
-    """``async with Traces(folder) as traces``: the known traces, and those that are open.
+    """The known traces, and those that are open. Use it as ``async with Traces(folder) as traces``.
 
     `named` are files and folders that the user named; `system` is the system of a trace without a description.
     """

@@ -19,7 +19,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
 
 
 class Recordings:
-    """``async with Recordings() as recordings``: leaving ends them all."""
+    """The recordings by instance. Use it as ``async with Recordings() as recordings``; leaving the block ends them all."""
 
     def __init__(self) -> None:
         self._recorders: dict[str, Recorder] = {}

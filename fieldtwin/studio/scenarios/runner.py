@@ -63,7 +63,7 @@ def _names(named: str, file: Path, system: Path) -> bool:
 
 
 class ScenarioRunner:
-    """Runs one scenario at a time. ``async with ScenarioRunner() as runner``: leaving stops the run."""
+    """Runs one scenario at a time. Use it as ``async with ScenarioRunner() as runner``; leaving the block stops the run."""
 
     def __init__(self) -> None:
         self._run: _Run | None = None

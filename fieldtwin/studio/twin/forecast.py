@@ -49,7 +49,7 @@ class AskWhatIf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Forecaster:
-    """Runs one question at a time. ``async with Forecaster() as forecaster``: leaving stops the run."""
+    """Answers one question at a time. Use it as ``async with Forecaster() as forecaster``; leaving the block stops the run."""
 
     def __init__(self) -> None:
         self._run: ChildRun | None = None

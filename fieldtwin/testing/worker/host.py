@@ -34,7 +34,8 @@ MOST = 1_000
 
 
 class Host:
-    """``await Host().serve()`` until the standard input ends."""
+    """The owner of all benches and programs of a test run. ``await Host().serve()`` handles requests until the standard input
+    ends."""
 
     def __init__(self, *, trust: bool = False) -> None:
         self._trust = trust

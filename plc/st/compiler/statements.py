@@ -23,7 +23,7 @@ _CHAIN = 48
 
 
 class Statements(Expressions):
-    """The compiler of a body. `leave` is the Python statement for RETURN."""
+    """The compiler of the statements of a POU. `leave` is the Python statement for RETURN."""
 
     leave = "return"
 

@@ -74,7 +74,7 @@ class RtuWire:
         self._noise = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Return whole requests: (unit ID and PDU, 0)."""
+        """Return the complete requests. Each is a pair: unit ID and PDU as bytes, and 0 in place of a transaction ID."""
         return [(frame[:-2], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
@@ -96,7 +96,7 @@ class AsciiWire:
         self._noise = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Return whole requests: (unit ID and PDU, 0)."""
+        """Return the complete requests. Each is a pair: unit ID and PDU as bytes, and 0 in place of a transaction ID."""
         return [(frame[:-1], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
@@ -123,7 +123,7 @@ class MbapWire:
         self._garbage = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Return whole requests: (unit ID and PDU, transaction ID)."""
+        """Return the complete requests. Each is a pair: unit ID and PDU as bytes, and the transaction ID."""
         self._buffer += data
         found = []
         while len(self._buffer) >= 6:

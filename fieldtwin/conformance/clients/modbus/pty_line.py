@@ -20,7 +20,8 @@ with suppress(ImportError):  # Windows has no pseudo-terminals
 
 
 class PtyLine:
-    """``line = await PtyLine.open(listen, stage)``, ``await line.run()`` until cancelled, ``await line.aclose()``."""
+    """The virtual port with its server. Create it with ``line = await PtyLine.open(listen, stage)``, serve with ``await
+    line.run()`` until cancelled, and end it with ``await line.aclose()``."""
 
     def __init__(self, listen: Endpoint, stage: HostileServer, port: ByteConnection, named: Endpoint) -> None:
         self.named = named

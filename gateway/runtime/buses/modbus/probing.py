@@ -36,7 +36,7 @@ SHORT_TRIES = 3
 
 
 class Probing:
-    """The budget of one bus. `share`, over 0 to 1, is the part of the bus's time for probes."""
+    """The budget of one bus. `share`, which is above 0 and at most 1, is the part of the bus's time for probes."""
 
     def __init__(self, share: float, t35_ns: int) -> None:
         self._share = share

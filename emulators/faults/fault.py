@@ -103,7 +103,7 @@ HEX = r"^([0-9A-Fa-f]{2} ?)*$"
 
 
 class Nothing(Parameters):
-    """A fault without parameters."""
+    """The empty form of a fault that needs no parameters."""
 
 
 class InjectionPoint(Enum):

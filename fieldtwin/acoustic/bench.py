@@ -162,7 +162,9 @@ class NetworkBench:
     async def clear(self, id: str) -> None:
         where = self._where.pop(id, None)
         if where is None:
-            raise UsageError(f"no fault {id!r} is active", expected=", ".join(self._where) or "one; there is none")
+            raise UsageError(
+                f"no fault {id!r} is active", expected=", ".join(self._where) or "an active fault; none is active"
+            )
         if where == WATER:
             self.faults.clear(id)
             self.trace.note(self.now_ns(), TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})

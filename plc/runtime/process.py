@@ -181,7 +181,9 @@ class PlcProcess:
         tags = list(there) if args.get("all") is True else [_text(args, "tag")]
         for tag in tags:
             if tag not in there:
-                raise UsageError(f"{tag} is not forced", expected=", ".join(there) or "a force; there is none")
+                raise UsageError(
+                    f"{tag} is not forced", expected=", ".join(there) or "a forced tag, but no tag is forced"
+                )
             self._note("unforce", args, tag=tag, old=there[tag]["value"], new=None)
             forces.unforce(tag)
         return {"removed": len(tags), "forces": forces.describe(monotonic_ns())}

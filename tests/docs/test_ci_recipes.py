@@ -42,7 +42,7 @@ def parsed(command: str) -> click.Context:
 
 
 @pytest.mark.parametrize(("service", "text"), RECIPES)
-def test_a_recipe_is_of_its_form_and_its_commands_are_there(service, text):
+def test_a_recipe_has_its_format_and_its_commands_exist(service, text):
     ours = [line for line in commands_of(service, text) if line.startswith("fieldtwin")]
     assert ours
     for line in ours:

@@ -55,7 +55,7 @@ def test_verdict_on_the_inotify_limit() -> None:
     assert watches_verdict(4).verdict is HostVerdict.NOTE
 
 
-def test_the_group_to_join_is_the_ports_own(tmp_path: Path) -> None:
+def test_the_group_to_join_is_the_group_that_owns_the_port(tmp_path: Path) -> None:
     port = tmp_path / "ttyUSB0"
     port.write_bytes(b"")
     port.chmod(0o660)

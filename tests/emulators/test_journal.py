@@ -33,7 +33,7 @@ def test_the_oldest_fall_off_and_are_counted() -> None:
     assert journal.since(7) == [DeviceValue(8, "level", b"\0\7", 70)]
 
 
-def test_less_is_stored_from_now_on() -> None:
+def test_a_lower_capacity_applies_from_now_on() -> None:
     journal = filled(8, 100)
     journal.keep(3)
     assert [h.number for h in journal.since(0)] == [6, 7, 8]

@@ -145,7 +145,9 @@ def check_rule(past: Past, check: CheckResult) -> None:
     if word in ("always", "never") and "age(" not in check.text:
         assert check.t_ns is not None
         assert past.truth(check.text, check.t_ns / NS) is (word == "never") or "stale" in check.got
-    elif word == "within" and (found := re.search(r"at ([\d.]+) s, and not so until ([\d.]+) s", check.got)):
+    elif word == "within" and (
+        found := re.search(r"at ([\d.]+) s, and the second did not hold until ([\d.]+) s", check.got)
+    ):
         rule = form.within[int(number) - 1]
         if (
             "age(" not in rule.after + rule.then

@@ -151,7 +151,7 @@ def test_markup_holds_any_text(inside: str, attribute: str) -> None:
     assert text(Markup("<i>")) == "<i>"
 
 
-def test_a_run_of_nothing() -> None:
+def test_a_report_of_a_run_without_scenarios_is_inconclusive() -> None:
     empty = Report("nothing", [])
     assert empty.verdict is Verdict.INCONCLUSIVE  # not a pass
     said = page(empty).said

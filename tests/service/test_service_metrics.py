@@ -242,7 +242,7 @@ def test_series_are_bounded() -> None:
     st.text(st.characters(codec="utf-8", exclude_characters="\r\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029")),
     st.floats(allow_nan=False),
 )
-def test_any_label_and_any_number_come_back(label: str, number: float) -> None:
+def test_any_label_and_any_number_are_read_back_unchanged(label: str, number: float) -> None:
     family = Family("x", "gauge", "back\\slash\nand line")
     family.add(number, name=label)
     assert scraped(render([family])) == {("x", frozenset({("name", label)})): number}

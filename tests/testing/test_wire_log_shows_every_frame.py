@@ -72,7 +72,9 @@ def test_the_text_of_a_stray_explains_why_its_bytes_are_hidden(device: DeviceHan
         ({"access": "writes"}, "no exchange has the access 'writes'; expected one of '', 'read', 'write'"),
     ],
 )
-def test_a_question_that_nothing_can_match_is_refused(device: DeviceHandle, like: dict[str, object], says: str) -> None:
+def test_a_selection_that_no_exchange_can_match_is_refused(
+    device: DeviceHandle, like: dict[str, object], says: str
+) -> None:
     with pytest.raises(TypeError) as refused:
         device.wire.expect(times=0, within_s=0.0, **like)
     assert says in str(refused.value)

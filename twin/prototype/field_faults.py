@@ -135,7 +135,9 @@ class FieldFaults:
     def clear(self, id: str) -> None:
         """Clear a fault. Raises `UsageError` for an id that is not active."""
         if id not in self._active:
-            raise UsageError(f"no fault {id!r} is active", expected=", ".join(self._active) or "one; there is none")
+            raise UsageError(
+                f"no fault {id!r} is active", expected=", ".join(self._active) or "an active fault; none is active"
+            )
         spec, _, bus = self._active.pop(id)
         if spec.aim.device in self._distortions:
             self._distortions[spec.aim.device].take_away(id)

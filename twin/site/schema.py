@@ -170,7 +170,8 @@ class StartForm(SiteModel):
     timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
     at_timeout: Literal["wait", "stop", "start_anyway"] = Field(
         default="wait",
-        description="wait: continue to wait and report it; stop: stop the PLC, outputs safe; start_anyway: start as it is",
+        description="wait: continue to wait and report it; stop: stop the PLC, outputs safe; "
+        "start_anyway: start with the inputs that it has",
     )
 
 

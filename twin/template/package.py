@@ -128,7 +128,7 @@ class Package(ABC):
 
 @contextmanager
 def open_package(path: Path, *, edited: bool = False) -> Iterator[Package]:
-    """Open a template, folder or zip. With `edited`, a folder may differ from its manifest (`EditedFolder`).
+    """Open a template, which is a folder or a zip. With `edited`, a folder may differ from its manifest (`EditedFolder`).
 
     Raises `FileInvalid` or `UsageError`.
     """

@@ -117,7 +117,7 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
             if name.lower() in sections:
                 if _OBJECT.fullmatch(name):
                     raise FileInvalid(f"section [{name}] is given twice", path=path, line=number)
-                notes.append(Note(number, f"[{name}] is given twice, the last one counts"))
+                notes.append(Note(number, f"[{name}] is given twice; the last one is used"))
             current = sections[name.lower()] = Section(name, number, path, notes=notes)
             continue
         key, equals, value = line.partition("=")
@@ -134,7 +134,7 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
         if key in current.values:
             if current.values[key][0] != bare and _OBJECT.fullmatch(current.name):
                 raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
-            notes.append(Note(number, f"{key} of [{current.name}] is given twice, the last one counts"))
+            notes.append(Note(number, f"{key} of [{current.name}] is given twice; the last one is used"))
         if bare != value.strip():
             notes.append(Note(number, f"a comment after the value of {key} in [{current.name}] is left out"))
         current.values[key] = (bare, number)

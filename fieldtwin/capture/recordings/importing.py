@@ -53,7 +53,7 @@ class TextSummary:
 
 
 def kind_of(path: Path) -> str:
-    """Return packets, can, csv, cnv, polls or capture.
+    """Return the kind of a file: ``packets``, ``can``, ``csv``, ``cnv``, ``polls`` or ``capture``.
 
     Raises `UsageError`, or `FileInvalid` where the file cannot be read.
     """

@@ -30,7 +30,7 @@ _DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Bad:
-    """Bytes that do not belong to an exchange, and the reason. `sent`: towards the device."""
+    """Bytes that do not belong to an exchange, and the reason. `sent` is true for bytes that went to the device."""
 
     t_ns: int
     sent: bool

@@ -87,7 +87,7 @@ def serial_causes(e: SerialEvidence) -> list[LikelyCause]:
             LikelyCause(
                 "the port ignores settings",
                 70 if e.heard.bytes and not e.heard.sure else 5,
-                f"its driver did not take {', '.join(e.ignored)}",
+                f"its driver ignored {', '.join(e.ignored)}",
                 "a virtual port has no parity; else use another adapter",
             )
         )

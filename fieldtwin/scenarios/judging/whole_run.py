@@ -191,8 +191,8 @@ class WithinRule:
                     self.number, self.text, got, self.names, self.limit_s, self._since_s, self.where, undecidable=True
                 )
         elif now_s >= self.due_s:
-            so = "and unknown at" if then is None else "and not so until"
-            got = f"that was at {self._since_s:.3f} s, {so} {now_s:.3f} s"
+            state = "was unknown at" if then is None else "did not hold until"
+            got = f"the first condition became true at {self._since_s:.3f} s, and the second {state} {now_s:.3f} s"
             bound_s = 0.0 if allowed.applies and not allowed.exhausted else self.limit_s
             if allowed.any_s:
                 got += f", {allowed.any_s:.3f} s of that for the lateness of this host"

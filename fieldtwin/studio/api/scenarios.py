@@ -45,7 +45,10 @@ async def run_scenario(request: Request) -> dict[str, Any]:
     form = await body_of(request, RunScenario)
     known = [file.path for file in known_scenarios(Path(attachment.record.path), folder_of(request))]
     if form.path not in known:  # a page must not run arbitrary files
-        raise NotFound(f"no scenario {form.path[:80]!r}", expected=", ".join(known) or "a scenario; there is none")
+        raise NotFound(
+            f"no scenario {form.path[:80]!r}",
+            expected=", ".join(known) or "a scenario; the system has none",
+        )
     await _runner(request).start(form.path, form.target)
     of_server(request, "traces", Traces).latest_run = _runner(request).trace
     return {"run": _runner(request).state()}

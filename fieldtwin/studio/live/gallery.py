@@ -43,7 +43,7 @@ class Gallery:
             if found is None:
                 others = ", ".join(other.name for other in await find_instances())
                 raise NoInstance(
-                    f"no instance {name!r} on this computer", expected=others or "an instance; there is none"
+                    f"no instance {name!r} on this computer", expected=others or "an instance, but none exists"
                 )
             known = self._attached.get(name)
             if known is not None and (found.record is None or found.record == known[0].record):

@@ -90,7 +90,7 @@ def test_a_busy_unit_reports_it_and_can_be_asked_for_the_reason() -> None:
     assert ask(unit, "0B", 100) == "0B 00 00 00 02", "the write and the question for the counter"
 
 
-def test_a_program_that_is_refused_is_a_nak() -> None:
+def test_a_refused_program_function_counts_as_a_nak() -> None:
     unit = make_unit()
 
     def refuse(pdu: bytes, now_ns: int) -> bytes:

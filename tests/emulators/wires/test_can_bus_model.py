@@ -201,7 +201,7 @@ def test_counts_and_load() -> None:
     assert (stats["nodes"][1]["received"], stats["nodes"][1]["overruns"]) == (20, 1)
 
 
-def test_instant_frames_know_no_collisions_and_count_them() -> None:
+def test_frames_without_duration_do_not_collide_and_are_counted() -> None:
     bus = CanBus(125_000, instant=True)
     a, b = bus.join(0), bus.join(0)
     bus.submit(b, CanFrame(0x181, b"b"), 0)

@@ -98,7 +98,7 @@ def test_missed_periods_are_skipped_and_counted_never_burst() -> None:
     assert (task.missed_periods, task.overruns) == (3, 1)  # 30, 40 and 50
 
 
-def test_a_scan_that_is_too_long_gives_up_the_periods_it_covers() -> None:
+def test_a_scan_that_is_too_long_skips_the_periods_that_it_covers() -> None:
     task, logic, clock = made()
     logic.takes_ms = [25]
     task.start()
@@ -155,7 +155,7 @@ def test_logic_that_raises_stops_the_task_and_the_error_is_kept() -> None:
     assert len(logic.stops_ns) == 1
 
 
-def test_a_request_stops_it_and_it_is_started_once() -> None:
+def test_a_task_stops_on_request_and_starts_only_once() -> None:
     task, logic, _ = made()
     task.start()
     with pytest.raises(Bug):

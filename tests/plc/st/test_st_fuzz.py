@@ -238,7 +238,7 @@ def test_huge_programs_are_refused_or_run(what: str) -> None:
     assert survives(text + ("" if text.endswith("(*") else "\nEND_PROGRAM")) == expected
 
 
-def test_long_chains_go_the_right_way() -> None:
+def test_each_branch_of_a_long_chain_is_taken() -> None:
     """ELSIF and CASE with more branches than Python can nest: each one is taken, and the ELSE."""
     cases = " ".join(f"{3 * n}, {3 * n + 1}: r := {n};" for n in range(200))
     branches = "".join(f"ELSIF n = {n} THEN e := {n}; " for n in range(200))

@@ -173,7 +173,7 @@ def test_a_wrong_state_file(tmp_path: Path, old: str, new: str, message: str) ->
         read_state(path, OBSERVATORY)
 
 
-def test_the_last_that_a_store_knows(tmp_path: Path) -> None:
+def test_the_last_known_state_is_read_from_a_store(tmp_path: Path) -> None:
     async def main() -> KnownState:
         store = await SqliteKnowledge.open(tmp_path / "k.db", offload=in_place)
         try:

@@ -44,7 +44,7 @@ def run(folder: Path, steps: str, head: str) -> ScenarioResult:
             "within: [{after: \"relay.state == 'ACTIVE'\", then: \"ctd.sample_period_s == 9\", within: 2s}]\n",
             "  - send: {period_s: 1}\n  - wait: {until: \"relay.state == 'ACTIVE'\", within: 10s}\n",
             Verdict.FAILED,
-            "and not so until 2.3",
+            "did not hold until 2.3",
         ),
         (
             "rate: [{tag: inclinometer.slope_long, updates_per_s: {min: 9, max: 11}, over: 2s, "

@@ -236,7 +236,7 @@ def test_a_follower_that_drips_gives_its_place_up_to_an_honest_one(
     really(main)
 
 
-def test_a_command_with_a_time_far_ahead_is_refused_so_that_it_does_not_stay_young_for_ever() -> None:
+def test_a_command_with_a_time_in_the_far_future_is_refused() -> None:
     """The plant's age limit protects a plant whose store was lost; a forged time would defeat it."""
     now_ms = CLOCK.utc_ns() // 1_000_000
     gate = CommandGate(remote=True, bounds=CommandLimits(), clock=CLOCK)

@@ -76,7 +76,7 @@ def test_cancelled_at_the_instant_at_which_it_was_passed_on_it_goes_to_the_next(
     assert had == ["second"]
 
 
-def test_an_alarm_ends_by_itself_or_is_rung_on_either_loop() -> None:
+def test_a_timeout_ends_by_itself_or_is_ended_early_on_either_loop() -> None:
     async def main() -> tuple[float, float]:
         loop = asyncio.get_running_loop()
         began = loop.time()

@@ -120,7 +120,7 @@ def adu(unit: int, pdu: str) -> bytes:
         (2, "06 0004 0001", 0x0B, "line/99", "the unit did not answer, and is not asked for some seconds"),
     ],
 )
-def test_a_write_that_the_bridge_answers_itself_is_on_record(
+def test_a_write_that_the_bridge_answers_itself_is_recorded(
     tmp_path: Path, unit: int, pdu: str, code: int, device: str, why: str
 ) -> None:
     async def main() -> None:

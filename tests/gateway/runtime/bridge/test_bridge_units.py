@@ -150,7 +150,7 @@ def test_mb_028_a_broadcast_is_sent_once_and_gets_no_reply(tmp_path: Path) -> No
     run(main())
 
 
-def test_mb_028_a_broadcast_is_answered_where_that_is_wanted_and_only_when_it_went_out(tmp_path: Path) -> None:
+def test_mb_028_a_broadcast_is_answered_if_configured_and_only_after_it_was_sent(tmp_path: Path) -> None:
     async def main() -> None:
         config = BridgeConfig("b", ANY_PORT, to="line", policy=WRITERS, broadcast=True, answer_broadcast=True)
         async with rig(tmp_path, config) as r, r.raw() as raw:

@@ -260,7 +260,7 @@ def test_co016_co017_one_lost_segment_is_always_got_over(lost: int) -> None:
 
 
 @given(frames=st.lists(st.binary(max_size=8), max_size=80), size=st.integers(0, 60))
-def test_any_bytes_are_survived(frames: list[bytes], size: int) -> None:
+def test_a_transfer_ends_whatever_bytes_arrive(frames: list[bytes], size: int) -> None:
     for transfer in (upload(), SdoBlockDownload(5, 0x2000, 0, TIMEOUT, bytes(size))):
         transfer.start(0)
         for data in [bytes.fromhex("C400200000000000"), bytes.fromhex("A400200004000000"), *frames]:

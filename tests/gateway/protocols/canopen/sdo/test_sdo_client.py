@@ -274,7 +274,7 @@ def test_no_garbage_and_no_repetition_yields_a_wrong_object(value: bytes, sized:
 
 
 @given(frames=st.lists(st.binary(max_size=8), max_size=100), size=st.integers(0, 30))
-def test_any_bytes_are_survived(frames: list[bytes], size: int) -> None:
+def test_a_transfer_ends_whatever_bytes_arrive(frames: list[bytes], size: int) -> None:
     for transfer in (upload(), SdoDownload(5, 0x1008, 0, TIMEOUT, bytes(size))):
         transfer.start(0)
         for data in frames:

@@ -52,7 +52,7 @@ def test_a_reply_that_may_be_the_late_one_settles_only_older_requests() -> None:
     assert not late.answered(PROBES[0])
 
 
-def test_a_boot_up_settles_all() -> None:
+def test_after_a_boot_up_no_reply_is_outstanding() -> None:
     late = LateReplies()
     late.unanswered(M)
     late.settle()

@@ -60,7 +60,7 @@ def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
     said, (version, modules) = manifest.software, wheel_hash(folder / manifest.software.wheel)
     if (version, modules) != (said.version, said.modules_sha256):
         raise FileInvalid(
-            f"{said.wheel} is different software from the manifest's", path=where,
+            f"{said.wheel} is not the software that the manifest names", path=where,
             expected=f"{said.version}, modules {said.modules_sha256[:12]}", got=f"{version}, modules {modules[:12]}",
         )  # fmt: skip
 

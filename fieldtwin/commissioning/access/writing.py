@@ -135,7 +135,7 @@ async def before(point: Point, write: Write) -> PointValue | None:
         raise CheckFailed(
             f"{write.tag.name}: its present value cannot be read, so nothing is written: {answer.problem}",
             where=point.where,
-            hint="--blind writes all the same",
+            hint="--blind writes without reading the present value first",
         )
     return answer
 

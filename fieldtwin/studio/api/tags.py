@@ -14,7 +14,7 @@ from fieldtwin.studio.live.marks import Mark, all_marks
 from fieldtwin.studio.live.tag_history import MOST_POINTS, recent
 
 WRITE_WITHIN_S = 8.0
-"""Longer than the gateway itself waits for the device."""
+"""Time limit of a write in seconds, which is longer than the gateway itself waits for the device."""
 
 
 class SetValue(msgspec.Struct, forbid_unknown_fields=True):

@@ -72,7 +72,7 @@ class ImageLayout:
     def __post_init__(self) -> None:
         names = [region.name for region in self.regions]
         if len(set(names)) != len(names):
-            raise FileInvalid("regions of one name in a process image", got=", ".join(names))
+            raise FileInvalid("two regions of a process image have the same name", got=", ".join(names))
 
     @property
     def size(self) -> int:

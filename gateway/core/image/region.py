@@ -192,7 +192,10 @@ class RegionWriter(_Region):
             where = f"region {self.shape.layout.name}"
             if len(times_ns) != self.shape.count:
                 raise Bug(
-                    "not one value a tag", expected=str(self.shape.count), got=str(len(times_ns)), where=where
+                    "the number of values is not the number of tags",
+                    expected=str(self.shape.count),
+                    got=str(len(times_ns)),
+                    where=where,
                 ) from e
             raise Bug("a time stamp that does not fit into 64 bits", where=where) from e
 
@@ -209,7 +212,7 @@ class RegionWriter(_Region):
         shape = self.shape
         if len(values) != shape.count:
             raise Bug(
-                "not one value a tag",
+                "the number of values is not the number of tags",
                 expected=str(shape.count),
                 got=str(len(values)),
                 where=f"region {shape.layout.name}",

@@ -163,9 +163,9 @@ def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
             current = Section(_canonical_section(heading[1].strip()), number)
             if current.name in sections and _OBJECT.match(current.name):
                 before = sections[current.name].line
-                raise FileInvalid(f"[{current.name}] is there twice", path=path, line=number, got=f"also line {before}")
+                raise FileInvalid(f"[{current.name}] occurs twice", path=path, line=number, got=f"also line {before}")
             if current.name in sections:
-                mended.append(f"[{current.name}]: the section occurs twice; the last one is used")
+                mended.append(f"[{current.name}]: occurs twice; the last one is used")
             sections[current.name] = current
             continue
         key, equals, value = line.partition("=")
@@ -184,9 +184,9 @@ def _put(section: Section, written: str, value: str, line: int, path: str, mende
     if key in section.values and _OBJECT.match(section.name):
         if section.values[key] != value:
             raise FileInvalid(
-                f"[{section.name}] {key} is there twice", path=path, line=line, got=f"also line {section.lines[key]}"
+                f"[{section.name}] {key} occurs twice", path=path, line=line, got=f"also line {section.lines[key]}"
             )
-        mended.append(f"[{section.name}] {key}: there twice")
+        mended.append(f"[{section.name}] {key}: occurs twice")
     section.values[key], section.lines[key] = value, line
 
 

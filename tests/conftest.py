@@ -6,6 +6,7 @@ import gc
 import os
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -59,20 +60,52 @@ each other.
 
 Each of the two queues takes about as long as all other tests together: three processes.
 """
+KILLS = "tests/system/failures/test_hundred_kills.py"
+"""Each of its tests takes minutes, and they share nothing."""
 
 
-def line_of(nodeid: str) -> str:
-    """Return the tests' group, which shares a process: a queue of `LINES`, or else the file."""
+def are_long(config: pytest.Config) -> bool:
+    """Return whether only the long tests were selected."""
+    return str(config.getoption("markexpr")).startswith("long")
+
+
+def line_of(nodeid: str, long: bool) -> str:
+    """Return the tests' group, which shares a process: a queue of `LINES`, or else the file.
+
+    The long tests of systems are too many for one queue: any process may run any file of them.
+    """
     file = nodeid.partition("::")[0]
+    if long and file.startswith("tests/system/"):
+        return nodeid if file == KILLS else file
     folders = Path(file).parts
     return LINES.get(folders[1], file) if len(folders) > 2 else file
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """In a process of pytest-xdist, put the long tests that may take longest first, so that none of them runs alone at the
+    end. The time limit of a group stands for its duration.
+    """
+    if not hasattr(config, "workerinput") or not are_long(config):
+        return
+    limits: dict[str, float] = {}
+    for item in items:
+        mark, group = item.get_closest_marker("timeout"), line_of(item.nodeid, True)
+        limits[group] = max(limits.get(group, 0.0), float(mark.args[0]) if mark else 0.0)
+    counts = Counter(line_of(item.nodeid, True) for item in items)
+
+    def order(item: pytest.Item) -> tuple[float, int, str]:
+        group = line_of(item.nodeid, True)
+        return -limits[group], -counts[group], group
+
+    items.sort(key=order)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Distribute tests over the processes of pytest-xdist: whole systems in one process, one after the other; user
     programs and third-party programs in another; all other tests file by file, so that fixtures of a file are created
-    once.
+    once. Long tests are distributed in the order of the collection.
 
     The marker `xdist_group` cannot be used: pytest 9.2 no longer lets xdist 3.8 change the id of a test, so tests run
     in any process.
@@ -81,8 +114,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Lines(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return line_of(nodeid)
+            return line_of(nodeid, are_long(config))
 
+    if are_long(config):
+        config.option.loadscopereorder = False
     return Lines(config, log)
 
 

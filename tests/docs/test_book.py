@@ -1,10 +1,8 @@
-"""The book of docs/: its links work, its reference matches the program, and it builds without a warning."""
+"""The book of docs/: its links work, and its reference matches the program. scripts/docs builds it."""
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
 from importlib import import_module
 
@@ -118,14 +116,3 @@ def test_the_public_api_equals_the_reference():
     for name in told:
         module, _, own = name.rpartition(".")
         assert getattr(import_module(module), own).__doc__, name
-
-
-@pytest.mark.long
-@pytest.mark.timeout(300)
-def test_the_book_is_built_without_a_warning():
-    for tool in ("sphinx", "myst_parser", "furo"):
-        pytest.importorskip(tool, reason="pip install '.[docs]'")
-    done = subprocess.run(
-        ["scripts/docs"], cwd=ROOT, env={**os.environ, "BOOK_PYTHON": sys.executable}, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

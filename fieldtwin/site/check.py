@@ -26,7 +26,8 @@ from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.scenarios.judging.waiving import ids_of
-from fieldtwin.scenarios.language.form import invariants_of, load_scenario
+from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.scenarios.language.names import invariants_of
 from fieldtwin.site.compose.check import CommandLines, ComposeCheck
 from fieldtwin.site.compose.service import is_compose
 from fieldtwin.twin.plant.physical import image_layout

@@ -59,6 +59,12 @@ class System:
         """Return the devices of a bus, in the file's order."""
         return [d for d in self.devices.values() if d.bus == bus]
 
+    def number_of(self, name: str, value: float | str | bool | None) -> float | str | bool | None:
+        """Return the number for a name in the `values` of the tag DEVICE.TAG, and every other value unchanged."""
+        device, _, tag = name.rpartition(".")
+        tags = self.devices[device].profile.tags if device in self.devices else {}
+        return tags[tag].number_of(value) if tag in tags and isinstance(value, str) else value
+
 
 def load_system(name: str, profiles: Iterable[Path] = (), errors: ErrorCollector | None = None) -> System:
     """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`.
@@ -259,6 +265,13 @@ def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name
     tag = _known(file, loc, profile, name)
     if not tag.writable:
         raise file.error(loc, f"the tag {name!r} of {profile.name} is read-only")
+    if tag.bits is not None or tag.scale_by is not None:
+        why = "a part of its register" if tag.bits is not None else "scaled by another register"
+        raise file.error(
+            loc,
+            f"the gateway cannot write the tag {name!r} of {profile.name}, because it is {why}",
+            expected="a tag of the whole register, without `bits` and `scale_by`",
+        )
     return tag
 
 

@@ -11,7 +11,7 @@ from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.runner import LATE_SHARE, RECENT_S
 from fieldtwin.scenarios.judging.standing import AlwaysRule, always_rule
 from fieldtwin.scenarios.judging.whole_run import WithinRule, within_rule
-from fieldtwin.scenarios.language.form import invariants_of, names_of
+from fieldtwin.scenarios.language.names import invariants_of, names_of
 from fieldtwin.twin.site.system import System
 
 Rule = AlwaysRule | WithinRule

@@ -73,7 +73,8 @@ async def _check_value(expect: Expect, watched: ExpectationInput, reading: TagRe
         return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
     if expect.quality is not None and reading.quality != expect.quality:
         return f"{expect.tag} {expect.quality}", f"{reading.quality} ({reading.reason})"
-    if expect.value is not None and not _near(reading.value, expect.value, expect.tolerance):
+    wanted = watched.system.number_of(expect.tag, expect.value)
+    if wanted is not None and not _near(reading.value, wanted, expect.tolerance):
         within = f" ± {expect.tolerance:g}" if expect.tolerance else ""
         return f"{expect.tag} {expect.value}{within}", str(reading.value)
     if expect.like is not None:

@@ -250,7 +250,7 @@ class ScenarioRunner:
             await bench.send(step.send.period_s)
         elif step.set is not None:
             device, _, tag = step.set.tag.rpartition(".")
-            await bench.set_value(device, tag, step.set.value)
+            await bench.set_value(device, tag, self.scenario.system.number_of(step.set.tag, step.set.value))
         elif step.fault is not None:
             await bench.inject({"id": fault_id(n, step), **step.fault})
         elif step.clear is not None:

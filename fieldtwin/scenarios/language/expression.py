@@ -22,7 +22,9 @@ and the reason why it is bad.
 QUALITIES = tuple(str(quality) for quality in Quality)
 WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for reason in Reason)}
 """The possible results of these functions."""
-NO_WORDS: Mapping[str, Collection[str]] = {}
+Words = Collection[str]
+"""The texts that a name can equal. A mapping gives the number of each text: the name's value is a number."""
+NO_WORDS: Mapping[str, Words] = {}
 _OWN = ("plc.late", "command_pending")
 """``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5 s."""
 Look = Callable[[str, str], Any]
@@ -42,15 +44,16 @@ class Expression:
     """An expression, parsed once from `text`. `names` are the tags and variables in it. Raises `UsageError` for an
     invalid expression.
 
-    `words` gives, for some names, all values that they can have; comparing such a name with a different text is an
-    error. `prefix` is put before each name when it is evaluated: in a network, the name of the system and a dot.
+    `words` gives, for some names, the texts that they can equal; comparing such a name with a different text is an
+    error. A text for which `words` has a number is replaced by that number. `prefix` is put before each name when it is
+    evaluated: in a network, the name of the system and a dot.
     """
 
     def __init__(
         self,
         text: str,
         known: Collection[str],
-        words: Mapping[str, Collection[str]] = NO_WORDS,
+        words: Mapping[str, Words] = NO_WORDS,
         prefix: str = "",
     ) -> None:
         self.text = text
@@ -121,16 +124,22 @@ class Expression:
             raise self._parsed.error(f"no function {name!r}", node, expected=expected, hint=hint)
 
     def _check_words(self, asked: ast.expr, text: ast.expr) -> None:
-        """Refuse a text that the other side of a comparison can never equal."""
+        """Refuse a text that the other side of a comparison can never equal, and replace the name of a number by the number."""
         if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
             return
-        words: Collection[str] = ()
+        words: Words = ()
         if isinstance(asked, ast.Name | ast.Attribute):
             words = self._words.get(dotted(asked), ())
         elif isinstance(asked, ast.Call) and isinstance(asked.func, ast.Name) and len(asked.args) == 1:
             value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute)
             words = self._words.get(dotted(asked.args[0]), ()) if value else WORDS.get(asked.func.id, ())
-        if words and text.value not in words:
+        if isinstance(words, Mapping) and text.value in words:
+            text.value = words[text.value]
+        elif isinstance(words, Mapping) and not words:
+            raise self._parsed.error(
+                f"{ast.unparse(asked)} is a number, and {text.value!r} is a text", text, expected="a number"
+            )
+        elif words and text.value not in words:
             raise self._parsed.error(
                 f"{ast.unparse(asked)} is never {text.value!r}",
                 text,

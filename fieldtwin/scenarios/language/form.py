@@ -12,9 +12,10 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector, Followi
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.language.expression import QUALITIES, Expression
-from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
+from fieldtwin.scenarios.language.expression import QUALITIES, Expression, Words
+from fieldtwin.scenarios.language.invariants import Invariants
 from fieldtwin.scenarios.language.located_expression import read_expression
+from fieldtwin.scenarios.language.names import incomplete_parts, invariants_of, names_of
 from fieldtwin.scenarios.language.probe_form import ScenarioProbe, read_probe
 from fieldtwin.scenarios.language.words import (
     WORDS,
@@ -30,7 +31,6 @@ from fieldtwin.scenarios.language.words import (
 )
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.group import SystemGroup, load_group
-from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
 
 _TOGETHER = {
@@ -58,8 +58,8 @@ class Scenario:
     """The names that expressions may contain."""
     own: tuple[str, ...] = ()
     """The names in `known` that belong to the system, without those of probes."""
-    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """The possible words of each name whose value is a word: the states of programs."""
+    words: Mapping[str, Words] = field(default_factory=dict)
+    """The texts that the system's names can equal, as `names_of` returns them."""
     probes: tuple[ScenarioProbe, ...] = ()
     profiles: tuple[Path, ...] = ()
     group: SystemGroup | None = None
@@ -81,60 +81,6 @@ class Scenario:
         expression = read_expression(self.file, loc, text, self.known, self.words, incomplete=self.incomplete)
         self.used.update(expression.names)
         return expression
-
-
-def names_of(
-    system: System, group: SystemGroup | None = None, errors: ErrorCollector | None = None
-) -> dict[str, tuple[str, ...]]:
-    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a group after the name of
-    their system. The value is a tuple of the words that a program's state can be, and empty for all other names.
-
-    Raises `FileInvalid` for a program that cannot be created or bound; with `errors`, such errors are added to it.
-    """
-    from fieldtwin.twin.plant.physical import bound_programs
-
-    if group is not None:
-        of_all = [(m.name, names_of(m.system)) for m in group.members.values()]
-        return {f"{member}.{name}": words for member, names in of_all for name, words in names.items()}
-    names: dict[str, tuple[str, ...]] = {
-        f"{d.name}.{t.name}": () for d in system.devices.values() for t in d.profile.tags.values()
-    }
-    with collecting(errors) as collector:
-        for program in bound_programs(system, collector):
-            inputs = [binding.tag for binding in program.inputs.values()]
-            names |= {tag: () for tag in inputs if tag.partition(".")[0] in system.devices}
-            for variable, tag in program.published():
-                if tag.partition(".")[0] in (program.name, *system.devices):
-                    is_state = tag == f"{program.name}.state"
-                    names[tag] = tuple(word for _, word in variable.words) if is_state else ()
-    return names
-
-
-def invariants_of(system: System, group: SystemGroup | None = None, errors: ErrorCollector | None = None) -> Invariants:
-    """Return the invariants of a system, or of all systems of a group.
-
-    Raises `FileInvalid`; with `errors`, the errors are added to it.
-    """
-    members = [("", system)] if group is None else [(m.prefix, m.system) for m in group.members.values()]
-    every = Invariants()
-    with collecting(errors) as collector:
-        for prefix, one in members:
-            if one.invariants != NONE_STATED:
-                names = names_of(one, errors=collector)
-                every += load_invariants(one, names, collector, incomplete_parts(one), prefix)
-    return every
-
-
-def incomplete_parts(system: System) -> frozenset[str]:
-    """Return the devices, buses and programs of the system file that were not resolved because of errors.
-
-    A program is also complete if all its variables are bound to tags, although it then publishes no name.
-    """
-    from fieldtwin.twin.plant.physical import bound_programs
-
-    programs = [program.name for program in bound_programs(system, ErrorCollector())]
-    known = {*system.devices, *system.buses, *programs}
-    return frozenset({*system.file.data["devices"], *system.file.data["buses"], *system.plc.programs} - known)
 
 
 def load_scenario(path: Path, profiles: tuple[Path, ...] = (), errors: ErrorCollector | None = None) -> Scenario:
@@ -174,7 +120,7 @@ def _resolve(
         (),
         known,
         tuple(own),
-        {name: words for name, words in own.items() if words},
+        own,
         tuple(probes),
         profiles,
         group,
@@ -308,9 +254,13 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
     found = scenario.system.devices.get(device)
     if found is None or name not in found.profile.tags or said.value is None:
         return
-    if found.profile.tags[name].is_text != isinstance(said.value, str):
+    if found.profile.tags[name].is_text != isinstance(scenario.system.number_of(said.tag, said.value), str):
         wanted = "a text" if found.profile.tags[name].is_text else "a number"
-        raise scenario.file.error((*loc, "value"), f"{said.tag} is {wanted}", got=repr(said.value))
+        names = [one for _, one in found.profile.tags[name].values]
+        hint = did_you_mean(str(said.value), names)
+        raise scenario.file.error(
+            (*loc, "value"), f"{said.tag} is {wanted}", expected=", ".join(names), got=repr(said.value), hint=hint
+        )
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
@@ -354,7 +304,9 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known, scenario.incomplete)
         words = scenario.words.get(expect.tag, ())
         if words and isinstance(expect.value, str):
-            _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, words)
+            _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, tuple(words))
+        elif isinstance(words, Mapping) and isinstance(expect.value, str):
+            raise scenario.file.error((*loc, "value"), f"{expect.tag} is a number", got=repr(expect.value))
         scenario.used.add(expect.tag)
     if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
         raise scenario.file.error((*loc, "like"), "`like: device` needs a tag of a device", expected="tag: DEVICE.TAG")
@@ -368,8 +320,10 @@ def _check_wire(scenario: Scenario, device: str, register: str | None, value: ob
     """Check that `register` is a tag of the device. A `value` needs a register: without one it would never match."""
     _known(scenario.file, (*loc, "wire"), "device", device, list(scenario.system.devices), scenario.incomplete)
     if register is not None:
-        tags = list(scenario.system.devices[device].profile.tags)
-        _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
+        tags = scenario.system.devices[device].profile.tags
+        _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tuple(tags))
+        if isinstance(value, str) and not tags[register].is_text:
+            raise scenario.file.error((*loc, "value"), f"{device}.{register} is a number", got=repr(value))
     elif value is not None:
         raise scenario.file.error((*loc, "value"), "the register of the value is missing", expected="register: TAG")
 

@@ -11,7 +11,7 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.scenarios.language.expression import Expression
+from fieldtwin.scenarios.language.expression import Expression, Words
 from fieldtwin.scenarios.language.located_expression import read_expression
 from fieldtwin.twin.site.system import System
 
@@ -63,24 +63,23 @@ class Invariants:
 
 def load_invariants(
     system: System,
-    names: Mapping[str, tuple[str, ...]],
+    names: Mapping[str, Words],
     errors: ErrorCollector,
     incomplete: Container[str] = frozenset(),
     prefix: str = "",
 ) -> Invariants:
-    """Read the invariants of a system file. `names` are the names that expressions may contain, with the words that a
-    state can be; `incomplete` are the devices and programs that have errors.
+    """Read the invariants of a system file. `names` are the names that expressions may contain, with the texts that each
+    can equal; `incomplete` are the devices and programs that have errors.
 
     `prefix` is the system's name in its network, with a dot; the names of the result begin with it. Errors are added to
     `errors`; the result contains the invariants without error.
     """
     form, file = system.invariants, system.file
-    words = {name: states for name, states in names.items() if states}
     stated: list[Stated] = []
     followed: list[Followed] = []
 
     def expression(text: str, *loc: Key) -> Expression:
-        read = read_expression(file, loc, text, names, words, prefix=prefix, incomplete=incomplete)
+        read = read_expression(file, loc, text, names, names, prefix=prefix, incomplete=incomplete)
         if read.is_constant:
             expected = "a tag or a variable in it"
             raise file.error(loc, "the expression refers to no value", expected=expected, got=text)

@@ -9,7 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.expressions import NotUnderstood
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.scenarios.language.expression import Expression, UnknownName
+from fieldtwin.scenarios.language.expression import Expression, UnknownName, Words
 
 
 def read_expression(
@@ -17,7 +17,7 @@ def read_expression(
     loc: tuple[Key, ...],
     text: str,
     known: Collection[str],
-    words: Mapping[str, Collection[str]],
+    words: Mapping[str, Words],
     *,
     prefix: str = "",
     incomplete: Container[str] = frozenset(),

@@ -98,6 +98,24 @@ def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize(
+    ("form", "why"), [("bits: [0, 0]", "a part of its register"), ("scale_by: run", "scaled by another register")]
+)
+def test_an_output_that_the_gateway_cannot_write_is_refused_when_the_file_is_read(
+    tmp_path: Path, form: str, why: str
+) -> None:
+    tags = f"  run: {{at: 40001, type: uint16}}\n  start: {{at: 40002, type: uint16, access: rw, {form}}}\n"
+    (tmp_path / "drive.yaml").write_text(f"device: mysite/drive\nprotocol: modbus\nsource: invented\ntags:\n{tags}")
+    (tmp_path / "plant.yaml").write_text(
+        'fieldtwin: 1\nsystem: plant\nbuses: {lan: {url: "tcp://192.0.2.1:502"}}\n'
+        "devices:\n  drive:\n    {profile: ./drive.yaml, bus: lan, unit: 1, writable: [start]}\n"
+    )
+    with pytest.raises(
+        FileInvalid, match=rf"plant\.yaml:6:\d+: the gateway cannot write the tag 'start' .*{why}; expected a tag"
+    ):
+        load_system(str(tmp_path / "plant.yaml"))
+
+
 @pytest.mark.parametrize("name", ["", "a/b", "..", "-x", "a" * 41, "a b", "ä"])
 def test_invalid_instance_names_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="instance name"):

@@ -3,7 +3,7 @@
 Objects follow CiA 406 v3.2 for multi-turn encoders, as printed in encoder makers' manuals: operating parameters 6000h, measuring
 units 6001h and total range 6002h, preset 6003h, position 6004h, speed 6030h, offset 6509h. The recording holds 6004h as recorded
 with the factory settings (scaling off, clockwise, no preset). That is the position of the shaft in steps; 6501h is the number of
-steps per turn.
+steps per turn. Without a recorded or simulated speed, the model computes the speed from the position.
 """
 
 from __future__ import annotations
@@ -55,10 +55,13 @@ class Encoder(DeviceModel):
         if (PRESET, 0) in situation.written:
             self._offset = objects.whole(PRESET) - raw
         position = (raw + self._offset) % _range(objects)
-        self._take_speed(raw, situation)
+        speed = situation.played.get((SPEED, 1))
+        if speed is None:
+            self._take_speed(raw, situation)
+            speed = self._speed
         parameters = objects.whole(PARAMETERS) & (COUNTER_CLOCKWISE | SCALING)
         states = {(OPERATING_STATUS, 0): parameters, (OFFSET, 0): self._offset}
-        return ModelOutput(states, {(POSITION, 0): position, (SPEED, 1): self._speed})
+        return ModelOutput(states, {(POSITION, 0): position, (SPEED, 1): speed})
 
     def _take_speed(self, raw: int, situation: Situation) -> None:
         now_ns, whole = situation.now_ns, _range(situation.objects)

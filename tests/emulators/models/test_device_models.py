@@ -246,6 +246,15 @@ def test_speed_in_turns_a_minute_across_the_end_of_the_range() -> None:
     assert rig.read(0x6030, 1) == 60  # a tenth of a turn in a tenth of a second
 
 
+def test_a_simulated_speed_of_an_encoder_is_not_replaced_by_one_computed_from_the_position() -> None:
+    rig = Rig("encoder-cia406")
+    rig.played = {(0x6004, 0): 0, (0x6030, 1): 24}
+    rig.read(0x6030, 1)
+    rig.now_ns += 100 * NS_PER_MS
+    rig.played[0x6004, 0] = STEPS // 20
+    assert rig.read(0x6030, 1) == 24
+
+
 # -- CiA 410 -----------------------------------------------------------------------------------------------------------
 
 

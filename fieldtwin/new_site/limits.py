@@ -14,6 +14,21 @@ NEVER_POLLED = ("identity", "setup")
 _PERCENT = (0.0, 100.0)
 _SETPOINT = {"set", "setpoint", "wanted", "target", "reference"}
 """Parts of names that show that a value is a setpoint and not a measurement."""
+_PARAMETER = {
+    "alarm",
+    "delay",
+    "filter",
+    "gain",
+    "limit",
+    "max",
+    "min",
+    "offset",
+    "threshold",
+    "time",
+    "timeout",
+    "warning",
+}
+"""Parts of names that show that a value is a parameter of the device and not a setpoint of the process."""
 _FEW = 10
 """A range with fewer whole numbers than this has no room for two limits."""
 
@@ -92,8 +107,8 @@ def limits_of(profile: DeviceProfile, tag: Tag) -> Limits:
 def commanded(profile: DeviceProfile, watched: Tag | None) -> Output | None:
     """Return the output that a program may command without knowledge of the process; None if the device has no such tag.
 
-    That is the sampling period of a sensor that samples, or the first setpoint that is polled, has a range and is not marked as
-    dangerous, of a device whose watched value is measured.
+    That is the sampling period of a sensor that samples, or the first setpoint that is polled, has a range, is not marked as
+    dangerous and has no name of a parameter, of a device whose watched value is measured.
     """
     if profile.sampled is not None:
         period = profile.tags[profile.sampled.period]
@@ -101,7 +116,8 @@ def commanded(profile: DeviceProfile, watched: Tag | None) -> Output | None:
     if watched is None or watched.writable or watched.type == "bool":
         return None
     for tag in profile.tags.values():
-        harmless = not (tag.danger or tag.nonvolatile or tag.secret or tag.is_text or tag.bits)
+        harmless = not (tag.danger or tag.nonvolatile or tag.secret or tag.is_text or tag.bits or tag.scale_by)
+        harmless = harmless and _PARAMETER.isdisjoint(tag.name.split("_"))
         if tag.writable and tag.readable and harmless and tag.poll not in NEVER_POLLED and tag.range is not None:
             low, high = tag.range
             return Output(tag, high, max(low, 0) if high > 0 else low)

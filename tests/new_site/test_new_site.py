@@ -305,6 +305,17 @@ def test_a_dangerous_or_permanent_setting_is_never_an_output(tmp_path: Path) -> 
     }
 
 
+def test_a_limit_of_a_measuring_device_is_not_an_output(tmp_path: Path) -> None:
+    """The gas analyser warns below `methane_limit`. It is writable, polled and has a range, but it is not a setpoint."""
+    (tmp_path / "gas.yaml").write_text(
+        "device: mysite/gas\nprotocol: modbus\nsource: invented\ntags:\n"
+        "  methane: {at: 30001, type: uint16, scale: 0.1, unit: '%'}\n"
+        "  methane_limit: {at: 40001, type: uint16, scale: 0.1, unit: '%', access: rw, range: [0, 100]}\n"
+    )
+    new(tmp_path / "plant", "--device", str(tmp_path / "gas.yaml"))
+    assert "writable" not in (tmp_path / "plant" / "plant.yaml").read_text()
+
+
 def test_a_scale_factor_is_not_the_supervised_value(tmp_path: Path) -> None:
     new(tmp_path / "solar", "--device", "sunspec-inverter-103", "--control", "st")
     assert "_sf :" not in (tmp_path / "solar" / "solar.st").read_text()

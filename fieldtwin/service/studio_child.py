@@ -56,7 +56,8 @@ class StudioChild:
                         if line.startswith(READY):
                             return line.removeprefix(READY)
                     if process.poll() is not None:
-                        raise Unreachable(f"Studio did not start: {' '.join(lines[-3:]) or 'it printed nothing'}")
+                        printed = " ".join(line.removeprefix("fieldtwin: ") for line in lines[-3:])
+                        raise Unreachable(f"Studio did not start: {printed or 'it printed nothing'}")
                     await asyncio.sleep(LOOK_S)
         except TimeoutError as e:
             raise Unreachable(f"Studio did not start within {STARTS_WITHIN_S:g} s", hint=f"log: {self._log}") from e

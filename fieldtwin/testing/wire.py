@@ -62,7 +62,8 @@ class Exchange:
     def __str__(self) -> str:
         if self.problem == "stray":
             return f"{self.t_s:.3f} s  {self.text}"
-        return f"{self.t_s:.3f} s  {self.text} -> {self.reply_text or self.problem or 'no answer wanted'}"
+        reply = self.reply_text or self.problem
+        return f"{self.t_s:.3f} s  {self.text} -> {reply}" if reply else f"{self.t_s:.3f} s  {self.text}"
 
 
 _FIELDS = set(Exchange.__dataclass_fields__)

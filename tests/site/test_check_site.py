@@ -78,6 +78,14 @@ def test_each_reference_to_a_renamed_device_is_reported_in_one_run(site: Path) -
     assert extra == {f"{path}:{line(site / path, 'devices:')}" for path in PROTOTYPES}, "no entry for the new name"
 
 
+def test_the_devices_that_a_simulation_may_use_do_not_include_the_missing_one(tmp_path: Path) -> None:
+    for name in ("lab_vehicle.yaml", "lab_vehicle.prototype.yaml", "vehicle.st"):
+        (tmp_path / name).write_text((SHIPPED / name).read_text())
+    changed(tmp_path / "lab_vehicle.yaml", "^  drive:", "  motor:")
+    (found,) = [error for error in check_site(tmp_path).errors if "no emulated device 'drive'" in str(error)]
+    assert "expected steering, console, localiser" in str(found)
+
+
 PROTOTYPES = ("observatory.prototype.yaml", "observatory.compose.yaml", "observatory.vcan.yaml")
 
 

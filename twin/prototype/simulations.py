@@ -110,7 +110,8 @@ def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple
     if device in form.devices and device in system.file.data["devices"] and device not in system.devices:
         raise FollowingError(f"the device {device!r} has an error", path=file.path)
     if device not in form.devices or device not in system.devices:
-        raise file.error(loc, f"no emulated device {device!r}", expected=", ".join(form.devices))
+        emulated = [name for name in form.devices if name in system.devices]
+        raise file.error(loc, f"no emulated device {device!r}", expected=", ".join(emulated))
     tags = system.devices[device].profile.tags
     if tag not in tags or tags[tag].is_text:
         numbers = ", ".join(t.name for t in tags.values() if not t.is_text)

@@ -68,7 +68,11 @@ def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -
     if result.verdict is not Verdict.PASSED:
         show(result)
         return
-    struck = [f"{one.name} on {one.on} ({one.struck} times)" for one in result.faults if one.struck]
+    struck = [
+        f"{one.name} on {one.on} ({'once' if one.struck == 1 else f'{one.struck} times'})"
+        for one in result.faults
+        if one.struck
+    ]
     idle = sum(not one.struck for one in result.faults)
     told = [*struck[:FAULTS_SHOWN], *([f"{len(struck) - FAULTS_SHOWN} more"] if len(struck) > FAULTS_SHOWN else [])]
     told += [f"{idle} never took effect"] if idle else []

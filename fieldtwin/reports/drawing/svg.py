@@ -99,7 +99,7 @@ def _controller(wires: Wiring) -> tuple[list[Markup], float, float]:
         ]  # fmt: skip
     served: list[tuple[str, str]] = []
     for server in wires.servers:
-        served += [(f"answers as {server.name}", "name"), (server.endpoint, ""), (server.offers, "soft")]
+        served += [(f"serves {server.name}", "name"), (server.endpoint, ""), (server.offers, "soft")]
     width = max(_width(logic, LOGIC) + 20, _width(served, LOGIC)) + 24
     top = EDGE + 26.0
     x = EDGE + 12

@@ -20,7 +20,7 @@ def tree(wires: Wiring, columns: int = 1000) -> str:
     if wires.programs:
         branches.append(("plc", "", [_logic_cells(logic) for logic in wires.programs]))
     if wires.servers:
-        branches.append(("answers", "", [_server_cells(server) for server in wires.servers]))
+        branches.append(("serve", "", [_server_cells(server) for server in wires.servers]))
     widest = max(len(name) for name, _, _ in branches)
     lines = [f"{wires.system} ({'prototype' if wires.prototype else 'plant'})"]
     for n, (name, told, leaves) in enumerate(branches):

@@ -38,12 +38,12 @@ def last_exchanges(exchanges: Iterable[DecodedExchange], check: CheckResult, dev
 
 
 def line_of(exchange: DecodedExchange) -> str:
-    """Return an exchange as ``12.340 s  ctd: read pressure -> ctd: pressure 1.2 dbar``."""
+    """Return an exchange as ``12.340 s  ctd: read pressure -> ctd: pressure 1.2 dbar``, a message such as a PDO alone."""
     at = f"{exchange.t_ns / NS_PER_S:.3f} s"
     if exchange.is_stray:
         return f"{at}  {exchange.text}"
-    pending = "no reply so far" if exchange.problem == "pending" else ""
-    return f"{at}  {exchange.text} -> {pending or exchange.reply_text or exchange.problem or 'no answer wanted'}"
+    reply = "no reply so far" if exchange.problem == "pending" else exchange.reply_text or exchange.problem
+    return f"{at}  {exchange.text} -> {reply}" if reply else f"{at}  {exchange.text}"
 
 
 def deciding(checks: Sequence[CheckResult], verdict: Verdict) -> CheckResult | None:

@@ -28,7 +28,7 @@ def cut(text: str, most: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return ``0.25 s``, ``12 min``, ``3.5 h``."""
+    """Return a duration as text, such as ``0.25 s``, ``12 min`` or ``3.5 h``."""
     if seconds >= 5400:
         return f"{seconds / 3600:.3g} h"
     if seconds >= 90:

@@ -43,7 +43,7 @@ class RunningPlc:
         return self.tag(name)["value"]
 
     def quality(self, name: str) -> str:
-        """Return ``good``, ``substituted``, ``simulated``, ``uncertain`` or ``bad``."""
+        """Return the quality of a tag: ``good``, ``substituted``, ``simulated``, ``uncertain`` or ``bad``."""
         __tracebackhide__ = True
         return str(self.tag(name)["quality"])
 

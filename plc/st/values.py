@@ -296,7 +296,7 @@ def real_text(x: float, digits: int) -> str:
 
 
 def duration_text(ns: int, prefix: str) -> str:
-    """Return ``T#1h2m3s4ms``, the largest units first, without units that are zero."""
+    """Return a duration as a literal such as ``T#1h2m3s4ms``: the largest units first, without units that are zero."""
     rest, out = abs(ns), []
     for unit, size in (
         ("d", 86_400 * NS_PER_S),

@@ -59,7 +59,8 @@ class Payload:
 
 
 def topic(group: str, message: str, node: str) -> str:
-    """Return ``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT would read as a pattern."""
+    """Return the topic of a message, such as ``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT would read
+    as a pattern."""
     for part in (group, node):
         if not part or any(c in part for c in "+#/") or not part.isprintable():
             raise UsageError("a name in Sparkplug", expected="a word without + # /", got=repr(part))

@@ -196,7 +196,7 @@ def _can_options(search: SearchOptions, bus: BusOptions) -> CanScanOptions:
 
 
 def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...] | None:
-    """Return ``1-20,247`` as numbers without duplicates, ascending. Raises `UsageError`."""
+    """Return the numbers in a text such as ``1-20,247``, without duplicates, in ascending order. Raises `UsageError`."""
     if text is None:
         return None
     found: list[int] = []

@@ -91,7 +91,7 @@ def waiting_once(session: RunSession) -> list[str]:
 
 
 def forces_text(forces: dict[str, Any]) -> str:
-    """Return ``ctd.pressure = 5 by ada, ...``: the first few forces and the number of the rest."""
+    """Return the forces as text such as ``ctd.pressure = 5 by ada, ...``: the first few of them, and the number of the rest."""
     shown = [
         f"{tag} = {value_text(force['value'])}" + (f" by {force['by']}" if force["by"] else "")
         for tag, force in list(forces.items())[:MAX_FORCES]

@@ -1,8 +1,8 @@
 """Find the registers that belong together, their type and order, by weighing all readings of a run against each other.
 
-Each reading of a stretch of registers has a cost (`costs`); a run of registers is tiled by readings. A reading's
-probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a
-hidden Markov model). So a word that fits both of its neighbours is doubtful, and is reported as such.
+Each reading of a stretch of registers has a cost (`costs`); a tiling divides a run of registers into readings. A reading's
+probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a hidden
+Markov model). So a word that fits both of its neighbours is doubtful, and is reported as such.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
 
 
 def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Interpretation]:
-    """Return the most probable tiling of a run.
+    """Return the most probable division of a run of registers into values (its tiling).
 
     `orders`: the cost of each order; `single_cost`: the additional cost of a value of one register.
     """

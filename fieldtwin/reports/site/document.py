@@ -94,7 +94,7 @@ class ReportedDevice:
 
     @property
     def name(self) -> str:
-        """Return ``unit 1``, ``node 5``."""
+        """Return the name of the device, such as ``unit 1`` or ``node 5``."""
         return f"{'node' if self.protocol == 'canopen' else 'unit'} {self.address}"
 
     @property

@@ -47,14 +47,14 @@ def render_html(document: SiteDocument) -> str:
 
 
 def day(when: str) -> str:
-    """Return ``2026-11-21 11:33 UTC`` for an ISO 8601 time."""
+    """Return an ISO 8601 time as text, such as ``2026-11-21 11:33 UTC``."""
     if len(when) < 16 or when[10:11] != "T":
         return when
     return f"{when[:10]} {when[11:16]}" + (" UTC" if when.endswith(("+00:00", "Z")) else "")
 
 
 def plural(count: int, word: str) -> str:
-    """Return ``no deviation``, ``1 deviation``, ``2 deviations``."""
+    """Return a count with its word, such as ``no deviation``, ``1 deviation`` or ``2 deviations``."""
     return f"{count or 'no'} {word}{'' if count in (0, 1) else 's'}"
 
 

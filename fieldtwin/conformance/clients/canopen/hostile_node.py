@@ -204,14 +204,14 @@ class HostileNode:
         self.last_ns = self.now_ns()
         self.pending -= 1
 
-    def _send(self, moves: list[SendFrame], now_ns: int) -> None:
+    def _send(self, steps: list[SendFrame], now_ns: int) -> None:
         """Send frames in order; correct answers wait until pending faulty ones were sent."""
-        if not moves:
+        if not steps:
             return
         start_ns = now_ns
-        if self._free_ns > now_ns and any(m.good for m in moves):
+        if self._free_ns > now_ns and any(m.good for m in steps):
             start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)
-        timed = [(start_ns + round(m.after_s * NS_PER_S), m) for m in moves]
+        timed = [(start_ns + round(m.after_s * NS_PER_S), m) for m in steps]
         self._free_ns = max([self._free_ns, *(t for t, m in timed if not m.good)])
         self.pending += len(timed)
         self._nursery.start(self._make(timed), "frames")
@@ -219,14 +219,14 @@ class HostileNode:
     async def _make(self, timed: list[tuple[int, SendFrame]]) -> None:
         left = len(timed)
         try:
-            for t_ns, move in timed:
+            for t_ns, step in timed:
                 if (wait_ns := t_ns - self.now_ns()) > 0:
                     await asyncio.sleep(wait_ns / NS_PER_S)
                 now_ns = self.now_ns()
-                if not move.good:
+                if not step.good:
                     self.last_ns = now_ns
-                self.recorder.add(ReplySent(now_ns, MASTER, move.frame.data, move.good, frame=str(move.frame)))
-                await self._connection.send(move.frame)
+                self.recorder.add(ReplySent(now_ns, MASTER, step.frame.data, step.good, frame=str(step.frame)))
+                await self._connection.send(step.frame)
                 left -= 1
                 self.pending -= 1
         except ConnectionLost:

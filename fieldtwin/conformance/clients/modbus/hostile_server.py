@@ -22,9 +22,9 @@ from fieldtwin.conformance.clients.modbus.setup import (
     GoSilent,
     HangUp,
     ModbusCase,
-    Move,
     RequestContext,
     SendBytes,
+    ServerStep,
     Unplug,
 )
 from fieldtwin.conformance.clients.recorder import Recorder
@@ -47,7 +47,7 @@ class HostileServer:
     """A server for every client of the endpoint. `play` is the current case; None: all requests are answered correctly.
 
     `struck` counts wrong replies, `first_ns` is the time of the first one, `last_ns` that of the last fault; `pending`
-    is the number of moves that wait for their time.
+    is the number of steps that wait for their time.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class HostileServer:
         self.strikes = self.struck = self.first_ns = self.last_ns = self.pending = 0
         self.clients = 0
         self.on_event: Callable[[], None] = lambda: None
-        self.unplug: Callable[[Unplug], None] = lambda move: None
-        """The function that removes the port and restores it. Until the port is restored, `pending` counts this move."""
+        self.unplug: Callable[[Unplug], None] = lambda step: None
+        """The function that removes the port and restores it. Until the port is restored, `pending` counts this step."""
         self._make_wire = make_wire
         self._first: RequestContext | None = None
         self._loop = asyncio.get_running_loop()
@@ -81,7 +81,7 @@ class HostileServer:
         self.struck = self.first_ns = self.last_ns = 0
 
     def end(self) -> None:
-        """Answer all requests correctly from now on; moves in progress are completed."""
+        """Answer all requests correctly from now on; steps in progress are completed."""
         self.play = None
 
     async def serve(self, connection: ByteConnection, *, plugged_in_again: bool = False) -> None:
@@ -103,13 +103,13 @@ class HostileServer:
         self.recorder.add(event)
         self.on_event()
 
-    def moves(self, wire: ModbusWire, request: bytes, tag: int, now_ns: int) -> list[Move]:
-        """Return the moves for a request received at `now_ns`: a correct reply, or that of the case."""
+    def steps(self, wire: ModbusWire, request: bytes, tag: int, now_ns: int) -> list[ServerStep]:
+        """Return the steps for a request received at `now_ns`: a correct reply, or that of the case."""
         true = self.device.answer(request[1:], now_ns)
         case = self.play
         if request[0] == 0 and not isinstance(wire, MbapWire):
             return []  # a broadcast is not answered
-        honest: list[Move] = [SendBytes(wire.frame(request, tag, true), good=True)] if true else []
+        honest: list[ServerStep] = [SendBytes(wire.frame(request, tag, true), good=True)] if true else []
         if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
             return honest
         false = self.device.answer_with(self.poison, request[1:], now_ns) if request[1] in READS else true
@@ -155,7 +155,7 @@ class _Client:
                 self._stage.note(RequestSeen(now_ns, self._number, request, tag, frame.hex(" ")))
                 if self._deaf:
                     continue
-                self._answer(self._stage.moves(self._wire, request, tag, now_ns), now_ns)
+                self._answer(self._stage.steps(self._wire, request, tag, now_ns), now_ns)
             self._dirty = bool(data)
             if garbage := self._wire.garbage():
                 self._stage.note(Garbled(now_ns, self._number, data[-garbage:]))
@@ -170,26 +170,26 @@ class _Client:
         except TimeoutError:
             return b""
 
-    def _answer(self, moves: list[Move], now_ns: int) -> None:
-        """Schedule moves in order; correct answers wait until pending faulty ones were sent, as a real device would."""
+    def _answer(self, steps: list[ServerStep], now_ns: int) -> None:
+        """Schedule steps in order; correct answers wait until pending faulty ones were sent, as a real device would."""
         start_ns = now_ns
-        if self._free_ns > now_ns and any(isinstance(m, SendBytes) and m.good for m in moves):
+        if self._free_ns > now_ns and any(isinstance(m, SendBytes) and m.good for m in steps):
             start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)
-        timed = [(start_ns + round(move.after_s * NS_PER_S), move) for move in moves]
-        odd = [t for t, move in timed if not (isinstance(move, SendBytes) and move.good)]
+        timed = [(start_ns + round(step.after_s * NS_PER_S), step) for step in steps]
+        odd = [t for t, step in timed if not (isinstance(step, SendBytes) and step.good)]
         self._free_ns = max([self._free_ns, *odd])
         if not timed:
             return
         self._stage.pending += len(timed)
-        self.nursery.start(self._make(timed, now_ns), "moves")
+        self.nursery.start(self._make(timed, now_ns), "steps")
 
-    async def _make(self, timed: list[tuple[int, Move]], asked_ns: int) -> None:
+    async def _make(self, timed: list[tuple[int, ServerStep]], asked_ns: int) -> None:
         left = len(timed)
         try:
-            for t_ns, move in timed:
+            for t_ns, step in timed:
                 if (wait_ns := t_ns - self._stage.now_ns()) > 0:
                     await asyncio.sleep(wait_ns / NS_PER_S)
-                await self._do(move, asked_ns)
+                await self._do(step, asked_ns)
                 left -= 1
                 self._stage.pending -= 1
         except ConnectionLost:
@@ -198,27 +198,27 @@ class _Client:
             self._stage.pending -= left
             self._stage.on_event()
 
-    async def _do(self, move: Move, asked_ns: int) -> None:
+    async def _do(self, step: ServerStep, asked_ns: int) -> None:
         now_ns = self._stage.now_ns()
         if self._deaf:
             return
-        if isinstance(move, GoSilent):
+        if isinstance(step, GoSilent):
             self._stage.last_ns = now_ns
             self._deaf = True
             return
-        if isinstance(move, Unplug):
+        if isinstance(step, Unplug):
             self.hung_up = True
-            self._stage.unplug(move)
+            self._stage.unplug(step)
             return
-        if isinstance(move, HangUp):
+        if isinstance(step, HangUp):
             self._stage.last_ns = now_ns
             self.hung_up = True
-            await _hang_up(self._connection, reset=move.reset)
+            await _hang_up(self._connection, reset=step.reset)
             return
-        if not move.good:
+        if not step.good:
             self._stage.last_ns = now_ns
-        self._stage.note(ReplySent(now_ns, self._number, move.data, move.good, asked_ns))
-        await self._connection.write(move.data)
+        self._stage.note(ReplySent(now_ns, self._number, step.data, step.good, asked_ns))
+        await self._connection.write(step.data)
 
 
 async def _hang_up(connection: ByteConnection, *, reset: bool) -> None:

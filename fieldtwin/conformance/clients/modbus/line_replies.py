@@ -1,10 +1,10 @@
-"""The replies of the hostile device on any framing, and on serial lines. Pure: a request in, moves out."""
+"""The replies of the hostile device on any framing, and on serial lines. Pure: a request in, steps out."""
 
 from __future__ import annotations
 
 import itertools
 
-from fieldtwin.conformance.clients.modbus.setup import Move, ReplyFunction, RequestContext, SendBytes, Unplug
+from fieldtwin.conformance.clients.modbus.setup import ReplyFunction, RequestContext, SendBytes, ServerStep, Unplug
 from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 
 SPLIT_S = 0.016
@@ -17,59 +17,59 @@ LATE = 1.5
 """Number of timeouts after the request at which a late reply is sent."""
 
 
-def nothing(scene: RequestContext) -> list[Move]:
+def nothing(scene: RequestContext) -> list[ServerStep]:
     return []
 
 
-def bad_crc(scene: RequestContext) -> list[Move]:
+def bad_crc(scene: RequestContext) -> list[ServerStep]:
     frame = scene.frame(scene.false)
     return [SendBytes(frame[:-2] + bytes(b ^ 0xFF for b in frame[-2:]))]
 
 
-def truncated(scene: RequestContext) -> list[Move]:
+def truncated(scene: RequestContext) -> list[ServerStep]:
     frame = scene.frame(scene.false)
     return [SendBytes(frame[: max(len(frame) - 3, 4)])]
 
 
-def paused(scene: RequestContext) -> list[Move]:
+def paused(scene: RequestContext) -> list[ServerStep]:
     frame = scene.frame(scene.true)
     return [SendBytes(frame[:4]), SendBytes(frame[4:], 0.010)]
 
 
-def split_16_ms(scene: RequestContext) -> list[Move]:
+def split_16_ms(scene: RequestContext) -> list[ServerStep]:
     frame = scene.frame(scene.true)
     cuts = (0, 1, 3, 5, len(frame))
     return [SendBytes(frame[a:b], i * SPLIT_S) for i, (a, b) in enumerate(itertools.pairwise(cuts))]
 
 
-def glued(scene: RequestContext) -> list[Move]:
+def glued(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.from_unit(scene.neighbour, scene.false) + scene.frame(scene.true))]
 
 
-def leading_noise(scene: RequestContext) -> list[Move]:
+def leading_noise(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(b"\x00\xff\x00" + scene.frame(scene.true))]
 
 
-def trailing_zeros(scene: RequestContext) -> list[Move]:
+def trailing_zeros(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.frame(scene.true) + b"\0\0")]
 
 
-def echo(scene: RequestContext) -> list[Move]:
+def echo(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(with_crc(scene.request)), SendBytes(scene.frame(scene.true), 0.005)]
 
 
-def corrupt_echo(scene: RequestContext) -> list[Move]:
+def corrupt_echo(scene: RequestContext) -> list[ServerStep]:
     sent = bytearray(with_crc(scene.request))
     sent[3] ^= 0x10
     return [SendBytes(bytes(sent))]
 
 
-def late(scene: RequestContext) -> list[Move]:
+def late(scene: RequestContext) -> list[ServerStep]:
     """Answer the first request too late, with the poison value. Requests that arrive meanwhile are answered after it."""
     return [SendBytes(scene.frame(scene.false), LATE * scene.timeout_s)]
 
 
-def late_other(scene: RequestContext) -> list[Move]:
+def late_other(scene: RequestContext) -> list[ServerStep]:
     """Answer the first request only after a different request has arrived, and answer the second request afterwards."""
     if scene.first is None:
         return []
@@ -78,48 +78,48 @@ def late_other(scene: RequestContext) -> list[Move]:
     return [SendBytes(scene.first.frame(scene.first.false)), scene.good(0.050)]
 
 
-def second_reply(scene: RequestContext) -> list[Move]:
+def second_reply(scene: RequestContext) -> list[ServerStep]:
     return [scene.good(), SendBytes(scene.frame(scene.false), 0.003)]
 
 
-def other_unit(scene: RequestContext) -> list[Move]:
+def other_unit(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.from_unit(scene.neighbour, scene.false))]
 
 
-def other_unit_first(scene: RequestContext) -> list[Move]:
+def other_unit_first(scene: RequestContext) -> list[ServerStep]:
     """Reply after another unit's reply, with a changing delay, so that no pause of the client hides its reaction."""
     after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
     return [SendBytes(scene.from_unit(scene.neighbour, scene.false)), SendBytes(scene.frame(scene.true), after_s)]
 
 
-def other_function(scene: RequestContext) -> list[Move]:
+def other_function(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.frame(bytes((scene.function ^ 0x07,)) + scene.false[1:]))]  # 03 and 04 change places
 
 
-def too_few(scene: RequestContext) -> list[Move]:
+def too_few(scene: RequestContext) -> list[ServerStep]:
     data = scene.false[2:-2]
     return [SendBytes(scene.frame(bytes((scene.function, len(data))) + data))]
 
 
-def too_many(scene: RequestContext) -> list[Move]:
+def too_many(scene: RequestContext) -> list[ServerStep]:
     data = scene.false[2:] + scene.false[-2:]
     return [SendBytes(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
 
 
-def count_255(scene: RequestContext) -> list[Move]:
+def count_255(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.frame(scene.false[:1] + b"\xff" + scene.false[2:]))]
 
 
-def odd_count(scene: RequestContext) -> list[Move]:
+def odd_count(scene: RequestContext) -> list[ServerStep]:
     data = scene.false[2:] + scene.false[-1:]
     return [SendBytes(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
 
 
-def other_echo(scene: RequestContext) -> list[Move]:
+def other_echo(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.frame(scene.true[:-1] + bytes((scene.true[-1] ^ 0x01,))))]
 
 
-def other_exception(scene: RequestContext) -> list[Move]:
+def other_exception(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.refuse(2, scene.function ^ 0x07))]
 
 
@@ -132,11 +132,11 @@ def exception_at_once_and_later(code: int) -> ReplyFunction:
     return lambda scene: [SendBytes(scene.refuse(code), LATER * scene.timeout_s if scene.nth else 0.0)]
 
 
-def hole(scene: RequestContext) -> list[Move]:
+def hole(scene: RequestContext) -> list[ServerStep]:
     return [SendBytes(scene.refuse(2))]
 
 
-def garbage(scene: RequestContext) -> list[Move]:
+def garbage(scene: RequestContext) -> list[ServerStep]:
     """Send the bytes that a receiver at twice the baud rate sees: every bit is doubled, and framing errors occur."""
     frame = scene.frame(scene.false)
     out = bytearray()
@@ -146,23 +146,23 @@ def garbage(scene: RequestContext) -> list[Move]:
     return [SendBytes(bytes(out))]
 
 
-def collision(scene: RequestContext) -> list[Move]:
+def collision(scene: RequestContext) -> list[ServerStep]:
     """Send the overlap of two senders: a bit is 0 where either of them sends 0."""
     ours, other = scene.frame(scene.false), scene.from_unit(scene.neighbour, scene.true[:1] + scene.true[1:])
     return [SendBytes(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]
 
 
-def bad_lrc(scene: RequestContext) -> list[Move]:
+def bad_lrc(scene: RequestContext) -> list[ServerStep]:
     frame = scene.frame(scene.false)
     return [SendBytes(frame[:-3] + (b"0" if frame[-3:-2] != b"0" else b"1") + frame[-2:])]
 
 
-def second_colon(scene: RequestContext) -> list[Move]:
+def second_colon(scene: RequestContext) -> list[ServerStep]:
     """Send the beginning of a frame, then the whole reply."""
     return [SendBytes(scene.frame(scene.false)[:7] + scene.frame(scene.true))]
 
 
-def long_gap(scene: RequestContext) -> list[Move]:
+def long_gap(scene: RequestContext) -> list[ServerStep]:
     """Send two halves of a frame, further apart than the second that SL 2.5.2.1 allows."""
     frame = scene.frame(scene.false)
     return [SendBytes(frame[:7]), SendBytes(frame[7:], 1.2)]

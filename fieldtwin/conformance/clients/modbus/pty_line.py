@@ -50,15 +50,15 @@ class PtyLine:
         while True:
             await self._stage.serve(self._port, plugged_in_again=plugged_in_again)
             plugged_in_again = True
-            move, self._unplugged = self._unplugged, None
-            if move is None:
+            step, self._unplugged = self._unplugged, None
+            if step is None:
                 raise Unreachable("the virtual serial port is gone", where=str(self._listen))
             try:
                 Path(self._listen.path).unlink(missing_ok=True)
-                await asyncio.sleep(move.out_s)
+                await asyncio.sleep(step.out_s)
                 self._port, self.named = await _open(self._listen)
-                if move.held_s:
-                    await _held(self.named.path, move.held_s)
+                if step.held_s:
+                    await _held(self.named.path, step.held_s)
             finally:
                 self._stage.last_ns = self._stage.now_ns()
                 self._stage.pending -= 1
@@ -66,10 +66,10 @@ class PtyLine:
     async def aclose(self) -> None:
         await self._port.aclose()
 
-    def _unplug(self, move: Unplug) -> None:
+    def _unplug(self, step: Unplug) -> None:
         """Stop serving the client; `run` notices it."""
         self._stage.pending += 1
-        self._unplugged = move
+        self._unplugged = step
         self._closing = asyncio.get_running_loop().create_task(self._port.aclose(), name="unplugging")
 
 

@@ -1,4 +1,4 @@
-"""The inputs and results of a reply function: the request, correct and false answers to it, and the moves of the device. Pure."""
+"""The inputs and results of a reply function: the request, correct and false answers to it, and the steps of the device. Pure."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Unplug:
     after_s: float = 0.0
 
 
-Move = SendBytes | HangUp | GoSilent | Unplug
+ServerStep = SendBytes | HangUp | GoSilent | Unplug
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class RequestContext:
         return self.frame(bytes(((function or self.function) | 0x80, code)))
 
 
-ReplyFunction = Callable[[RequestContext], list[Move]]
+ReplyFunction = Callable[[RequestContext], list[ServerStep]]
 Wants = Literal["register read", "read", "write", "read of several", "request to unit 0", "nothing"]
 
 

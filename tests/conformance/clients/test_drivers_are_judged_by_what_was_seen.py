@@ -85,7 +85,7 @@ def test_a_client_that_backs_off_does_not_count_as_waiting_for_silence(
 
 def test_without_the_timeout_a_wait_after_an_exception_is_inconclusive() -> None:
     result = judge(_poller(0.05, sees_short=False), LINE, "MB-021", timeout_s=0.0)["MB-021"]  # type: ignore[arg-type]
-    assert (result.verdict, "say --timeout" in result.reason) == (Verdict.INCONCLUSIVE, True), result.reason
+    assert (result.verdict, "give --timeout" in result.reason) == (Verdict.INCONCLUSIVE, True), result.reason
 
 
 @pytest.mark.parametrize("pause_s", [0.002, 0.005, 0.020, 0.030, 0.100, 0.300])

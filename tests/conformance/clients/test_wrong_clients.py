@@ -89,7 +89,7 @@ def test_a_late_reply_is_only_a_failure_if_the_timeout_is_known() -> None:
     client = _client(_checks_crc_only, 0.0)
     result = judge(client, "rtu:/line?baudrate=19200", "MB-013", timeout_s=0.0)["MB-013"]  # type: ignore[arg-type]
     assert result.verdict is Verdict.INCONCLUSIVE
-    assert "say --timeout" in result.reason
+    assert "give --timeout" in result.reason
 
 
 async def _gives_up(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:

@@ -6,11 +6,16 @@ corrects the pages. ``tests/project/test_installation.py`` finds a line that dif
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 from fieldtwin.__about__ import __version__
 
 PUBLISHED = False
 CLONE = "./fieldtwin"
 WHEEL = f"./fieldtwin-{__version__}-py3-none-any.whl"
+PROGRAM = Path(__file__).resolve().parents[1]
+"""The folder of the running package: the clone, if it was installed from a clone as editable."""
 NOTE = (
     "`pip install fieldtwin` installs the newest release, and `pip install 'fieldtwin[mqtt]'` also what an extra needs."
     if PUBLISHED
@@ -30,5 +35,10 @@ def install_command(extra: str = "", source: str = CLONE) -> str:
 
 
 def install_hint(extra: str) -> str:
-    """Return the hint of a message about an extra that is missing."""
+    """Return the hint of a message about an extra that is missing.
+
+    For a clone it is a command that works as it is, in any folder and without an activated environment.
+    """
+    if (PROGRAM / "pyproject.toml").is_file():
+        return f"{sys.executable} -m pip install --editable '{PROGRAM}[{extra}]'"
     return install_command(extra) + ("" if PUBLISHED else f"; {CLONE} is a clone or a wheel file")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import shlex
+import sys
+import tomllib
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -53,6 +56,24 @@ def test_a_new_version_is_written_into_the_names_of_wheels(script: ModuleType, m
     monkeypatch.setattr(installation, "__version__", "0.2.0")
     monkeypatch.setattr(installation, "WHEEL", "./fieldtwin-0.2.0-py3-none-any.whl")
     assert script.corrected(LINES) == LINES.replace("0.1.0", "0.2.0")
+
+
+def test_the_hint_about_a_missing_extra_works_in_every_folder_for_a_clone() -> None:
+    command = shlex.split(installation.install_hint("studio"))
+    assert command[:4] == [sys.executable, "-m", "pip", "install"]
+    clone, _, extra = command[-1].rstrip("]").partition("[")
+    assert Path(clone).is_absolute()
+    project = tomllib.loads((Path(clone) / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["name"] == "fieldtwin"
+    assert extra in project["optional-dependencies"]
+
+
+def test_the_hint_of_a_program_from_a_wheel_file_names_the_wheel_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(installation, "PROGRAM", tmp_path)
+    assert installation.install_hint("studio").startswith("pip install './fieldtwin[studio]'")
+    assert "wheel file" in installation.install_hint("studio")
 
 
 @pytest.mark.long

@@ -244,6 +244,7 @@ class ClientRun(Generic[C]):
         if self.restart is None:
             return False
         self._ended = None
+        await self._until(lambda: self.stage.pending == 0, self.plan.patience_s)  # a removed port has to be back
         await self.restart()
         await self._until(
             lambda: self.stage.recorder.count(RequestSeen, self.stage.now_ns() - NS_PER_S) > 0, self.plan.wait_s

@@ -200,3 +200,14 @@ def test_a_port_that_is_unplugged_comes_back_under_its_name(tmp_path: Path, agai
     )  # fmt: skip
     assert found["MB-066"][0] == verdict, said
     assert code == (0 if again else 1)
+
+
+@pytest.mark.long
+def test_a_program_that_ended_without_its_port_is_started_again_when_the_port_is_back(tmp_path: Path) -> None:
+    ends = OPENS_AGAIN.replace("if not %r:\n            time.sleep(60)", "raise")
+    _, found, said = run_check(
+        tmp_path, "modbus-client", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66,68",
+        program=ends,
+    )  # fmt: skip
+    assert found["MB-066"][0] == "failed", said
+    assert found["MB-068"][0] == "passed", said

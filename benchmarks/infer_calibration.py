@@ -20,7 +20,7 @@ for folder in (ROOT, ROOT / "tests" / "rigs" / "devices"):
 from infer_corpus import Map, corpus  # noqa: E402
 
 from fieldtwin.commissioning.infer.calibration import fitted, kind_of  # noqa: E402
-from fieldtwin.commissioning.infer.fields import Interpretation, Level  # noqa: E402
+from fieldtwin.commissioning.infer.fields import Interpretation, Level, text_of  # noqa: E402
 from fieldtwin.commissioning.infer.infer import Series, infer  # noqa: E402
 
 FIT_SEED, CHECK_SEED = 1, 2
@@ -51,12 +51,13 @@ class Bin:
 
 
 def is_right(reading: Interpretation, one: Map) -> bool:
-    """Return whether a generated map has this value there: same registers, type and order."""
+    """Return whether a generated map has this value there: same registers, type and order; of a text, also with other padding."""
     kinds = {reading.type, reading.type[1:]} if reading.sign_open else {reading.type}
     for f in one.fields:
+        if f.kind == "string" and f.address == reading.address:
+            text = text_of(f.rows[0], "BADC" if f.order in ("BADC", "DCBA") else "ABCD")
+            return reading.type == "string" and reading.values[0] == text
         if f.address == reading.address and f.registers == reading.registers:
-            if f.kind == "string":
-                return reading.type == "string"
             order = f.order if f.registers > 1 else "ABCD"
             return f.kind in kinds and order == reading.order
     return False

@@ -53,8 +53,9 @@ def command(
     loaded = [_load(path, unit) for path in dumps]
     inference = infer(series_of(loaded))
     if inference.series.passes < FEWEST_PASSES:
+        passes = "1 pass" if inference.series.passes == 1 else f"{inference.series.passes} passes"
         stderr.print(
-            f"{inference.series.passes} passes: results are uncertain below {FEWEST_PASSES}; use `dump --passes 20`",
+            f"{passes}: results are uncertain below {FEWEST_PASSES}; use `dump --passes 20`",
             soft_wrap=True,
         )
     draft = draft_profile(inference, loaded, name)

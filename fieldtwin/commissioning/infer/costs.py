@@ -129,14 +129,12 @@ def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
 def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
     """Return the cost of an order, given the costs of the four orders.
 
-    One register has no word order; its bytes are either swapped or not.
+    One register and a text have no word order; their bytes are either swapped or not.
     """
-    if kind == "string":
-        return ORDER_COST[order]
-    if REGISTERS_OF[kind] > 1:
+    if kind != "string" and REGISTERS_OF[kind] > 1:
         return orders[order]
     pair = ("ABCD", "CDAB") if order == "ABCD" else ("BADC", "DCBA")
-    rare = SWAPPED_SINGLE_COST if order == "BADC" else 0.0
+    rare = SWAPPED_SINGLE_COST if order == "BADC" and kind != "string" else 0.0
     return rare - math.log(sum(math.exp(-orders[o]) for o in pair))
 
 

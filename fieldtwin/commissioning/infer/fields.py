@@ -243,12 +243,18 @@ def _reading(
         values = (text_of(rows[0], tile.order),) * len(rows)
     else:
         values = tuple(decode_series(rows, tile.type, tile.order) or ())
-    twin = _twin(tile, values)
-    same = [w for w, t in covering if (t.start, t.size, t.type, t.order) == (tile.start, tile.size, twin, tile.order)]
-    share = min(1.0, share + sum(map(math.exp, same)))
-    others = sorted(((w, t) for w, t in covering if t is not tile and w not in same), key=lambda x: -x[0])[:3]
+    if tile.type == "string":
+        equal = _same_text(words, tile, [t for _, t in covering])
+    else:
+        twin = _twin(tile, values)
+        equal = [
+            t for _, t in covering if (t.start, t.size, t.type, t.order) == (tile.start, tile.size, twin, tile.order)
+        ]
+    share = min(1.0, share + sum(math.exp(w) for w, t in covering if t in equal))
+    others = sorted(((w, t) for w, t in covering if t is not tile and t not in equal), key=lambda x: -x[0])[:3]
     rivals = tuple((t.type, address + t.start, t.order, min(1.0, math.exp(w))) for w, t in others)
-    kind = tile.type if not same else f"u{tile.type.removeprefix('u')}"
+    sign_open = bool(equal) and tile.type != "string"
+    kind = f"u{tile.type.removeprefix('u')}" if sign_open else tile.type
     return Interpretation(
         table,
         address + tile.start,
@@ -259,8 +265,18 @@ def _reading(
         values,
         rivals,
         _cap(tile, words, values),
-        bool(same),
+        sign_open,
     )
+
+
+def _same_text(words: Sequence[Sequence[int]], tile: _Tile, covering: Sequence[_Tile]) -> list[_Tile]:
+    """Return the other readings with this text: registers cannot tell whether the padding after a text belongs to it."""
+
+    def text(size: int) -> str:
+        return text_of([w[0] for w in words[tile.start : tile.start + size]], tile.order)
+
+    texts = [t for t in covering if (t.start, t.type, t.order) == (tile.start, "string", tile.order)]
+    return [t for t in texts if t is not tile and text(t.size) == text(tile.size)]
 
 
 def _twin(tile: _Tile, values: Sequence[float | str]) -> str:

@@ -63,7 +63,11 @@ def series_of(dumps: Sequence[Dump]) -> Series:
     """
     for dump in dumps:
         if dump.protocol != "modbus":
-            raise FileInvalid("a CANopen node's EDS defines its types, so there is nothing to infer", path=dump.path)
+            raise FileInvalid(
+                "a dump of a CANopen node: `infer` only reads dumps of Modbus registers",
+                path=dump.path,
+                hint="the node's EDS states the types; without one, try a type: `fieldtwin read ... 2000:01 --type float32`",
+            )
         if dump.header.get("address") != dumps[0].header.get("address"):
             raise FileInvalid("dumps of two units", path=dump.path, expected=f"unit {dumps[0].header.get('address')}")
     passes = sorted((p for d in dumps for p in d.passes if p.cells), key=lambda p: p.utc_ns)

@@ -46,12 +46,12 @@ def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
         marks.append("counter")
     elif whole and reading.registers == 1 and max(numbers) > LARGEST_CODE and (bits := _bits(reading)):
         marks.append("bits")
-        notes.append(f"a status word: bits {', '.join(map(str, bits))} changed")
+        notes.append(_bits_note(bits))
     elif whole and _is_state(numbers, steps):
         marks.append("enumeration")
     elif whole and reading.registers == 1 and (bits := _bits(reading)):
         marks.append("bits")
-        notes.append(f"a status word: bits {', '.join(map(str, bits))} changed")
+        notes.append(_bits_note(bits))
     elif all(s >= 0 for s in steps) and up:
         notes.append("only increased: perhaps a counter")
     return replace(reading, marks=tuple(marks), notes=tuple(notes + _likeness(reading, numbers, whole=whole)))
@@ -59,6 +59,10 @@ def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
 
 def _bits(reading: Interpretation) -> tuple[int, ...]:
     return toggled_bits([int(v) & 0xFFFF for v in reading.values])
+
+
+def _bits_note(bits: Sequence[int]) -> str:
+    return f"a status word: {'bit' if len(bits) == 1 else 'bits'} {', '.join(map(str, bits))} changed"
 
 
 def _is_time(numbers: Sequence[float], times_s: Sequence[float]) -> bool:

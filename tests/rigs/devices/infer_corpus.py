@@ -157,6 +157,8 @@ class _Maker:
         row = tuple(raw[i] << 8 | raw[i + 1] for i in range(0, len(raw), 2))
         if self.order in ("BADC", "DCBA"):
             row = tuple(w >> 8 | (w & 0xFF) << 8 for w in row)
+        padding = (0, 0, 2, 5)[(self.at + len(row)) % 4]  # most devices have fields of a fixed length
+        row += (0x2020 if self.at % 3 == 0 else 0,) * padding
         self.fields.append(Field(self.at, "string", self.order, (row,) * self.passes, "text"))
         self.at += len(row)
 

@@ -13,7 +13,7 @@ import click
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldtwin.cli.device.device_options import DeviceOptions, log_option, words
-from fieldtwin.cli.device.dump_view import estimate_text, notes, profile_gaps, summary, unknown_text
+from fieldtwin.cli.device.dump_view import estimate_text, notes, object_indexes, profile_gaps, summary, unknown_text
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, DumpJob
@@ -173,7 +173,9 @@ def _described(found: Dump, out: Path) -> dict[str, Any]:
         "log": str(log_path(out)),
         "passes": len(found.passes),
         "values": len(found.passes[-1].cells),
-        "maps": list(found.maps.values()),
+        "maps": [
+            m | ({"indexes": object_indexes(found)} if m["map"] == "objects" else {}) for m in found.maps.values()
+        ],
         "unknown": dict(zip(("addresses", "of"), found.unknown, strict=True)),
         "mostly_unknown": found.is_mostly_unknown,
         "functions": list(found.functions.values()),

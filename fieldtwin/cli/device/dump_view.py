@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any
 
 from rich.table import Table
@@ -54,6 +54,8 @@ def summary(dump: Dump) -> list[Table | Text]:
         shown += [_maps(dump), _functions(dump)]
     else:
         shown.append(Text(_objects(dump)))
+        if indexes := object_indexes(dump):
+            shown.append(Text(f"readable: {', '.join(indexes)}"))
     if dump.latency:
         shown.append(_latency(dump.latency))
     shown += [Text(line) for line in notes(dump)]
@@ -113,6 +115,16 @@ def _objects(dump: Dump) -> str:
     parts = [f"{counts[key]} {name}" for key, name in zip(STATE_KEYS[2:], STATE_NAMES[2:], strict=True) if counts[key]]
     parts += [f"{counts['not_asked']} not asked"] if counts["not_asked"] else []
     return ", ".join([f"{counts['readable']} objects read", *parts])
+
+
+def object_indexes(dump: Dump) -> list[str]:
+    """Return the indexes of a CANopen node's readable objects: ``1000h``, or ``1008h..100Ah`` for consecutive ones."""
+    found = sorted({int(index) for index, _ in (dump.passes[0].cells if dump.passes else ())})
+    texts = []
+    for _, group in groupby(enumerate(found), key=lambda placed: placed[1] - placed[0]):
+        run = [index for _, index in group]
+        texts.append(f"{run[0]:04X}h" + (f"..{run[-1]:04X}h" if len(run) > 1 else ""))
+    return texts
 
 
 def profile_gaps(dump: Dump) -> list[str]:

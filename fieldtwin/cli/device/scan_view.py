@@ -139,6 +139,7 @@ def show_can(scan: CanScan) -> None:
     rate = f" at {scan.bitrate} bit/s" if scan.bitrate else ""
     stderr.print(f"listened for {scan.listened_s:.1f} s{rate}: {heard.frames} frames, {heard.errors} error frames")
     table = _table("node", "state", "SDO", "device type", "vendor", "product", "serial", "heard")
+    table.columns[1].no_wrap = True  # a state is one word
     asked = {n.node: n for n in scan.nodes}
     for number in sorted(asked.keys() | {n for n, h in heard.nodes.items() if h.certain}):
         node, traffic = asked.get(number), heard.nodes.get(number)

@@ -108,7 +108,8 @@ def estimate(job: DumpJob, spacing_s: float) -> Estimate:
         shorter = "ranges, such as 6000..6FFF, with --eds"
     else:
         shorter = "ranges, such as holding:0..999, with --profile"
-    return Estimate(least, most, least * (each + long_s), most * (each + short_s), budgets_s, shorter)
+    shortest_s, longest_s = sorted((least * (each + long_s), most * (each + short_s)))
+    return Estimate(least, most, shortest_s, longest_s, budgets_s, shorter)
 
 
 def frames(job: DumpJob) -> list[str]:

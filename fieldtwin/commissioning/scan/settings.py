@@ -23,7 +23,7 @@ FRAMES = ("8N1", "8E1", "8O1", "8N2")
 ASCII_FRAMES = ("7E1", "8N1", "8E1", "7O1", "7N2", "7N1")
 
 UNITS = (1, 2, 3, 4, 5, 10, 16, 247, 17, 6, 7, 8, 9, 11, 32, 20, 100, 126, 50, 12, 64, 128, 13, 14, 15, 200)
-"""The usual unit IDs of new devices, and an ID that no manufacturer uses as the factory setting (42)."""
+"""The usual unit IDs of new devices, most frequent first."""
 
 SERIAL_UNITS = tuple(range(1, 248))
 TCP_UNITS = (*range(1, 248), 0, 255)

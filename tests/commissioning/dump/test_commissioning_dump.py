@@ -12,7 +12,7 @@ from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.cli.device.dump_view import estimate_text
+from fieldtwin.cli.device.dump_view import estimate_text, object_indexes
 from fieldtwin.commissioning.access.reading import DeviceTarget
 from fieldtwin.commissioning.dump.coverage import NOT_ASKED, READABLE, REFUSED
 from fieldtwin.commissioning.dump.dump import DumpJob
@@ -327,5 +327,20 @@ def test_the_estimate_of_a_long_dump_names_what_shortens_it() -> None:
     assert "shorter" not in estimate_text(estimate(few, 0.02), 1, 50.0)
     wide = DumpJob(DeviceTarget("tcp://192.0.2.1", 1), register_spans(["holding"]))
     assert "shorter with fewer ranges, or with a higher --rate" in estimate_text(estimate(wide, 0.02), 1, 50.0)
+    line = DumpJob(DeviceTarget("rtu:/dev/ttyS0", 1), register_spans(["holding:0..20"]))
+    shortest = estimate(line, 0.02)  # its one long reply takes longer than short ones
+    assert shortest.least_s < shortest.most_s
     drive = DumpJob(DeviceTarget("can:socketcan/can0", 5))
     assert "such as 6000..6FFF, with --eds" in estimate_text(estimate(drive, 0.02), 1, 50.0)
+
+
+def test_the_objects_of_a_dump_are_listed_by_their_indexes(tmp_path: Path) -> None:
+    found = ("1000h:00", "1008h:00", "1009h:00", "100Ah:00", "2400h:00", "2400h:01")
+    lines = [
+        '{"fieldtwin_dump":2,"protocol":"canopen","address":41,"ranges":["1000h..24FFh"]}',
+        '{"pass":0,"at":"2026-11-28T05:32:19.326+00:00"}',
+        *(f'{{"read":"{name}","hex":"01","us":9}}' for name in found),
+        '{"read":"1001h:00","code":100794368,"us":9}',
+    ]
+    (tmp_path / "node.jsonl").write_text("\n".join(lines) + "\n")
+    assert object_indexes(load_dump(tmp_path / "node.jsonl")) == ["1000h", "1008h..100Ah", "2400h"]

@@ -213,7 +213,7 @@ def test_a_typed_unit_id_is_that_of_the_next_steps_and_a_refused_function_does_n
         assert "11h" not in page.text(".outcome")
 
 
-def test_the_dump_of_a_canopen_node_counts_its_objects(tmp_path: Path) -> None:
+def test_the_dump_of_a_canopen_node_counts_its_objects_and_names_their_indexes(tmp_path: Path) -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         bus = f"can:fieldtwin/127.0.0.1:{listener.getsockname()[1]}"
@@ -230,7 +230,7 @@ def test_the_dump_of_a_canopen_node_counts_its_objects(tmp_path: Path) -> None:
             go_to(page, "Dump")
             page.type("[name=address]", "5")
             play(page, "Dump", "done", ranges="1000..1018")
-            page.sees(".outcome td", "21")
+            page.sees(".outcome td", "21: 1000h..1001h, ")
             assert page.complaints() == []
     finally:
         node.terminate()

@@ -50,14 +50,14 @@ const Identify = ({ r }) => {
   const out = r.candidates.length - fits.length;
   return html`<p><strong>${r.summary}</strong></p>
     <${Facts} facts=${stated(r)} />
-    ${fits.length > 0 && html`<${Table} head=${["Profile", "Sureness", "Because"]} rows=${fits.map((c) => [html`<strong>${c.profile}</strong>`, html`<${Chip} tone=${SURENESS[c.sureness] ?? ""}>${c.sureness}<//>`, c.reasons.join("; ")])} />`}
+    ${fits.length > 0 && html`<${Table} head=${["Profile", "Certainty", "Because"]} rows=${fits.map((c) => [html`<strong>${c.profile}</strong>`, html`<${Chip} tone=${SURENESS[c.sureness] ?? ""}>${c.sureness}<//>`, c.reasons.join("; ")])} />`}
     ${out > 0 &&
     html`<details><summary>${out} profiles are ruled out</summary>
       <${Table} head=${["Profile", "Because"]} rows=${r.candidates.filter((c) => c.sureness === "ruled out").map((c) => [c.profile, c.against.join("; ")])} />
     </details>`}`;
 };
 
-/** What a device may not have answered, by the names in `silence`. */
+/** What a device may not have answered, by the names in `silence`. Reads of registers (03) are questions about profiles. */
 const SILENT = { "2B": "identification", 11: "server id", sunspec: "SunSpec" };
 
 /** What the device says about itself, and why it does not. */
@@ -72,14 +72,17 @@ function stated(r) {
     serial,
     "server id": r.server_id && html`<span class="mono">${hex(r.server_id)}</span>`,
     conflict: r.conflict,
-    ...Object.fromEntries(Object.entries(r.silence ?? {}).map(([request, why]) => [SILENT[request] ?? request, why])),
+    ...Object.fromEntries(Object.entries(r.silence ?? {}).filter(([request]) => request !== "03").map(([request, why]) => [SILENT[request] ?? request, why])),
   };
 }
 
 const answering = (r) => (r.functions ?? []).filter((f) => f.hex !== undefined); // the others were refused, or silent
 
-/** The registers in a state; of a CANopen node the number of objects. */
-const listed = (map, state) => map[state]?.join(", ") ?? map.counts?.[state] ?? "";
+/** The registers in a state; of a CANopen node the number of objects, and the indexes of the readable ones. */
+const listed = (map, state) => {
+  const count = map[state]?.join(", ") ?? map.counts?.[state] ?? "";
+  return state === "readable" && map.indexes ? `${count}: ${map.indexes.join(", ")}` : count;
+};
 
 const Dump = ({ r }) => html`
   <p>${r.values} values in ${r.passes} ${r.passes === 1 ? "pass" : "passes"}.</p>
@@ -91,7 +94,7 @@ const Dump = ({ r }) => html`
   ${answering(r).length > 0 && html`<h3>Functions that answer</h3><p class="mono">${answering(r).map((f) => `${f.function.toString(16).toUpperCase().padStart(2, "0")}h`).join(", ")}</p>`}`;
 
 const Infer = ({ r }) => html`<${Table}
-  head=${["At", "Type", "Last value", "Sure", "Remarks"]}
+  head=${["At", "Type", "Last value", "Certainty", "Remarks"]}
   rows=${r.readings.map((x) => [
     html`<span class="mono">${x.at}</span>`,
     html`<span class="mono">${x.type}${x.registers > 1 ? ` ${x.order}` : ""}</span>`,

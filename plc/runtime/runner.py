@@ -18,6 +18,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram
@@ -416,7 +417,9 @@ class TaskRunner:
         """Return the last changes of an output or local, the newest first. Raises `UsageError` for a tag that no
         program writes."""
         if tag not in self.outputs.last():
-            raise UsageError(f"no program writes {tag!r}", expected="an output or local of a program")
+            bound = {f"{b.name}.{v.name}": to for b in self.programs for v, to in b.published()}
+            hint = f"this output is the tag {bound[tag]!r}" if tag in bound else did_you_mean(tag, self.outputs.last())
+            raise UsageError(f"no program writes {tag!r}", expected="an output or local of a program", hint=hint)
         now_ns = self._now_ns()
         return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
 

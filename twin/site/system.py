@@ -266,7 +266,7 @@ def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name
     if not tag.writable:
         raise file.error(loc, f"the tag {name!r} of {profile.name} is read-only")
     if tag.bits is not None or tag.scale_by is not None:
-        why = "a part of its register" if tag.bits is not None else "scaled by another register"
+        why = "only a part of a register" if tag.bits is not None else "scaled by another register"
         raise file.error(
             loc,
             f"the gateway cannot write the tag {name!r} of {profile.name}, because it is {why}",

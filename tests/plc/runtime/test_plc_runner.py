@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,11 @@ from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
 from fieldtwin.plc.runtime.runner import TaskRunner
 
 MS = 1_000_000
-PLANT = {"d.go": TagSpec("d.go", TagKind.BOOL), "d.n": TagSpec("d.n", TagKind.INT)}
+PLANT = {
+    "d.go": TagSpec("d.go", TagKind.BOOL),
+    "d.n": TagSpec("d.n", TagKind.INT),
+    "d.total": TagSpec("d.total", TagKind.INT),
+}
 MODULE = """
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_output, var_retain
@@ -47,6 +51,7 @@ class Rig:
         folder: Path,
         tasks: tuple[TaskSpec, ...],
         used: tuple[str, ...] = ("Fast", "Slow", "Event"),
+        outputs: Mapping[str, str] = {},
         **more: object,
     ) -> None:
         self.module = f"runner_{folder.name}".replace("-", "_")
@@ -54,7 +59,8 @@ class Rig:
         known = {t.name for t in tasks}
         self.programs = tuple(
             ProgramConfig(
-                name.lower(), f"python: {self.module}:{name}", {"n": InputBinding("d.n", str(more.pop("if_bad", "pass")))}, {},
+                name.lower(), f"python: {self.module}:{name}", {"n": InputBinding("d.n", str(more.pop("if_bad", "pass")))},
+                dict(outputs),
                 name.lower() if name.lower() in known else "",
             )
             for name in used
@@ -268,3 +274,13 @@ def test_a_program_reads_another_programs_variable(tmp_path: Path) -> None:
     second = runner.programs[1].program
     assert runner.outputs.last()["second.doubled"] == 4.0  # the value of `first` at the scan's start
     assert second.quality == "good"  # type: ignore[attr-defined]
+
+
+def test_a_question_about_a_bound_output_names_its_tag_and_a_misspelt_one_the_nearest(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, (TaskSpec("fast", 10),), ("Fast",), outputs={"count": "d.total"})
+    rig.runner.start()
+    rig.until(20)
+    with pytest.raises(UsageError, match=r"no program writes 'fast\.count'; .*this output is the tag 'd\.total'"):
+        rig.runner.why("fast.count")
+    with pytest.raises(UsageError, match=r"did you mean 'd\.total'"):
+        rig.runner.why("d.totl")

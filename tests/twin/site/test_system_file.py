@@ -99,7 +99,7 @@ def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "why"), [("bits: [0, 0]", "a part of its register"), ("scale_by: run", "scaled by another register")]
+    ("form", "why"), [("bits: [0, 0]", "only a part of a register"), ("scale_by: run", "scaled by another register")]
 )
 def test_an_output_that_the_gateway_cannot_write_is_refused_when_the_file_is_read(
     tmp_path: Path, form: str, why: str

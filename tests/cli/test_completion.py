@@ -56,6 +56,17 @@ def test_bash_accepts_the_script(tmp_path: Path) -> None:
     assert (done.returncode, "_fieldtwin_completion" in done.stdout) == (0, True), done.stderr
 
 
+def test_the_line_for_a_bash_without_its_package_for_completion_works(tmp_path: Path) -> None:
+    env = {**os.environ, "HOME": str(tmp_path), "XDG_DATA_HOME": str(tmp_path / "data")}
+    install = [sys.executable, "-m", "fieldtwin", "completion", "bash", "--install"]
+    said = subprocess.run(install, env=env, capture_output=True, text=True, check=True, timeout=60).stderr
+    line = said.strip().rpartition("~/.bashrc: ")[2]
+    (tmp_path / "rc").write_text(line + "\n", encoding="utf-8")
+    bash = ["bash", "--norc", "-c", f"source {tmp_path / 'rc'} && complete -p fieldtwin"]
+    done = subprocess.run(bash, env=env, capture_output=True, text=True, check=False)
+    assert "_fieldtwin_completion" in done.stdout, (said, done.stderr)
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

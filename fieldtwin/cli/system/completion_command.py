@@ -11,7 +11,11 @@ import click
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 
-OF_ZSH = "add these lines to ~/.zshrc, before compinit: fpath+=~/.zfunc; autoload -Uz compinit && compinit"
+NEEDED = {
+    "bash": "bash needs its package bash-completion for this; without the package add this line to ~/.bashrc: . {path}",
+    "zsh": "add these lines to ~/.zshrc, before compinit: fpath+=~/.zfunc; autoload -Uz compinit && compinit",
+}
+"""The requirements of a shell for loading the file."""
 
 
 @click.command("completion")
@@ -39,6 +43,6 @@ def command(shell: str, install: bool) -> int:
     except OSError as e:
         raise UsageError(f"cannot write {path}: {e.strerror}", hint=f"fieldtwin completion {shell} prints it") from e
     stderr.print(f"written to {path}; a new {shell} uses it", soft_wrap=True, markup=False, highlight=False)
-    if shell == "zsh":
-        stderr.print(OF_ZSH, soft_wrap=True, markup=False, highlight=False)
+    if shell in NEEDED:
+        stderr.print(NEEDED[shell].format(path=path), soft_wrap=True, markup=False, highlight=False)
     return 0

@@ -207,7 +207,8 @@ def test_a_terminated_test_removes_its_faults_and_values_at_once(running: Runnin
 @pytest.mark.parametrize("order", ORDERS)
 def test_any_order_gives_the_same_verdicts_on_compose(running: Running, order: tuple[str, ...]) -> None:
     running.plc("force", tag="tank.valve", value=1, by="a person")
-    assert verdicts(running.test(*order)) == EXPECTED
+    results = running.test(*order)
+    assert verdicts(results) == EXPECTED, results
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -14,7 +14,7 @@ from studio_rig import OPERATE, Studio, until
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, read_record, write_record
 
 pytest.importorskip("selenium", reason="needs selenium, which is in the extra dev")
-from browser import MISSING, Window, browser
+from browser import MISSING, WIDE, Window, browser
 from selenium.webdriver.common.action_chains import ActionChains
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
@@ -39,6 +39,25 @@ def page(chromium: Window, observatory: Studio) -> Iterator[Window]:
         client.delete("/instances/observatory/faults")
         client.delete("/instances/observatory/plc/forces")
     assert chromium.complaints() == []
+
+
+def test_no_width_of_the_window_cuts_the_function_of_a_frame(page: Window) -> None:
+    """At 800 pixels, Function and Meaning both showed the first letters of "read holding registers"."""
+    page.click(".nav a", "Bus")
+    page.sees(".frames .item", "read holding registers")
+    page.click("button", "Pause")
+    cut = """
+    const rows = [...document.querySelectorAll('.frames .row')].map((row) => row.children[arguments[0]]);
+    return rows.filter((cell) => cell && cell.scrollWidth > cell.clientWidth).length"""
+    try:
+        for width, shows_function in ((800, False), (1000, False), (1100, True), (1280, True), (1920, True)):
+            page.size(width, 900)
+            until(lambda shown=shows_function: ("Function" in page.text(".frames .head")) == shown, f"{width} px")
+            assert page.script(cut, 4) == 0, width
+            wide = page.script("return document.querySelector('.frames .item').children[5].clientWidth")
+            assert wide >= 195, width  # the meaning
+    finally:
+        page.size(*WIDE)
 
 
 def test_a_frame_is_explained_field_by_field_and_leads_to_its_reply(page: Window) -> None:

@@ -201,7 +201,7 @@ function Frames({ store, filter, live, setLive, selected, setSelected, at }) {
           >
             <span class="mono">${clock(r.t_ns - started)}</span><span>${r.bus}</span>
             <span title=${r.sent ? "sent by the gateway" : "received by the gateway"}>${r.sent ? "→" : "←"}</span>
-            <span>${r.device || (r.unit === null ? "" : r.unit)}</span><span>${r.service}</span><span title=${r.text}>${r.text}</span>
+            <span>${r.device || (r.unit === null ? "" : r.unit)}</span><span>${r.service}</span><span title=${r.service ? `${r.service}: ${r.text}` : r.text}>${r.text}</span>
             <span class="mono soft">${hex(r.bytes)}</span><span class="mono">${milliseconds(r.latency_ns)}</span>
             <span>${r.verdict || (r.sent ? "pending" : "")}</span>
           </button>`;

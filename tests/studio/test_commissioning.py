@@ -76,9 +76,11 @@ def test_the_guide_names_folder_ports_practice_devices_and_files(running: Studio
         guide = client.get(GUIDE).json()
     assert guide["folder"] == str(folder)
     assert guide["role"] == "view"
-    assert {"name": "ctd-reference", "device": "fieldtwin/ctd-reference", "unit": 1} in guide["practice"]
-    assert "drive-cia402" not in [p["name"] for p in guide["practice"]]
-    assert "drive-cia402" in guide["profiles"]
+    ctd = {"name": "ctd-reference", "device": "fieldtwin/ctd-reference", "protocol": "modbus", "address": 1}
+    assert ctd in guide["profiles"]
+    assert ("inclinometer-cia410", "canopen", 5) in [
+        (p["name"], p["protocol"], p["address"]) for p in guide["profiles"]
+    ]
 
 
 def test_a_scan_finds_the_device_and_its_result_is_data(running: Studio) -> None:

@@ -19,7 +19,7 @@ from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.api.stream import FULL, SENT_WITHIN_S, until_left
 from fieldtwin.studio.commissioning.drafts import check_draft
 from fieldtwin.studio.commissioning.jobs import Job, Jobs
-from fieldtwin.studio.commissioning.practice import practice_devices, profile_names
+from fieldtwin.studio.commissioning.practice import known_profiles
 from fieldtwin.studio.commissioning.steps import AnyStep
 
 AT_MOST_EVERY_S = 0.2
@@ -47,8 +47,7 @@ async def get_guide(request: Request) -> dict[str, Any]:
         "folder": str(jobs.folder.path),
         "role": request.scope["role"],
         "ports": await asyncio.to_thread(local_ports),
-        "practice": await asyncio.to_thread(practice_devices),
-        "profiles": sorted(profile_names()),
+        "profiles": await asyncio.to_thread(known_profiles),
         "jobs": jobs.overview(),
         "forgotten_jobs": jobs.forgotten,
         "files": files,

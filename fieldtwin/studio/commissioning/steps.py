@@ -109,13 +109,17 @@ class Identify(Step, tag="identify"):
 
 
 class Dump(Step, tag="dump"):
-    """Read all values of a device several times. Without `ranges` everything is read, which can take long."""
+    """Read all values of a device several times.
+
+    Without `ranges` the dump reads the tags of the profile or the objects of the EDS, else everything, which can take long.
+    """
 
     endpoint: Url
     out: File
     address: Address = 1
     ranges: Annotated[list[Range], Meta(max_length=20)] = []
     profile: File | None = None
+    eds: File | None = None
     passes: Annotated[int, Meta(ge=1, le=10_000)] = 1
     every_s: Seconds = 10.0
     resume: bool = False
@@ -123,15 +127,16 @@ class Dump(Step, tag="dump"):
     def command(self, folder: WorkFolder) -> Command:
         out = folder.checked(self.out, ".jsonl")
         arguments = ["dump", *_endpoint(self.endpoint, folder), *_address(self.endpoint, self.address), *self.ranges]
-        arguments += _profile(self.profile, folder)
+        arguments += _profile(self.profile, folder) + _eds(self.eds, folder)
         if self.passes > 1:
             arguments += ["--passes", str(self.passes), *_duration("--every", self.every_s, 10.0)]
         arguments += ["-o", out, *_flag("--resume", self.resume)]
         log = f"{out.removesuffix('.jsonl')}.sent.jsonl"
         port = _port(self.endpoint, folder)
+        reads = _files(folder, self.profile, self.eds)
         if self.resume:
-            return Command(tuple(arguments), port, reads=(out,), adds_to=out)
-        return Command(tuple(arguments), port, writes=(out, log))
+            return Command(tuple(arguments), port, reads=(*reads, out), adds_to=out)
+        return Command(tuple(arguments), port, reads, writes=(out, log))
 
 
 class Infer(Step, tag="infer"):
@@ -148,11 +153,14 @@ class Infer(Step, tag="infer"):
 
 
 class Record(Step, tag="record"):
-    """Record the device's answers to the reads of a profile, for a number of rounds; a CAN bus without a profile only listens."""
+    """Record the device's answers to the reads of a profile or an EDS, for a number of rounds; without both, a recording of a CAN
+    bus only listens.
+    """
 
     endpoint: Url
     out: File
     profile: File | None = None
+    eds: File | None = None
     address: Address | None = None
     rounds: Annotated[int, Meta(ge=1, le=1_000_000)] = 10
     every_s: Seconds = 1.0
@@ -162,16 +170,19 @@ class Record(Step, tag="record"):
         is_can = Endpoint.parse(self.endpoint).is_can
         out = folder.checked(self.out, ".log" if is_can else ".jsonl")
         arguments = ["record", *_endpoint(self.endpoint, folder), *_profile(self.profile, folder)]
+        arguments += _eds(self.eds, folder)
         if self.profile is None and not is_can:
             raise UsageError("a recording needs a profile", hint="infer writes one")
-        if self.profile is not None:
+        if self.profile is not None or self.eds is not None:
             arguments += _address(self.endpoint, self.address) if self.address is not None else []
             arguments += ["--rounds", str(self.rounds)] if self.for_s is None else []
             arguments += _duration("--every", self.every_s, 1.0)
         elif self.for_s is None:
             raise UsageError("a recording of a CAN bus needs a duration", expected="for_s")
         arguments += [*_duration("--for", self.for_s, None), "-o", out]
-        return Command(tuple(arguments), _port(self.endpoint, folder), _files(folder, self.profile), writes=(out,))
+        return Command(
+            tuple(arguments), _port(self.endpoint, folder), _files(folder, self.profile, self.eds), writes=(out,)
+        )
 
 
 class Emulate(Step, tag="emulate"):
@@ -231,6 +242,7 @@ class Check(Step, tag="check"):
     endpoint: Url
     out: File
     html: File
+    eds: File | None = None
     address: Address = 1
     writes: Annotated[list[Cell], Meta(max_length=10)] = []
     confirmed: bool = False
@@ -239,11 +251,11 @@ class Check(Step, tag="check"):
         is_can = Endpoint.parse(self.endpoint).is_can
         out, html = folder.checked(self.out, ".json"), folder.checked(self.html, ".html")
         arguments = ["check", "canopen" if is_can else "modbus", *_endpoint(self.endpoint, folder)]
-        arguments += _address(self.endpoint, self.address)
+        arguments += _address(self.endpoint, self.address) + _eds(self.eds, folder)
         arguments += [argument for cell in self.writes for argument in ("--write", cell)]
         arguments += ["--yes"] if self.writes and self.confirmed else []
         arguments += ["-o", out, "--html", html]
-        return Command(tuple(arguments), _port(self.endpoint, folder), writes=(out, html))
+        return Command(tuple(arguments), _port(self.endpoint, folder), _files(folder, self.eds), writes=(out, html))
 
 
 class Report(Step, tag="report"):
@@ -317,14 +329,18 @@ def _profile(name: str | None, folder: WorkFolder) -> list[str]:
     return [] if name is None else ["--profile", _shipped_or_file(name, folder, ".yaml")]
 
 
+def _eds(name: str | None, folder: WorkFolder) -> list[str]:
+    return [] if name is None else ["--eds", folder.checked(name, ".eds", ".dcf")]
+
+
 def _shipped_or_file(name: str, folder: WorkFolder, *suffixes: str) -> str:
     """Return the name of a known profile, or that of a file of the folder."""
     return name if name in profile_names() else folder.checked(name, *suffixes)
 
 
-def _files(folder: WorkFolder, name: str | None) -> tuple[str, ...]:
-    """Return the file that a name means, if it means one and not a known profile."""
-    return () if name is None or name in profile_names() else (name,)
+def _files(folder: WorkFolder, *names: str | None) -> tuple[str, ...]:
+    """Return those of the names that mean a file and not a known profile."""
+    return tuple(name for name in names if name is not None and name not in profile_names())
 
 
 def _option(name: str, value: int | str | None) -> list[str]:

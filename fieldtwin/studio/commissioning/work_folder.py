@@ -20,18 +20,23 @@ MOST_DRAFT_BYTES = 256 * 1024
 _HEAD_BYTES = 4096
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,79}\Z")
 
-DUMP, RECORDING, PROFILE, CHECK, COMPARISON, REPORT, OTHER = (
+DUMP, RECORDING, PROFILE, DATA_SHEET, CHECK, COMPARISON, REPORT, OTHER = (
     "dump",
     "recording",
     "profile",
+    "data sheet",
     "check",
     "comparison",
     "report",
     "other",
 )
+_EDS_SECTION = re.compile(rb"^\[(FileInfo|DeviceInfo)\]", re.MULTILINE | re.IGNORECASE)
 _SIGNS: tuple[tuple[str, str, re.Pattern[bytes]], ...] = (
     (".jsonl", DUMP, re.compile(rb'\A\{"fieldtwin_dump"')),
     (".jsonl", RECORDING, re.compile(rb'\A\{"fieldtwin_recording"')),
+    (".log", RECORDING, re.compile(rb"\A\(\d+\.\d+\) \S+ [0-9A-Fa-f]+#")),
+    (".eds", DATA_SHEET, _EDS_SECTION),
+    (".dcf", DATA_SHEET, _EDS_SECTION),
     (".yaml", PROFILE, re.compile(rb"^device:", re.MULTILINE)),
     (".json", CHECK, re.compile(rb'"kind": ?"fieldtwin check"')),
     (".json", COMPARISON, re.compile(rb'"kind": ?"fieldtwin compare"')),

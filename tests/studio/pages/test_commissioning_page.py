@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -140,6 +140,10 @@ def test_the_first_hour_with_an_unknown_device(tmp_path: Path) -> None:
         document = (tmp_path / "meter-acceptance.html").read_text()
         assert "Pump house 3" in document
         assert "Flow meter F3" in document
+        site = "fieldtwin new mysite --device 'meter=./meter.yaml@rtu:near?baudrate=9600&frame=8N1#3' --yes"
+        page.sees(".finish pre", site)
+        subprocess.run([sys.executable, "-m", *shlex.split(site)], cwd=tmp_path, check=True, capture_output=True)
+        assert (tmp_path / "mysite" / "profiles" / "meter.yaml").read_text().endswith(PROFILE)
 
         states = page.text(".steps").splitlines()
         assert states.count("done") == 9, states
@@ -211,27 +215,3 @@ def test_a_typed_unit_id_is_that_of_the_next_steps_and_a_refused_function_does_n
         play(page, "Dump", "done", ranges="holding:0..1", passes="1")
         page.sees(".outcome .mono", "07h, 08h, 0Bh, 0Ch")  # 11h and 2Bh are refused
         assert "11h" not in page.text(".outcome")
-
-
-def test_the_dump_of_a_canopen_node_counts_its_objects_and_names_their_indexes(tmp_path: Path) -> None:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        bus = f"can:fieldtwin/127.0.0.1:{listener.getsockname()[1]}"
-    emulate = [sys.executable, "-m", "fieldtwin", "emulate", "inclinometer-cia410", "--on", bus, "--node", "5"]
-    said = tmp_path / "emulate.log"
-    with said.open("wb") as out:
-        node = subprocess.Popen(emulate, stdout=out, stderr=subprocess.STDOUT)
-    try:
-        until(lambda: "node 5 on" in said.read_text(), "the node answers")
-        with studio(folder=tmp_path) as running, browser() as page:
-            opened(page, running)
-            page.type("#field-endpoint", bus)
-            page.sees(".top", bus)
-            go_to(page, "Dump")
-            page.type("[name=address]", "5")
-            play(page, "Dump", "done", ranges="1000..1018")
-            page.sees(".outcome td", "21: 1000h..1001h, ")
-            assert page.complaints() == []
-    finally:
-        node.terminate()
-        node.wait()

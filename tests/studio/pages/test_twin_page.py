@@ -53,7 +53,7 @@ def page(site: TwinSite) -> Iterator[Window]:
 def test_the_view_leads_from_the_command_line_to_the_twin_and_to_its_forecast(page: Window, site: TwinSite) -> None:
     place = site.twins()["plant_thread"]["place"]
     page.sees("main", "No shadow or twin of this instance runs on this computer")
-    page.sees(".command", f"fieldtwin twin observatory --from {place} --command 2")
+    page.sees(".copyable", f"fieldtwin twin observatory --from {place} --command 2")
 
     site.start_twin()
     page.sees(MODEL, "ACTIVE, period 2 s")
@@ -79,7 +79,7 @@ def test_the_view_leads_from_the_command_line_to_the_twin_and_to_its_forecast(pa
     labels = page.script("return [...document.querySelectorAll('.what-if .trend')].map(e => e.ariaLabel)")
     assert any("Forecast of ctd.sample_period_s: " in label for label in labels), labels
     page.click(".what-if summary", "command line")
-    page.sees(".what-if .command", "--from instance:observatory --horizon 60s --command 10@0s --faults faults.yaml")
+    page.sees(".what-if .copyable", "--from instance:observatory --horizon 60s --command 10@0s --faults faults.yaml")
     assert page.complaints() == []
 
 

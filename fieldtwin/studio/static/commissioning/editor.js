@@ -2,16 +2,30 @@
 
 import { html, useEffect, useRef, useState } from "../vendor/preact.js";
 import { get, post, put } from "../lib/api.js";
+import { count } from "../lib/format.js";
 import { Failure, useAction } from "../lib/parts.js";
+import { isCan, newest } from "./steps.js";
 
 const PAUSE_MS = 350;
 const path = (name) => `/commissioning/drafts/${encodeURIComponent(name)}`;
+
+/** The beginning of a CANopen profile: valid, with the one object that every node has. */
+const firstProfile = (ctx, sheet) => `device: mysite/${ctx.name.toLowerCase()}
+source: "the data sheet ${sheet}"
+protocol: canopen
+factory: {node: ${ctx.address}}
+eds: ${sheet}
+tags:
+  error_register: {object: "1001:00", type: uint8}
+  # Add the objects of your site, for example:
+  # slope: {object: "6010:00", type: int16, scale: 0.01, unit: deg}
+`;
 const EMPTY = { name: "", text: "", saved: "", version: "", checked: null };
 
 export const emptyDraft = EMPTY;
 
 /** `draft` and `setDraft` belong to the page, so that another step does not discard unsaved text. */
-export function Editor({ ctx, draft, setDraft, mayOperate, onSaved }) {
+export function Editor({ ctx, folder, draft, setDraft, mayOperate, onSaved }) {
   const [run, error, busy] = useAction();
   const [said, setSaid] = useState("");
   const area = useRef(null);
@@ -64,10 +78,22 @@ export function Editor({ ctx, draft, setDraft, mayOperate, onSaved }) {
     const height = parseFloat(getComputedStyle(area.current).lineHeight);
     area.current.scrollTop = Math.max(0, (line - 6) * height);
   };
-  if (!names.length) return html`<${Failure} text=${error} /><p class="empty">No profile yet: the step Infer writes one.</p>`;
+  const sheet = isCan(ctx.endpoint) && newest(ctx, "data sheet");
+  const begin = () =>
+    run(async () => {
+      await put(path(`${ctx.name}.yaml`), { text: firstProfile(ctx, sheet) });
+      onSaved(`${ctx.name}.yaml`, true);
+    });
+  if (!names.length)
+    return html`<${Failure} text=${error} />
+      ${isCan(ctx.endpoint)
+        ? html`${ctx.profile && html`<p>The known profile <strong>${ctx.profile}</strong> fits, so you need not make your own. Go on with the step Record.</p>`}
+            <p class="soft">${sheet ? html`A profile of your own names the objects of <code>${sheet}</code> that your site uses.` : html`A profile of your own needs the EDS of the device: copy it into <code>${folder}</code>, and it is listed here.`}</p>
+            ${sheet && mayOperate && html`<p class="bar"><button type="button" class="primary" disabled=${busy} onClick=${begin}>Begin a profile</button></p>`}`
+        : html`<p class="empty">No profile yet: the step Infer writes one.</p>`}`;
   const errors = draft.checked?.errors ?? [];
   const bad = new Set(errors.map((e) => e.line));
-  const count = draft.text.split("\n").length;
+  const lineCount = draft.text.split("\n").length;
   return html`
     <div class="bar">
       <label>Profile
@@ -83,7 +109,7 @@ export function Editor({ ctx, draft, setDraft, mayOperate, onSaved }) {
     <${Failure} text=${error} />
     <div class="editor">
       <div class="gutter" ref=${gutter} aria-hidden="true">
-        ${Array.from({ length: count }, (_, n) => html`<div class=${bad.has(n + 1) ? "bad" : ""}>${n + 1}</div>`)}
+        ${Array.from({ length: lineCount }, (_, n) => html`<div class=${bad.has(n + 1) ? "bad" : ""}>${n + 1}</div>`)}
       </div>
       <textarea
         ref=${area}
@@ -106,7 +132,7 @@ export function Editor({ ctx, draft, setDraft, mayOperate, onSaved }) {
         ${errors.map((e) => html`<li><button type="button" class="quiet" onClick=${() => goTo(e.line)}>line ${e.line}</button> ${e.message}</li>`)}
       </ul>`}
       ${draft.checked && !errors.length &&
-      html`<p><span class="chip good">valid</span> ${draft.checked.device}, ${draft.checked.tags.length + draft.checked.tags_left_out} tags</p>
+      html`<p><span class="chip good">valid</span> ${draft.checked.device}, ${count(draft.checked.tags.length + draft.checked.tags_left_out, "tag")}</p>
         <details><summary>Tags</summary>
           <table class="list"><thead><tr><th>Tag</th><th>At</th><th>Type</th><th>Unit</th></tr></thead>
             <tbody>${draft.checked.tags.map((t) => html`<tr><td><strong>${t.name}</strong></td><td class="mono">${t.at}</td><td class="mono">${t.type}</td><td>${t.unit}</td></tr>`)}</tbody>

@@ -2,6 +2,7 @@
 
 import { html, useEffect, useState } from "../vendor/preact.js";
 import { post } from "../lib/api.js";
+import { Copyable } from "../lib/parts.js";
 
 const PAUSE_MS = 150;
 
@@ -9,7 +10,7 @@ const PAUSE_MS = 150;
 export const valuesOf = (fields, entered) => Object.fromEntries(fields.map((f) => [f.name, valid(f, entered?.[f.name]) ?? f.value]));
 
 function valid(field, value) {
-  if (field.kind === "select" && value !== undefined && !field.options.includes(value)) return undefined;
+  if (field.kind === "select" && value !== undefined && !field.options.includes(value) && !(field.none && value === "")) return undefined;
   if (field.kind === "files" && value !== undefined) return value.filter((name) => field.options.includes(name));
   return value;
 }
@@ -36,9 +37,9 @@ function Field({ field: f, value, disabled, onChange }) {
     <label for=${id}>${f.label}</label>
     <span>
       ${f.kind === "select"
-        ? f.options.length
+        ? f.options.length || f.none
           ? html`<select id=${id} name=${f.name} value=${value} disabled=${disabled} onChange=${(e) => onChange(e.target.value)}>
-              ${!value && html`<option value=""></option>`}${f.options.map((o) => html`<option value=${o}>${o}</option>`)}
+              ${(f.none || !value) && html`<option value="">${f.none}</option>`}${f.options.map((o) => html`<option value=${o}>${o}</option>`)}
             </select>`
           : html`<span class="soft">${f.missing}</span>`
         : html`<input id=${id} name=${f.name} type=${f.kind === "number" ? "number" : "text"} min=${f.min} max=${f.max} step=${f.step} placeholder=${f.placeholder}
@@ -73,22 +74,4 @@ export function useCommand(request) {
   return [shown.text, shown.problem];
 }
 
-export function CommandLine({ text }) {
-  const [copied, setCopied] = useState(false);
-  useEffect(() => setCopied(false), [text]);
-  const copy = async () => {
-    try {
-      await navigator.clipboard.writeText(text);
-    } catch {
-      // without HTTPS or the permission, the selected text is copied in the old way
-      getSelection().selectAllChildren(document.getElementById("command-line"));
-      document.execCommand("copy");
-    }
-    setCopied(true);
-  };
-  return html`<div class="command">
-    <h3>The same on the command line</h3>
-    <div><pre id="command-line" tabindex="0">${text || " "}</pre>
-    <button type="button" disabled=${!text} onClick=${copy}>${copied ? "Copied" : "Copy"}</button></div>
-  </div>`;
-}
+export const CommandLine = ({ text }) => html`<div class="command"><h3>The same on the command line</h3><${Copyable} text=${text} id="command-line" /></div>`;

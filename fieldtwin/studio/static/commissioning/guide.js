@@ -8,11 +8,12 @@ import { Editor, emptyDraft } from "./editor.js";
 import { CommandLine, Fields, useCommand, valuesOf } from "./fields.js";
 import { PortStep } from "./port.js";
 import { Download, Result } from "./results.js";
-import { isCan, PRACTICE, STEPS } from "./steps.js";
+import { Finish } from "./finish.js";
+import { isCan, isPractice, STEPS } from "./steps.js";
 
 const WORDS = { running: "running", done: "done", findings: "findings", stopped: "stopped", failed: "failed" };
 const TONES = { running: "accent", done: "good", findings: "warn", stopped: "warn", failed: "bad" };
-const NEW = { endpoint: "", name: "device", settings: null, address: 1, profile: "", draft: "", forms: {}, taken: 0, draftValid: null };
+const NEW = { endpoint: "", name: "device", settings: null, address: 1, profile: "", draft: "", forms: {}, taken: 0, identified: 0, draftValid: null };
 const keyOf = (folder) => `fieldtwin-commissioning ${folder}`;
 
 /** What the user has chosen, kept in the browser for this folder. */
@@ -83,16 +84,17 @@ export function Guide({ step: wanted, place, children }) {
   const [run, failed, busy] = useAction();
   const latest = useMemo(() => {
     const found = {};
-    for (const job of guide?.jobs ?? []) if (job.step !== "emulate" || job.form.on !== PRACTICE) found[job.step] = job;
+    for (const job of guide?.jobs ?? []) if (!isPractice(job)) found[job.step] = job;
     return found;
   }, [guide]);
-  const practice = guide?.jobs.find((j) => j.state === "running" && j.form.on === PRACTICE);
+  const practice = guide?.jobs.findLast(isPractice);
   const ctx = guide && {
     ...choices,
     files: guide.files,
     profiles: guide.profiles,
     latest,
-    practice,
+    practice: practice?.state === "running" ? practice : null,
+    practiceFailed: practice?.state === "failed" ? practice.lines.slice(-3).join(" ") : "",
     emulator: latest.emulate?.state === "running" ? latest.emulate : null,
   };
   useEffect(() => {
@@ -104,6 +106,14 @@ export function Guide({ step: wanted, place, children }) {
       change({ taken: scan.number, ...(unit ? { address: unit.unit, settings: unit.settings } : node ? { address: node.node } : {}) });
     }, () => {});
   }, [latest.scan?.number, latest.scan?.state]);
+  useEffect(() => {
+    const job = latest.identify;
+    if (!job || job.state === "running" || job.number === choices.identified) return;
+    get(`/commissioning/jobs/${job.number}`).then(({ result }) => {
+      const fits = result?.candidates?.find((c) => c.sureness === "certain" || c.sureness === "likely");
+      change({ identified: job.number, profile: guide.profiles.find((p) => p.device === fits?.profile)?.name ?? "" });
+    }, () => {});
+  }, [latest.identify?.number, latest.identify?.state]);
   const at = STEPS.find((s) => s.id === wanted) ?? STEPS[0];
   const mayOperate = guide?.role === "operate";
   const main = useRef(null);
@@ -129,7 +139,7 @@ export function Guide({ step: wanted, place, children }) {
       <a class="brand" href="#/">fieldtwin Studio</a>
       <strong>Commissioning</strong>
       ${choices.endpoint && html`<span class="chip accent endpoint" title=${choices.endpoint}>${choices.endpoint}</span>`}
-      ${practice && html`<span class="chip warn">practice: ${practice.form.what}</span>`}
+      ${ctx?.practice && html`<span class="chip warn">practice: ${ctx.practice.form.what}</span>`}
       <span class="grow"></span>
       ${guide?.role === "view" && html`<span class="chip">view only</span>`}
       <span class="chip ${connected ? "good" : "bad"}" role="status">${connected ? "live" : "not connected"}</span>
@@ -153,15 +163,16 @@ export function Guide({ step: wanted, place, children }) {
       html`<div class="guide">
         <section class="card" key=${at.id}>
           <header><h1>${at.title}</h1></header>
-          <p class="explanation">${at.text}</p>
+          <p class="explanation">${typeof at.text === "function" ? at.text(ctx) : at.text}</p>
           <${Guard} title="This step cannot be shown" place=${place}>
             ${at.id === "port" && html`<${PortStep} ctx=${ctx} guide=${guide} change=${change} mayOperate=${mayOperate} again=${again} />`}
             ${at.id === "edit" &&
-            html`<${Editor} ctx=${ctx} draft=${draft} setDraft=${setDraft} mayOperate=${mayOperate}
+            html`<${Editor} ctx=${ctx} folder=${guide.folder} draft=${draft} setDraft=${setDraft} mayOperate=${mayOperate}
               onSaved=${(name, valid) => (change({ draft: name, draftValid: valid }), again())} />`}
             ${at.fields && html`<${CommandStep} step=${at} ctx=${ctx} choices=${choices} change=${change} mayOperate=${mayOperate} again=${again} />`}
           <//>
         </section>
+        ${at === STEPS.at(-1) && html`<${Finish} ctx=${ctx} folder=${guide.folder} />`}
         <${Files} guide=${guide} />
         <${Next} at=${at} />
       </div>`}
@@ -209,7 +220,7 @@ function CommandStep({ step, ctx, choices, change, mayOperate, again }) {
   };
   if (step.needsPort && !ctx.endpoint) return html`<p class="empty">First <a href="#/commissioning?step=port">choose a port</a>.</p>`;
   if (step.modbusOnly && isCan(ctx.endpoint)) return html`<p class="empty">${step.modbusOnly}</p>`;
-  const missing = fields.some((f) => (f.kind === "select" && f.options.length === 0) || (f.kind === "files" && !values[f.name].length));
+  const missing = fields.some((f) => (f.kind === "select" && f.options.length === 0 && !f.none) || (f.kind === "files" && !values[f.name].length));
   return html`
     <form onSubmit=${submit}>
       <${Fields} fields=${fields} values=${values} disabled=${!mayOperate || running} onChange=${enter} />

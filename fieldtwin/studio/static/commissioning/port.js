@@ -3,22 +3,23 @@
 import { html, useState } from "../vendor/preact.js";
 import { post, remove } from "../lib/api.js";
 import { Failure, useAction } from "../lib/parts.js";
-import { PRACTICE } from "./steps.js";
+import { asClient, PRACTICE } from "./steps.js";
 
 const KNOWN = /^(rtu|ascii|tcp|rtu\+tcp|udp|tls|can):.+/;
 
 export function PortStep({ ctx, guide, change, mayOperate, again }) {
-  const [chosen, setChosen] = useState(guide.practice.some((p) => p.name === "ctd-reference") ? "ctd-reference" : guide.practice[0]?.name);
+  const [chosen, setChosen] = useState(guide.profiles.some((p) => p.name === "ctd-reference") ? "ctd-reference" : guide.profiles[0]?.name);
   const [run, error, busy] = useAction();
   const choose = (endpoint) => change({ endpoint: endpoint.trim(), settings: null });
   const practise = () =>
     run(async () => {
-      await post("/commissioning/jobs", { step: { step: "emulate", what: chosen, on: PRACTICE } });
-      change({ endpoint: PRACTICE.replace("pty:", "rtu:"), settings: null, name: "practice" });
+      const on = PRACTICE[guide.profiles.find((p) => p.name === chosen).protocol];
+      await post("/commissioning/jobs", { step: { step: "emulate", what: chosen, on } });
+      change({ endpoint: asClient(on), settings: null, name: "practice" });
       again();
     });
   const stop = () => run(() => remove(`/commissioning/jobs/${ctx.practice.number}`));
-  const answers = ctx.practice?.lines.some((line) => line.startsWith("units "));
+  const answers = ctx.practice?.lines.some((line) => /^(units|node) /.test(line));
   const odd = ctx.endpoint && !KNOWN.test(ctx.endpoint);
   return html`
     <div class="fields">
@@ -42,18 +43,18 @@ export function PortStep({ ctx, guide, change, mayOperate, again }) {
       </div>
     </div>
     ${odd && html`<${Failure} text="An endpoint begins with rtu:, ascii:, tcp://, udp://, tls://, rtu+tcp:// or can:" />`}
-    ${guide.practice.length > 0 &&
+    ${guide.profiles.length > 0 &&
     html`<section class="practice">
       <h2>No device at hand?</h2>
-      <p class="soft">Practise with an emulated device: a shipped profile answers on a virtual serial port of this computer.</p>
-      <${Failure} text=${error} />
+      <p class="soft">Practise with an emulated device: a shipped profile answers on a virtual serial port or a software CAN bus of this computer.</p>
+      <${Failure} text=${error || ctx.practiceFailed} />
       ${ctx.practice
         ? html`<p class="bar" role="status"><span class="chip ${answers ? "good" : "accent"}">${answers ? "running" : "starting"}</span>
-            <span><strong>${ctx.practice.form.what}</strong> ${answers ? html`answers on <code>rtu:practice</code>.` : "will answer in a moment."}</span>
+            <span><strong>${ctx.practice.form.what}</strong> ${answers ? html`answers on <code>${asClient(ctx.practice.form.on)}</code>.` : "will answer in a moment."}</span>
             ${mayOperate && html`<button type="button" disabled=${busy} onClick=${stop}>Stop it</button>`}</p>`
         : mayOperate &&
           html`<p class="bar">
-            <label>Device <select value=${chosen} onChange=${(e) => setChosen(e.target.value)}>${guide.practice.map((p) => html`<option value=${p.name}>${p.device}</option>`)}</select></label>
+            <label>Device <select value=${chosen} onChange=${(e) => setChosen(e.target.value)}>${guide.profiles.map((p) => html`<option value=${p.name}>${p.device}</option>`)}</select></label>
             <button type="button" disabled=${busy} onClick=${practise}>Practise with an emulated device</button>
           </p>`}
     </section>`}`;

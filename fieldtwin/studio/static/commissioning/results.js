@@ -1,7 +1,8 @@
 // The results of the steps as tables. A result that has no table of its own is shown as text.
 
 import { html } from "../vendor/preact.js";
-import { hex, number } from "../lib/format.js";
+import { count, hex, number } from "../lib/format.js";
+import { asClient, isCan } from "./steps.js";
 
 const Facts = ({ facts }) =>
   html`<dl class="facts">${Object.entries(facts).filter(([, v]) => v !== "" && v !== null && v !== undefined).map(([name, v]) => html`<dt>${name}</dt><dd>${v}</dd>`)}</dl>`;
@@ -40,7 +41,7 @@ const Scan = ({ r, ctx, use }) => {
     ${nodes.length > 0 &&
     html`<${Table} head=${["Node", "State", ""]} rows=${nodes.map((n) => [n.node, n.state ?? "", use && html`<${Use} chosen=${ctx.address === n.node} onUse=${() => use(n.node, null)} />`])} />`}
     ${!units.length && !nodes.length &&
-    html`<p>No device was found. Check the supply, swap A and B, and scan without the limit to likely settings.</p>`}`;
+    html`<p>No device was found. ${isCan(ctx.endpoint) ? "Check the supply of the nodes, the bit rate, and the termination at both ends of the bus." : "Check the supply, swap A and B, and scan without the limit to likely settings."}</p>`}`;
 };
 
 const Use = ({ chosen, onUse }) => (chosen ? html`<${Chip} tone="good">in use<//>` : html`<button type="button" onClick=${onUse}>Use</button>`);
@@ -105,16 +106,18 @@ const Infer = ({ r }) => html`<${Table}
   empty="No register has a value that is not 0."
 />`;
 
-const Record = ({ r }) => html`<${Facts}
-  facts=${{ recorded: `${r.exchanges ?? r.frames ?? 0} ${r.exchanges === undefined ? "frames" : "exchanges"} in ${r.rounds ?? 1} rounds`, unanswered: r.unanswered, refused: r.refused, "rounds missed": r.missed_rounds, "connections lost": r.connections_lost }}
+const Record = ({ r }) => html`${r.notes.map((note) => html`<p>${note.charAt(0).toUpperCase()}${note.slice(1)}.</p>`)}<${Facts}
+  facts=${{ recorded: `${count(r.exchanges ?? r.frames ?? 0, r.exchanges === undefined ? "frame" : "exchange")} in ${r.rounds === undefined ? `${r.seconds.toFixed(1)} s` : count(r.rounds, "round")}`, unanswered: r.unanswered, refused: r.refused, "rounds missed": r.missed_rounds, "connections lost": r.connections_lost }}
 />`;
 
-const Compare = ({ r }) => html`
+const Compare = ({ r, job, ctx }) => html`
   <p><${Chip} tone=${r.inconclusive ? "warn" : r.met ? "good" : "bad"}>${r.inconclusive ? "inconclusive" : r.met ? "met" : "not met"}<//> ${r.alike} of ${r.compared} exchanges are equal: values ${percent(r.values ?? 0)}${r.timing === null || r.timing === undefined ? "" : `, timing ${percent(r.timing)}`}.</p>
+  ${!r.met && isCan(job.form.endpoint) && ctx.emulator && asClient(ctx.emulator.form.on) === job.form.endpoint &&
+  html`<p class="soft">An emulator gives each recorded value once. If it was read before, stop it and start it again, and compare once more.</p>`}
   ${r.latency?.length > 0 &&
   html`<${Table} head=${["Latency in ms", "n", "Recorded p50", "p90", "p99", "There p50", "p90", "p99"]} rows=${r.latency.map((l) => [l.service, l.count, ...[...l.recorded_s, ...l.other_s].map((s) => (1000 * s).toFixed(1))])} />`}
   ${r.differences?.length > 0 &&
-  html`<h3>Differences</h3><${Table} head=${Object.keys(r.differences[0])} rows=${r.differences.slice(0, 50).map((d) => Object.values(d).map((v) => (typeof v === "object" ? JSON.stringify(v) : String(v))))} />
+  html`<h3>Differences</h3><${Table} head=${Object.keys(r.differences[0])} rows=${r.differences.slice(0, 50).map((d) => Object.entries(d).map(([name, v]) => (name === "t_s" ? v.toFixed(3) : typeof v === "object" ? JSON.stringify(v) : String(v))))} />
   ${r.differences.length > 50 && html`<p class="soft">${r.differences.length - 50} more are in the file.</p>`}`}`;
 
 const Check = ({ r }) => {
@@ -123,7 +126,7 @@ const Check = ({ r }) => {
   const rows = (cases) => cases.map((c) => [html`<span class="mono">${c.id}</span>`, html`<${Chip} tone=${VERDICT[c.verdict] ?? "warn"}>${c.verdict}<//>`, c.title, c.reason, c.clause]);
   const head = ["Case", "Verdict", "Test", "Result", "Clause"];
   return html`
-    <p>${Object.entries(r.counts).map(([verdict, count]) => `${count} ${verdict}`).join(", ")}. The standard requires what ${r.findings.standard} of the failed cases ask.</p>
+    <p>${Object.entries(r.counts).map(([verdict, count]) => `${count} ${verdict}`).join(", ")}.${r.counts.failed ? ` The standard requires what ${r.findings.standard} of the failed cases ask.` : ""}</p>
     <${Table} head=${head} rows=${rows(shown)} empty="No case failed." />
     <details><summary>${rest.length} passed</summary><${Table} head=${head} rows=${rows(rest)} empty="" /></details>`;
 };

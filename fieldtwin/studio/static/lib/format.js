@@ -49,3 +49,6 @@ export function yaml(fields) {
   const plain = (v) => (typeof v === "string" ? (/^[A-Za-z_][\w .-]*$/.test(v) ? v : JSON.stringify(v)) : JSON.stringify(v));
   return "{" + Object.entries(fields).map(([k, v]) => `${k}: ${plain(v)}`).join(", ") + "}";
 }
+
+/** A number of things: "1 tag", "2 tags". */
+export const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;

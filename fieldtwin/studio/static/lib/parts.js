@@ -84,3 +84,22 @@ export function Sparkline({ points, now, width = 110, height = 22 }) {
   });
   return html`<svg class="spark" width=${width} height=${height} aria-hidden="true">${gaps}<path d=${path} /></svg>`;
 }
+
+/** A command line with a button that copies it. */
+export function Copyable({ text, id }) {
+  const shown = useRef(null);
+  const [copied, setCopied] = useState(false);
+  useEffect(() => setCopied(false), [text]);
+  const copy = async () => {
+    try {
+      await navigator.clipboard.writeText(text);
+    } catch {
+      // without HTTPS or the permission, the selected text is copied in the old way
+      getSelection().selectAllChildren(shown.current);
+      document.execCommand("copy");
+    }
+    setCopied(true);
+  };
+  return html`<div class="copyable"><pre id=${id} ref=${shown} role="group" tabindex="0" aria-label="Command line">${text || " "}</pre>
+    <button type="button" disabled=${!text} onClick=${copy}>${copied ? "Copied" : "Copy"}</button></div>`;
+}

@@ -3,7 +3,7 @@
 import { html, useEffect, useState } from "../vendor/preact.js";
 import { get } from "../lib/api.js";
 import { age, number, reason } from "../lib/format.js";
-import { Failure, useFetched } from "../lib/parts.js";
+import { Copyable, Failure, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { WhatIf } from "./twin_what_if.js";
 
@@ -45,18 +45,8 @@ function Start({ commands, thread }) {
         ? `The plant offers its digital thread at ${thread.place}. Start one of these in another terminal; this view then shows it.`
         : "This run has no digital thread. Stop it, and start it again with one; then start a shadow or a twin in another terminal."}
     </p>
-    ${commands.map(({ text, command }) => html`<h3 key=${text}>${text}</h3><${CommandLine} text=${command} />`)}
+    ${commands.map(({ text, command }) => html`<h3 key=${text}>${text}</h3><${Copyable} text=${command} />`)}
   </section>`;
-}
-
-export function CommandLine({ text }) {
-  const [copied, setCopied] = useState("");
-  const copy = () =>
-    navigator.clipboard ? navigator.clipboard.writeText(text).then(() => setCopied(text)) : undefined;
-  return html`<div class="command">
-    <pre class="yaml" role="group" tabindex="0" aria-label="Command line">${text}</pre>
-    ${navigator.clipboard && html`<button onClick=${copy}>${copied === text ? "Copied" : "Copy"}</button>`}
-  </div>`;
 }
 
 function Follower({ store, follower, thread }) {

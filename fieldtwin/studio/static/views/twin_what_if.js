@@ -3,8 +3,7 @@
 import { html, useEffect, useState } from "../vendor/preact.js";
 import { get, post, remove } from "../lib/api.js";
 import { number, yaml } from "../lib/format.js";
-import { Failure, useAction, useFetched } from "../lib/parts.js";
-import { CommandLine } from "./twin.js";
+import { Copyable, Failure, useAction, useFetched } from "../lib/parts.js";
 import { ForecastChart } from "./twin_forecast.js";
 
 const LOOK_EVERY_MS = 1000;
@@ -142,7 +141,7 @@ function Forecast({ store, run }) {
     ${Object.entries(result?.states ?? {}).map(([program, states]) => html`<p class="soft">${program}: ${states.slice(0, 8).map(([t, s]) => `${s} at ${number(t)} s`).join(" → ")}${states.length > 8 ? " …" : ""}</p>`)}
     <details>
       <summary>The same on the command line</summary>
-      <${CommandLine} text=${run.command} />
+      <${Copyable} text=${run.command} />
       ${asked.faults.length > 0 && html`<p class="soft">with faults.yaml:</p><pre class="yaml">${`faults: [${asked.faults.map(yaml).join(", ")}]`}</pre>`}
     </details>`;
 }

@@ -6,6 +6,7 @@ import asyncio
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -119,6 +120,11 @@ def test_a_text_comes_from_the_gateway(site: Site) -> None:
     assert site.seen(TEXT)[0] == "0043"
 
 
+def names(asked: Asked) -> set[str]:
+    """Return the lists of tags whose values Studio has asked for."""
+    return {json.dumps(args["names"]) for command, args in asked.requests if command == "watch"}
+
+
 @pytest.mark.long
 @pytest.mark.timeout(180)
 def test_studio_shows_what_the_gateway_has_without_asking_for_all_tags(
@@ -148,13 +154,78 @@ def test_studio_shows_what_the_gateway_has_without_asking_for_all_tags(
                     await asyncio.sleep(0.1)
                 else:
                     pytest.fail(f"{name}: Studio shows {seen}, and the gateway has {want}")
-            assert studio.gateway is not None
-            assert list(studio.gateway.tags) == list((await gateway.ask("get", GatewayStatus)).tags)
+            await eventually(lambda: names(asked) == {"[]", json.dumps([TEXT])}, "only texts are asked for", 60)
+            all_tags = list((await gateway.ask("get", GatewayStatus)).tags)
+            await eventually(
+                lambda: studio.gateway is not None and list(studio.gateway.tags) == all_tags, "all tags", 60
+            )
             assert (await gateway.ask("get", GatewayStatus, brief=True)).tags == {}
         await gateway.aclose()
         assert all(args["brief"] is True for args in asked.statuses)
-        names = {json.dumps(args["names"]) for command, args in asked.requests if command == "watch"}
-        assert names == {"[]", json.dumps([TEXT])}
 
     with process("run", "observatory", "--prototype", "--log", "text", root=root, ready="started"):
         asyncio.run(main())
+
+
+PROFILE = """device: fieldtwin/pump
+source: "made for this test"
+protocol: modbus
+numbering: sent
+tags:
+  mode: {{at: "holding:0", poll: fast, values: {{1: {name}}}}}
+"""
+SYSTEM = """fieldtwin: 1
+system: pump
+buses: {lan: {url: "tcp://192.0.2.1:502"}}
+devices: {p: {profile: pump_profile.yaml, bus: lan, unit: 1, poll: {fast: {every_ms: 100}}}}
+"""
+PROTOTYPE = """prototype_of: pump.yaml
+buses: {lan: {listen: "tcp://127.0.0.1:0"}}
+devices: {p: {model: profile, values: {mode: 1}}}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(180)
+def test_studio_follows_a_reload_and_a_gateway_that_is_started_again(tmp_path_factory: pytest.TempPathFactory) -> None:
+    root: Path = tmp_path_factory.mktemp("h")
+    run_dir, observed_dir = root / "run" / "pump", root / "o"
+    (root / "pump_profile.yaml").write_text(PROFILE.format(name="idle"))
+    (root / "pump.yaml").write_text(SYSTEM)
+    (root / "pump.prototype.yaml").write_text(PROTOTYPE)
+    start = ("run", "pump.yaml", "--prototype", "--log", "text")
+
+    async def main(running: ExitStack) -> None:
+        observed_dir.mkdir()
+        for name in (SYSTEM_FILE, GATEWAY_SOCKET):
+            (observed_dir / name).symlink_to(run_dir / name)
+        shutil.copy(run_dir / CONFIG, observed_dir / CONFIG)
+        record = read_record(
+            run_dir
+        )  # the directory that Studio observes has no record, which would tell it of another run
+        async with Attachment(FoundInstance("pump", observed_dir, True, record), WallClock()) as studio:
+
+            def text() -> object:
+                return studio.gateway.tags["p.mode"].text if studio.gateway is not None else None
+
+            await eventually(lambda: text() == "idle", "the value has its name", 60)
+            (root / "pump_profile.yaml").write_text(PROFILE.format(name="ready"))
+            gateway = await ControlClient.connect_unix(run_dir / GATEWAY_SOCKET)
+            assert (await gateway.call("reload"))["applied"] is True
+            await gateway.aclose()
+            await eventually(lambda: text() == "ready", "the value has its new name", 60)
+            await asyncio.to_thread(running.close)
+            await eventually(lambda: studio.gateway is None, "the gateway has ended", 60)
+            stopped_ns = studio.now_ns()
+            await asyncio.to_thread(running.enter_context, process(*start, root=root, ready="started"))
+            await eventually(lambda: text() == "ready", "the next gateway answers", 60)
+            await eventually(
+                lambda: studio.history.changes("p.mode", stopped_ns, studio.now_ns()), "its changes are read", 60
+            )
+            points, _ = studio.history.between("p.mode", 0, studio.now_ns())
+            assert [point.t_ns for point in points] == sorted(point.t_ns for point in points)
+            assert studio.changes_lost == 0
+
+    with ExitStack() as running:
+        running.enter_context(process(*start, root=root, ready="started"))
+        asyncio.run(main(running))

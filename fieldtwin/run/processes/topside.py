@@ -54,7 +54,7 @@ def script(periods: tuple[int, ...], duration_s: float) -> list[Scripted]:
 
 
 def parse_periods(text: str) -> tuple[int, ...]:
-    """Parse ``1,2,0,-1`` or ``none``. Raises `UsageError`."""
+    """Return the periods in a text such as ``1,2,0,-1``; ``none`` stands for no period. Raises `UsageError`."""
     if text.strip().lower() in ("", "none"):
         return ()
     try:

@@ -29,7 +29,7 @@ ALLOWED = 0
 
 
 def network(text: str) -> Network:
-    """Return the network ``10.0.0.0/24``, ``10.0.0.7`` or ``fd00::/8``. Raises `UsageError`."""
+    """Return the network that a text such as ``10.0.0.0/24``, ``10.0.0.7`` or ``fd00::/8`` describes. Raises `UsageError`."""
     try:
         return ip_network(text)
     except ValueError as e:

@@ -75,7 +75,7 @@ def test_the_files_handed_over_are_equal_and_readable_for_their_owner_only(tmp_p
 def test_a_damaged_hand_over_is_an_error_of_fieldtwin(tmp_path: Path) -> None:
     path = tmp_path / "system.pickle"
     path.write_bytes(b"\x80\x04")
-    with pytest.raises(Bug, match="handed over"):
+    with pytest.raises(Bug, match="the system that the run has written for its processes"):
         read_resolved(str(path))
 
 

@@ -62,8 +62,7 @@ def test_a_node_from_a_log_answers_and_sends_as_recorded() -> None:
             again += [(t_ns + MS, answer) for answer in node.feed(asked, t_ns)]
     again = [pair for pair in again if pair[1].can_id in (0x605, 0x585)]
     sdo = [pair for pair in frames if pair[1].can_id in (0x605, 0x585)]
-    assert [str(f) for _, f in again[:-1]] == [str(f) for _, f in sdo[:-1]]
-    assert str(again[-1][1]) == "585#8011200000000206", "of what was only ever in another state the log has nothing"
+    assert [str(f) for _, f in again] == [str(f) for _, f in sdo]
     assert node.feed(CanFrame(0, b"\x01\x05"), 100 * MS) is not None
     sent: Log = []
     while (due_ns := node.wake_at_ns()) is not None and due_ns <= 2000 * MS:

@@ -310,7 +310,7 @@ def test_a_tap_keeps_every_byte_in_both_directions_and_the_framing_is_found(tmp_
         stop, ready = asyncio.Event(), asyncio.Event()
         with RotatingFile(tmp_path / "t.tap.jsonl") as file:
             sink = LineSink(file, Endpoint.parse(far), WallClock(), "test")
-            tap = LineTap(Endpoint.parse(near), Endpoint.parse(far), sink, say=lambda text: ready.set())
+            tap = LineTap(Endpoint.parse(near), Endpoint.parse(far), sink, on_message=lambda text: ready.set())
             async with played(original, far):
                 tapping = asyncio.ensure_future(tap.run(stop))
                 try:

@@ -203,7 +203,7 @@ def test_messages_that_do_not_fit_are_refused() -> None:
     for messages in ({"m": [(0, b"12345")]}, {"m": [(0, b"")] * 3}, {"x": [(0, b"")]}):
         with pytest.raises(NotEncodable):
             writer.publish([good(0), good(0)], 1, messages)
-    with pytest.raises(Bug, match="one value a tag"):
+    with pytest.raises(Bug, match="the number of values is not the number of tags"):
         writer.publish([good(0)], 1)
     assert writer.counter == 0
 

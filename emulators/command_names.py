@@ -1,6 +1,6 @@
 """Determine the profile's command for a Modbus request, from the registers that the request reads or writes.
 
-The names are those of the command list (SPEC ruling 12). Pure; like all emulator code, it has its own decoder.
+The names are those of the command list (paper.md, ruling 12). Pure; like all emulator code, it has its own decoder.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The paper's virtual context: a collection of recordings from which an emulator answers (SPEC row Emulator).
+"""The paper's virtual context: a collection of recordings from which an emulator answers (the paper's Emulator).
 
 The collection is ordered, time-stamped and bounded, and keeps duplicates (rulings 2 and 3): the oldest recording of a command
 is returned first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` uses it with one
@@ -21,7 +21,7 @@ MAX_ENTRIES = 500_000
 
 
 class EndOfRecording(Enum):
-    """The behaviour of an emulator at the end of its recording (SPEC ruling 3), which the prototype file selects."""
+    """The behaviour of an emulator at the end of its recording (paper.md, ruling 3), which the prototype file selects."""
 
     HOLD = "hold"
     LOOP = "loop"
@@ -103,7 +103,7 @@ class VirtualContext:
     """The recordings by command. `taken` counts the recordings that were returned, `dropped` those for which there was no room.
 
     If `commands` is given, `take` accepts exactly these commands, even those without recordings. Otherwise the list of commands
-    is derived from the added recordings (ruling 12). A full context drops its oldest entry.
+    is derived from the added recordings (paper.md, ruling 12). A full context drops its oldest entry.
 
     `copy` returns a context in the initial state of this one; each device of one recording has its own copy.
     """
@@ -213,7 +213,7 @@ class VirtualContext:
         return series.last or (series.recorded[series.at] if series.left else None)
 
     def take(self, command: COMMAND) -> RECORDING:
-        """Return and remove a recording of the context; the command must be in the list (SPEC).
+        """Return and remove a recording of the context; the command must be in the list, as in the paper.
 
         At the end, `HOLD` returns the last recording again, `LOOP` starts over, and `ERROR` raises `UsedUp`. If nothing was ever
         recorded, all of them raise `UsedUp`. Raises `UnknownCommand` if the command is not in the list.

@@ -28,10 +28,10 @@ Answer = Callable[[bytes, int], bytes | None]
 
 
 class Emulator(Device, ABC):
-    """SPEC row Emulator. `virtual_context` is a collection of recordings, empty if a simulation replaces it.
+    """The paper's Emulator. `virtual_context` is a collection of recordings, empty if a simulation replaces it.
 
     Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`); recorded
-    signals are read at the emulator's clock and stay (SPEC ruling 3).
+    signals are read at the emulator's clock and stay (paper.md, ruling 3).
     """
 
     def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized) -> None:
@@ -61,7 +61,7 @@ class UnitEmulator(Emulator):
 
 
 class SensorEmulator(UnitEmulator):
-    """SPEC row SensorEmulator: an emulator on RS232, like the sensor that it emulates."""
+    """The paper's SensorEmulator: an emulator on RS232, like the sensor that it emulates."""
 
     wire_types = frozenset({PROTOCOL.RS232})
 
@@ -83,7 +83,7 @@ class EmulatedUnit(ModbusUnit):
     """A unit of an emulated line whose requests pass through the device's own connection.
 
     `kind` is the connection type of the emulated device, even if a different medium carries it now. A request that is not in the
-    command list gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
+    command list gets the protocol's own answer (paper.md, ruling 11), and is counted in `unlisted`.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class EmulatedUnit(ModbusUnit):
 
 @dataclass(frozen=True)
 class EmulatedCommunication(Communication):
-    """SPEC row EmulatedCommunication: the agreement of Communication, with an emulator in place of the device.
+    """The paper's EmulatedCommunication: the agreement of Communication, with an emulator in place of the device.
 
     The connection between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and
     is not used here.

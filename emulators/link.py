@@ -47,14 +47,14 @@ class LinkOptions:
 
 
 class EmulatedConnection(TCPConnection):
-    """SPEC row EmulatedConnection: a Connection that is always of type TCP and also stores the original PROTOCOL.
+    """The paper's EmulatedConnection: a Connection that is always of type TCP and also stores the original PROTOCOL.
 
     `emulate_write` and `emulate_read` are the identity: they return the bytes unchanged, and count them.
     """
 
     def __init__(self, protocol: PROTOCOL) -> None:
         if protocol is PROTOCOL.CAN:
-            raise Bug("CAN is a bus, not a pipe", expected="a software CAN bus (SPEC ruling 13)")
+            raise Bug("CAN is a bus, not a pipe", expected="a software CAN bus (paper.md, ruling 13)")
         super().__init__()
         self.protocol = protocol
         self.written_bytes = 0

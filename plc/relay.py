@@ -1,4 +1,4 @@
-"""The paper's ControlLogic (SPEC part 1), and `Relay`, the PLC program that runs it in a scan.
+"""The paper's ControlLogic, and `Relay`, the PLC program that runs it in a scan.
 
 `ControlLogic` implements the row literally: consumers `sensor` and `transmitter`, producers `response` and `command`, a
 period, a data log and the observatory's state machine. It does not interpret payloads, except for the period in a
@@ -46,7 +46,7 @@ class LogEntry:
 
 class DataLog:
     """The data log: limited in size, ordered, time-stamped. Duplicates are kept; a full log drops its oldest entry
-    (SPEC ruling 2).
+    (paper.md, ruling 2).
 
     `total` counts all entries ever added.
     """
@@ -71,7 +71,7 @@ class DataLog:
 
 
 class ControlLogic:
-    """SPEC row ControlLogic. Init: period 0, log empty, state STANDBY.
+    """The paper's ControlLogic. Init: period 0, log empty, state STANDBY.
 
     `commands` and `responses` count what was relayed, `bad_commands` the received commands that were invalid.
     """
@@ -106,8 +106,8 @@ class ControlLogic:
     def send_cmd(self, now_ns: int) -> None:
         """Drain the transmitter's queue (sendCmd): each command is consumed, sets the period, and is emitted.
 
-        Every valid command is relayed. It is logged if the period that it sets is above 0 (SPEC ruling 1). An invalid command
-        changes nothing and is not relayed: it is counted, and logged if the present period is above 0.
+        Every valid command is relayed. It is logged if the period that it sets is above 0 (paper.md, ruling 1). An invalid
+        command changes nothing and is not relayed: it is counted, and logged if the present period is above 0.
         """
         for command in self.transmitter.drain():
             try:

@@ -1,4 +1,4 @@
-"""The proof of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
+"""The proof of the observatory's relay: the paper's ControlLogic, with rulings 1, 2, 5 and 6 of paper.md.
 
 It covers commands of every sign (-1, 0, 1 and the limits of the type; only the sign matters), invalid commands, scans with and
 without a response, and mailboxes that are emptied or not. The queue and the data log are limited to three entries, so that all

@@ -1,6 +1,6 @@
 """Replays a recorded CANopen node: its object dictionary and its PDO stream, from a log of the bus.
 
-Values are resolved object by object (SPEC ruling 3), so the next client may read in a different order. Uploaded values are
+Values are resolved object by object (paper.md, ruling 3), so the next client may read in a different order. Uploaded values are
 returned in recorded order, one value for each upload of the object. Values that were sent in TPDOs are signals, read at the time
 of the emulator's clock, also by SDO. Values that the recorded client wrote are settings: the node starts with the first recorded
 value and then holds what is written. An object that was only ever refused with an abort is refused again. Block transfers are not

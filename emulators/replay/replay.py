@@ -1,4 +1,4 @@
-"""Replays a recorded Modbus device: SPEC ruling 3.
+"""Replays a recorded Modbus device: paper.md, ruling 3.
 
 Values are resolved cell by cell (unit, table, address, earlier writes), so a client that splits or merges the recorded
 ranges gets the same numbers. Properties of a whole request (an exception, a limit, silence, latency) are kept by the

@@ -1,4 +1,4 @@
-"""The situation of a device: its past writes, on which its recorded answers depend (SPEC ruling 3).
+"""The situation of a device: its past writes, on which its recorded answers depend (paper.md, ruling 3).
 
 A situation is the last value written to each cell of one unit since the recording began. Each situation has a number.
 Recordings are kept by situation. A read uses the present situation or, if nothing was recorded in it, the most similar

@@ -1,1 +1,1 @@
-"""A simulation as virtual context: values from formulas or a Python model, in steps of the emulator's clock (SPEC prose 9)."""
+"""A simulation as virtual context: values from formulas or a Python model, in steps of the emulator's clock."""

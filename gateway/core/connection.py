@@ -1,8 +1,8 @@
 """Connections: the paper's pure stream, and the asynchronous ends that wrap it.
 
-`Connection` follows SPEC's schema exactly: a protocol type and a FIFO of data that is empty after Init, appended to by
+`Connection` follows the paper's schema exactly: a protocol type and a FIFO of data that is empty after Init, appended to by
 `write`, and read from its head. Drivers and devices hold a `ByteConnection` or a `CanConnection`: one end of a duplex
-medium (SPEC ruling 4), whose inbound direction is such a stream. An end of the operating system
+medium (paper.md, ruling 4), whose inbound direction is such a stream. An end of the operating system
 (fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory end differ only in the
 source of their data.
 
@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError
 
 
 class PROTOCOL(Enum):
-    """The paper's PROTOCOL type: the kind of link. CAN is an addition of this project (SPEC ruling 13)."""
+    """The paper's PROTOCOL type: the kind of link. CAN is an addition of this project (paper.md, ruling 13)."""
 
     RS232 = "RS232"
     TCP = "TCP"
@@ -37,7 +37,7 @@ T = TypeVar("T", bytes, CanFrame)
 
 
 class Connection(ABC, Generic[T]):
-    """SPEC row Connection: a typed FIFO that neither loses, changes nor invents data.
+    """The paper's Connection: a typed FIFO that neither loses, changes nor invents data.
 
     Abstract: a device or driver owns an RS232, TCP or CAN connection, never this class.
     """

@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 
 
 class End(Generic[T]):
-    """One end of a duplex medium. Reading returns what the other end wrote, in order (SPEC ruling 4)."""
+    """One end of a duplex medium. Reading returns what the other end wrote, in order (paper.md, ruling 4)."""
 
     __slots__ = ("inbound", "outbound", "read", "type", "write")
 
@@ -39,7 +39,7 @@ def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
 
 
 class Device(ABC):
-    """SPEC row Device. Concrete classes list in `wire_types` the kinds of link to which they may be connected.
+    """The paper's Device. Concrete classes list in `wire_types` the kinds of link to which they may be connected.
 
     `command_list` holds the names of the device's commands and is never empty.
     """
@@ -85,7 +85,7 @@ class Device(ABC):
     def receive(self, now_ns: int) -> RESPONSE:
         """Read a message, execute it and send the response (Receive). A message that is not a command is not answered.
 
-        The connection must not be empty. Raises `UnknownCommand`; the protocol decides what follows (SPEC ruling 11).
+        The connection must not be empty. Raises `UnknownCommand`; the protocol decides what follows (paper.md, ruling 11).
         """
         command = self.recognise(self.connection.read())
         response = self.execute_command(command, now_ns)
@@ -94,20 +94,20 @@ class Device(ABC):
 
 
 class Sensor(Device):
-    """SPEC row Sensor: a device on RS232."""
+    """The paper's Sensor: a device on RS232."""
 
     wire_types = frozenset({PROTOCOL.RS232})
 
 
 class Transmitter(Device):
-    """SPEC row Transmitter: a device on TCP."""
+    """The paper's Transmitter: a device on TCP."""
 
     wire_types = frozenset({PROTOCOL.TCP})
 
 
 @dataclass(frozen=True)
 class Communication:
-    """SPEC row Communication: a driver and a device whose command lists are equal (ruling 12)."""
+    """The paper's Communication: a driver and a device whose command lists are equal (paper.md, ruling 12)."""
 
     name: str
     driver_commands: frozenset[str]

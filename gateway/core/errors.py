@@ -2,7 +2,7 @@
 
 Every error that leaves fieldtwin is a `FieldtwinError`. Foreign exceptions (``OSError``, pymodbus, python-can) are
 translated once, where they arise; code above that place does not catch them. Bad quality is data and never an error
-(SPEC ruling 11): these classes state why a value is missing.
+(paper.md, ruling 11): these classes state why a value is missing.
 
 The class decides the exit code of the command line (docs/explanation/design.md, "Command line contract").
 """
@@ -119,7 +119,7 @@ class FileInvalid(FieldtwinError):
 
 
 class CommandListMismatch(FileInvalid):
-    """The command lists of a driver and its device differ (SPEC row Communication, ruling 12)."""
+    """The command lists of a driver and its device differ (the paper's Communication, paper.md, ruling 12)."""
 
 
 class Bug(FieldtwinError):
@@ -217,7 +217,7 @@ class SdoAborted(DeviceRefused):
 
 
 class UnknownCommand(DeviceRefused):
-    """A command that is not in the device's command list (SPEC row Device)."""
+    """A command that is not in the device's command list (the paper's Device)."""
 
 
 class VerifyFailed(DeviceRefused):

@@ -1,7 +1,7 @@
 """The observatory's state machine, M = (Q, Sigma, delta, q0, F).
 
 Q = {STANDBY, ACTIVE, OFF}, Sigma = Z, q0 = STANDBY, F = {OFF}. delta depends on the sign of the commanded period alone,
-from every state, OFF included (SPEC ruling 6):
+from every state, OFF included (paper.md, ruling 6):
 
     x > 0  ->  ACTIVE   the sensor samples every x seconds
     x = 0  ->  STANDBY  nothing is sampled
@@ -84,7 +84,7 @@ def decode_period(command: COMMAND) -> int:
 
 
 class EventStateMachine:
-    """SPEC row EventStateMachine: Init is STANDBY with period 0; ProcessEvent sets period and state."""
+    """The paper's EventStateMachine: Init is STANDBY with period 0; ProcessEvent sets period and state."""
 
     def __init__(self) -> None:
         self.state: STATE = STATES["STANDBY"]

@@ -1,7 +1,7 @@
 """The paper's DATA types, and a tag's value with its quality.
 
 DATA is a bit sequence (``bytes``); COMMAND and RESPONSE are DATA, MEASUREMENT and STATUS are RESPONSEs, a RECORDING is
-a RESPONSE. All are frozen: received data cannot be changed on the way (SPEC, ControlLogic: "payload unaltered").
+a RESPONSE. All are frozen: received data cannot be changed on the way (the paper's ControlLogic: "payload unaltered").
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class DATA:
 class COMMAND(DATA):
     """A command to a device: its bits, and its name in the device's command list.
 
-    Between the topside controller and the control logic, a command is a period in seconds, signed 16 bit (SPEC ruling
+    Between the topside controller and the control logic, a command is a period in seconds, signed 16 bit (paper.md, ruling
     17), without a name.
     """
 
@@ -42,7 +42,7 @@ class MEASUREMENT(RESPONSE):
 
 @dataclass(frozen=True, slots=True)
 class STATUS(RESPONSE):
-    """The state of a device or system. Carries state and period (SPEC ruling 7)."""
+    """The state of a device or system. Carries state and period (paper.md, ruling 7)."""
 
 
 @dataclass(frozen=True, slots=True)

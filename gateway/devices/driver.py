@@ -1,4 +1,4 @@
-"""SPEC row DeviceDriver: a driver with one concrete connection, an emitter and a consumer.
+"""The paper's DeviceDriver: a driver with one concrete connection, an emitter and a consumer.
 
 Its operation Send consumes a command and writes it; its operation Receive reads a message and emits it. A driver opens no
 connection: the runtime opens it through a Connector and attaches the driver. It uses only the clock that it is given, and
@@ -92,7 +92,7 @@ class DeviceDriver(ABC):
         raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
 
     def behaviour(self, name: str) -> tuple[COMMAND, ...]:
-        """Return the commands that the profile maps to a named behaviour, in the profile's order (SPEC ruling 14).
+        """Return the commands that the profile maps to a named behaviour, in the profile's order (paper.md, ruling 14).
 
         Raises `NotAllowed` for a name that the profile does not have, and otherwise as `command`.
         """

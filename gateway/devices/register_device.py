@@ -401,6 +401,6 @@ class RegisterDriver(DeviceDriver):
 
 
 class SensorDriver(RegisterDriver):
-    """SPEC row SensorDriver: a register device on RS232."""
+    """The paper's SensorDriver: a register device on RS232."""
 
     wire_types = frozenset({PROTOCOL.RS232})

@@ -1,4 +1,4 @@
-"""SPEC row TransmitterDriver: a pure relay between two mailboxes and two queues (SPEC ruling 17).
+"""The paper's TransmitterDriver: a pure relay between two mailboxes and two queues (paper.md, ruling 17).
 
 A mailbox holds one message: sequence, length and payload, in holding registers that are written with one request. The sequence
 that the receiver acknowledges is in a separate register. 0 means empty; sequences run from 1 to 65535 and then start again at 1.

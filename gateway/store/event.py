@@ -104,8 +104,8 @@ class KnowledgeStore(Protocol):
         """Return the origin under which this side of `system` writes: the existing one, or a new one named
         ``name:log``.
 
-        `prototype` is part of the identity of an origin (SPEC ruling 15). `log` distinguishes a new store from an earlier store
-        of the same name.
+        `prototype` is part of the identity of an origin (paper.md, ruling 15). `log` distinguishes a new store from an earlier
+        store of the same name.
         """
         ...
 

@@ -1,8 +1,8 @@
 """The exchange log: the control logic's dataLog, kept in SQLite.
 
-While its period is positive, the PLC logs each exchanged message (SPEC ruling 1) and sends the record through the process image.
-This module stores the records in order, duplicates included. Rows are committed in batches, outside the event loop's critical
-path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are counted.
+While its period is positive, the PLC logs each exchanged message (paper.md, ruling 1) and sends the record through the process
+image. This module stores the records in order, duplicates included. Rows are committed in batches, outside the event loop's
+critical path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are counted.
 """
 
 from __future__ import annotations

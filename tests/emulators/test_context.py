@@ -1,4 +1,4 @@
-"""The virtual context: SPEC row Emulator, and the rulings on order, bounds and the end of a recording."""
+"""The virtual context: the paper's Emulator, and the rulings on order, bounds and the end of a recording."""
 
 from __future__ import annotations
 

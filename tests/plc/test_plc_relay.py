@@ -1,4 +1,4 @@
-"""ControlLogic against SPEC's row and rulings 1, 2, 5, 6, 17; Relay as a program with full mailboxes."""
+"""The paper's ControlLogic with rulings 1, 2, 5, 6, 17; Relay as a program with full mailboxes."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from fieldtwin.twin.model.variables import ModelVariable, Variables
 
 
 class DigitalModel:
-    """SPEC row DigitalModel. Init: STANDBY, period 0, all variables unknown. ProcessEvent is that of the state machine.
+    """The paper's DigitalModel. Init: STANDBY, period 0, all variables unknown. ProcessEvent is that of the state machine.
 
     `declared` holds the system's variables (`fieldtwin.twin.plant.declared`), and `variables` their last reported
     values. Commands and statuses do not change `variables`, and reported values do not change the state.

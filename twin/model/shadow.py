@@ -1,7 +1,7 @@
 """The digital shadow: Monitor and Analyze process the events that arrive from the plant. It has no object through which it
 could send.
 
-It receives from a queue (SPEC ruling 16). Filling that queue, acknowledging events and requesting missing ones is done
+It receives from a queue (paper.md, ruling 16). Filling that queue, acknowledging events and requesting missing ones is done
 outside this module; import contracts keep it free of connections, drivers, transmitters and threads.
 """
 
@@ -26,7 +26,7 @@ VERDICTS = 1000
 
 
 class DigitalShadow:
-    """SPEC row DigitalShadow: its own digital model, thread processes, and a receive-only connection.
+    """The paper's DigitalShadow: its own digital model, thread processes, and a receive-only connection.
 
     `step` runs the stages one after the other on the arrived events. `declared` are the variables of the model, which
     only events change. `verdicts` is a consumer for callers that want to read the verdicts; `decisions` keeps the newest ones.

@@ -1,4 +1,4 @@
-"""A STATUS of the observatory: both the state and the period (SPEC ruling 7), in three bytes.
+"""A STATUS of the observatory: both the state and the period (paper.md, ruling 7), in three bytes.
 
 They are encoded separately, so that a state that does not follow from its period can be detected. Pure.
 """

@@ -20,8 +20,8 @@ KNOWLEDGE = 10_000
 
 
 class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no operations
-    """SPEC row DigitalThreadProcess: shareable knowledge, in order, bounded. A full queue drops its oldest event and
-    counts it (ruling 2).
+    """The paper's DigitalThreadProcess: shareable knowledge, in order, bounded. A full queue drops its oldest event and
+    counts it (paper.md, ruling 2).
     """
 
     side: ClassVar[str] = ""
@@ -84,10 +84,10 @@ class DTDigitalThreadProcess(DigitalThreadProcess):
 
 
 class ReceivingEnd(EventHandler):
-    """A bounded queue of what arrives over a thread (ruling 2).
+    """A bounded queue of what arrives over a thread (paper.md, ruling 2).
 
-    A shadow has no other part of a connection (ruling 16): the sender that polls, acknowledges and requests missing events is
-    created elsewhere.
+    A shadow has no other part of a connection (paper.md, ruling 16): the sender that polls, acknowledges and requests missing
+    events is created elsewhere.
     """
 
     def __init__(self, event: str, capacity: int = KNOWLEDGE) -> None:

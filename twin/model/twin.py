@@ -19,7 +19,7 @@ from fieldtwin.twin.model.variables import ModelVariable
 
 
 class DigitalTwin(DigitalShadow):
-    """SPEC row DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived.
+    """The paper's DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived.
 
     While a prototype is asked about a command, the shadow continues; its findings wait to be planned for.
     """

@@ -285,7 +285,7 @@ def make_drivers(system: System, tags: TagTable, clock: Clock) -> dict[str, Regi
 
 
 class EmbeddedControlSystem:
-    """SPEC row EmbeddedControlSystem: the drivers and the control logic of a system, built from its file alone.
+    """The paper's EmbeddedControlSystem: the drivers and the control logic of a system, built from its file alone.
 
     The plant and its prototype run this same class. It spans two processes, the gateway with the drivers and the PLC
     with the control logic, which share the process image. This class makes the gateway and the configuration of both
@@ -340,10 +340,10 @@ class EmbeddedControlSystem:
 
 
 class PhysicalTwin:
-    """SPEC row PhysicalTwin: sensors, transmitters and the embedded control system.
+    """The paper's PhysicalTwin: sensors, transmitters and the embedded control system.
 
     The devices are external hardware; this class holds their description from the system file. CANopen nodes count as
-    sensors (SPEC ruling 13).
+    sensors (paper.md, ruling 13).
     """
 
     def __init__(self, system: System) -> None:

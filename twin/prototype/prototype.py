@@ -23,8 +23,8 @@ from fieldtwin.twin.site.system import System
 
 
 class DigitalTwinPrototype:
-    """SPEC row DigitalTwinPrototype. Raises `CommandListMismatch` if the command lists of an emulator and its driver
-    differ (ruling 12).
+    """The paper's DigitalTwinPrototype. Raises `CommandListMismatch` if the command lists of an emulator and its driver
+    differ (paper.md, ruling 12).
 
     `ecs` is the physical twin's class, made from the same system file; `model` is a separate instance. `real` names the
     devices that are not emulated, on buses that the prototype file marks `plant`; a complete prototype has none.

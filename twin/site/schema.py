@@ -1,7 +1,6 @@
 """The pydantic models of the YAML form of system files and prototype files.
 
-The plant reads `SystemForm` only. `PrototypeForm` describes a separate file, which the plant never opens (SPEC part 2,
-row 2).
+The plant reads `SystemForm` only. `PrototypeForm` describes a separate file, which the plant never opens.
 """
 
 from __future__ import annotations

@@ -192,7 +192,7 @@ def check_path(path: str, where: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """SPEC row Document: a description of the physical twin, or a document needed to build it. `path` is its path in
+    """The paper's Document: a description of the physical twin, or a document needed to build it. `path` is its path in
     the package.
     """
 
@@ -235,7 +235,7 @@ DOCUMENTS: dict[DocumentKind, type[Document]] = {
 
 
 class DigitalTemplate:
-    """SPEC row DigitalTemplate: documents, the embedded control system, and its own digital model.
+    """The paper's DigitalTemplate: documents, the embedded control system, and its own digital model.
 
     `system` is the system of the package, loaded. Creating this object assembles the control logic, which imports
     Python programs: for an untrusted package, the caller must have asked the user before.

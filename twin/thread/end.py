@@ -1,7 +1,7 @@
 """One side of a thread: a store, a carrier, and the protocol core between them, for as long as the twin runs.
 
 It opens a new link whenever one is lost, sends events from the store to the other side, stores the events that it receives,
-and passes new ones on in order. This class can send; a shadow is given the received events only (SPEC ruling 16).
+and passes new ones on in order. This class can send; a shadow is given the received events only (paper.md, ruling 16).
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class ImageProcess(PTDigitalThreadProcess):
     While a tag's quality stays the same, its new values are shared at most every `every_ms`. States and messages are always
     shared.
 
-    Whether a program runs is a value with the program's name, which is bad when it does not run (SPEC ruling 18). When
+    Whether a program runs is a value with the program's name, which is bad when it does not run (paper.md, ruling 18). When
     the PLC is dead, its last state is no longer a state of the plant, and when the gateway is dead, its values are bad.
     """
 

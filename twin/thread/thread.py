@@ -86,19 +86,19 @@ class ThreadConnection(Generic[P]):
 
 
 class PTtoDTConnection(ThreadConnection[PTDigitalThreadProcess]):
-    """SPEC row PTtoDTConnection: measurements and statuses, to the digital twin."""
+    """The paper's PTtoDTConnection: measurements and statuses, to the digital twin."""
 
     collects = PTDigitalThreadProcess
 
 
 class DTtoPTConnection(ThreadConnection[DTDigitalThreadProcess]):
-    """SPEC row DTtoPTConnection: commands, to the physical twin."""
+    """The paper's DTtoPTConnection: commands, to the physical twin."""
 
     collects = DTDigitalThreadProcess
 
 
 class DigitalThread:
-    """SPEC row DigitalThread: one connection in each direction."""
+    """The paper's DigitalThread: one connection in each direction."""
 
     def __init__(self, pt_data: PTtoDTConnection, dt_data: DTtoPTConnection) -> None:
         if type(pt_data) is not PTtoDTConnection or type(dt_data) is not DTtoPTConnection:

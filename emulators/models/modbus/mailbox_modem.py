@@ -1,4 +1,4 @@
-"""A pair of modems with mailboxes in holding registers, and the link between them (SPEC ruling 17).
+"""A pair of modems with mailboxes in holding registers, and the link between them (paper.md, ruling 17).
 
 Each modem has its own register bank on its own socket: one for the plant, one for the remote side. A message that one side writes
 into its outbox travels over the link and appears in the inbox of the opposite side when that inbox is free. A repeated sequence

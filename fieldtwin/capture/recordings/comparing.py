@@ -1,6 +1,6 @@
 """Compare the behaviour of a device with that of another one or of a recording: outcomes, values and timing.
 
-Fidelity (SPEC part 2 row 10) has two figures. *Values*: the share of exchanges with the same outcome (values inside
+Fidelity has two figures. *Values*: the share of exchanges with the same outcome (values inside
 their tolerance, the same exception, the same silence). *Timing*: the similarity of the two distributions of latency, as
 the mean ratio of their quantiles. Pure and bounded: exchanges come in pairs, differences are kept up to a number and
 only counted beyond it.

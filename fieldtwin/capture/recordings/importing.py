@@ -212,7 +212,7 @@ def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
 
 
 def _of_prototype(capture: Path) -> bool:
-    """Return whether the run of a capture was marked as a prototype's (SPEC ruling 15)."""
+    """Return whether the run of a capture was marked as a prototype's (paper.md, ruling 15)."""
     try:
         with open_input(capture) as file:
             head = json.loads(file.readline(MAX_LINE))

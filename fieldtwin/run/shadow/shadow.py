@@ -1,6 +1,6 @@
 """A running digital shadow: the thread that delivers the plant's observations, the store that keeps them, and the shadow.
 
-The transmitter's side is assembled here, outside of `fieldtwin.twin.model.shadow` (SPEC ruling 16): it acknowledges
+The transmitter's side is assembled here, outside of `fieldtwin.twin.model.shadow` (paper.md, ruling 16): it acknowledges
 events and requests missing ones, and has no log to send.
 """
 
@@ -73,7 +73,7 @@ class Shadowing:
         self.receiving = ReceivingEnd("from the plant")
         self.shadow = self._make(system)
         self.prototypes: set[str] = set()
-        """Origins whose field is emulated (ruling 15)."""
+        """Origins whose field is emulated (paper.md, ruling 15)."""
         self.origins: set[str] = set()
         self._system = system
         self._place = place

@@ -28,7 +28,7 @@ DRAIN_LIMIT_S = 1.0
 
 
 class SerialConnection(ByteConnection):
-    """One end of a serial line (SPEC: an RS232 connection).
+    """One end of a serial line (in the paper, an RS232 connection).
 
     At most `max_pending` chunks of `CHUNK` bytes wait here. Then the port is not read until half of them have been
     taken; meanwhile the operating system's buffer, and then the flow control of the line if it has one, holds the rest.

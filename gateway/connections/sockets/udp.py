@@ -21,7 +21,7 @@ OPEN_TIMEOUT_S = 5.0
 
 
 class UdpConnection(ByteConnection):
-    """One end of an exchange of datagrams (in the SPEC, a TCP connection, since it has no other network connection).
+    """One end of an exchange of datagrams (in the paper, a TCP connection, since it has no other network connection).
 
     Only datagrams of the peer are accepted. At most `max_pending` of them wait here; further ones are dropped and
     counted, as in the network. If boundaries matter, do not use `read_pending`, which joins the waiting datagrams.

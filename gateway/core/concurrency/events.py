@@ -1,6 +1,6 @@
 """The paper's event handlers: one Producer, many Consumers, each with its own bounded queue.
 
-A queue is a bounded FIFO, not a set (SPEC ruling 2): it keeps the order and duplicates; when it overflows, it drops the
+A queue is a bounded FIFO, not a set (paper.md, ruling 2): it keeps the order and duplicates; when it overflows, it drops the
 oldest item and counts it. Everything is synchronous and free of I/O: the owner of a Consumer drains it.
 """
 

@@ -222,7 +222,7 @@ class DeviceProfile:
 
     @property
     def command_list(self) -> frozenset[str]:
-        """Return the commands that a device of this profile accepts (SPEC ruling 12).
+        """Return the commands that a device of this profile accepts (paper.md, ruling 12).
 
         They are ``read_<group>`` for each poll group, the names in `commands`, and ``set_<tag>`` for each writable tag that
         `commands` does not name. A transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.

@@ -71,7 +71,7 @@ class SignalInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
 class RecordingHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
     """The first line: the recorded device, the kind of recording, and its origin.
 
-    `prototype` is true if the recorded device was an emulator (SPEC ruling 15). `start_utc` is ISO 8601, empty if the
+    `prototype` is true if the recorded device was an emulator (paper.md, ruling 15). `start_utc` is ISO 8601, empty if the
     date of the start is not known. `profile_hash` is that of the device profile in use, empty if there was none.
     """
 

@@ -1,4 +1,4 @@
-"""Recorded Modbus devices that are replayed (SPEC ruling 3), against a device simulated in a few lines here."""
+"""Recorded Modbus devices that are replayed (paper.md, ruling 3), against a device simulated in a few lines here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pure stream of SPEC row Connection, and the asynchronous end around it."""
+"""The pure stream of the paper's Connection, and the asynchronous end around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The transmitter's driver against emulated modems and the link between them: no loss, no duplicates (SPEC ruling 17)."""
+"""The transmitter's driver against emulated modems and the link between them: no loss, no duplicates (paper.md, ruling 17)."""
 
 from __future__ import annotations
 

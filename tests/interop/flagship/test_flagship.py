@@ -1,4 +1,4 @@
-"""SPEC part 2, row 1: the driver cannot distinguish an emulator from the device.
+"""The driver cannot distinguish an emulator from the device.
 
 The same drivers and the same observatory.yaml run against two targets: our emulators, and independent implementations of the
 same devices (libmodbus, a socket that answers from a table of bytes, python-can). Both conversations are captured and compared

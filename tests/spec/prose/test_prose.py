@@ -1,4 +1,4 @@
-"""SPEC part 2, rows 2, 3 and 11, and a plant without emulators: whole runs of `fieldtwin`, observed from outside."""
+"""The paper's statements about prototypes, and a plant without emulators: whole runs of `fieldtwin`, observed from outside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SPEC part 2, rows 1 and 4 to 10, each on a small scale; tests/interop and tests/system test them with whole runs."""
+"""The paper's statements about twins, each on a small scale; tests/interop and tests/system test them with whole runs."""
 
 from __future__ import annotations
 

@@ -193,7 +193,7 @@ def test_a_new_twin_with_an_empty_store_gets_the_events_of_the_first_one(tmp_pat
 
 @pytest.mark.parametrize("over", ["tcp", "modems"])
 def test_towards_the_plant_a_shadow_sends_only_acknowledgements_and_requests(tmp_path: Path, over: str) -> None:
-    """SPEC ruling 16: a capture holds no COMMAND and nothing of DTtoPT, despite losses and deaths."""
+    """paper.md, ruling 16: a capture holds no COMMAND and nothing of DTtoPT, despite losses and deaths."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         sent: list[Frame] = []

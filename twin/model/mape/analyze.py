@@ -31,7 +31,7 @@ was started. Both are counted, and left out of the lag and the rate.
 
 
 class Analyze(DTDigitalThreadProcess):
-    """SPEC row Analyze. Compares values with the limits of the model's variables.
+    """The paper's Analyze. Compares values with the limits of the model's variables.
 
     A tag that is not reported for `stale_after_ms` is stale. Every status gets a verdict. For a tag only changes are emitted:
     outside its limits and inside again, bad and good, stale and fresh. A change that first arrived as history is emitted again as

@@ -1,7 +1,7 @@
 """Execute: the last stage. It checks each command against the digital model, and sends only what the model accepts.
 
 If configured, it also asks a prototype. That takes time but blocks nothing: later commands stay in the queue meanwhile. No user
-is involved. A refusal becomes an event with its reason (SPEC ruling 9).
+is involved. A refusal becomes an event with its reason (paper.md, ruling 9).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class CommandCheck:
 
 
 class Execute(DTDigitalThreadProcess):
-    """SPEC row Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
+    """The paper's Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
 
     `what_if` answers the question of each command, by simulation; the default `question` applies if the planner gives none.
     The command is sent only after an answer without an objection. `decisions` records the outcomes.

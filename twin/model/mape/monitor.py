@@ -21,7 +21,7 @@ CAPACITY = 10_000
 
 
 class Monitor(DTDigitalThreadProcess):
-    """SPEC row Monitor: it updates the twin's model. `statuses` and `measurements` are its consumers, `emitter` its producer."""
+    """The paper's Monitor: it consumes `statuses` and `measurements`, updates the twin's model, and produces for `emitter`."""
 
     def __init__(self, model: DigitalModel, clock: Clock) -> None:
         super().__init__("monitor", clock)

@@ -83,7 +83,7 @@ class RulePlanner:
 
 
 class Plan(DTDigitalThreadProcess):
-    """SPEC row Plan: consume, Planning, emit.
+    """The paper's Plan: consume, Planning, emit.
 
     `take` consumes findings, and `plan_next` plans for the first of them. Findings may wait while a prototype is asked
     about a command; `overtaken` counts the findings that `only_newest` dropped because a newer finding superseded them.

@@ -1,8 +1,8 @@
 """Upkeep: keeps the digital model's variables up to date with what the plant reports.
 
-The Monitor does not change the model when a measurement arrives; it passes the measurement on to its subscribers (SPEC
-row Monitor). Upkeep is such a subscriber, as a database is. So every received measurement updates the model (SPEC prose, row
-5). This module must never depend on a connection, or on code that can send a command.
+The Monitor does not change the model when a measurement arrives; it passes the measurement on to its subscribers,
+as the paper's Monitor does. Upkeep is such a subscriber, as a database is. So every received measurement updates the
+model. This module must never depend on a connection, or on code that can send a command.
 """
 
 from __future__ import annotations

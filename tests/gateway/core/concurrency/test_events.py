@@ -1,4 +1,4 @@
-"""Producer and Consumer: every event, to all consumers, in order, bounded (SPEC rows EventHandler to Consumer)."""
+"""Producer and Consumer: every event, to all consumers, in order, bounded (the paper's EventHandler, Producer and Consumer)."""
 
 from __future__ import annotations
 

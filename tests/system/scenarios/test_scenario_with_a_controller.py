@@ -120,7 +120,7 @@ def test_a_scenario_about_our_gateway_is_skipped_with_the_reason(site: Path) -> 
     code, (result,), _ = judged(site, str(site / "ours.scenario.yaml"), "--json", "--with", "--", *controller(site))
     assert code == 1
     assert result["verdict"] == "skipped"
-    assert "idle.high, tank.level: fieldtwin's own gateway and PLC publish that" in result["reason"]
+    assert "the scenario reads idle.high, tank.level, which fieldtwin's own gateway and PLC publish" in result["reason"]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The wall clock, the only module of the gateway that imports ``time``, and the event loop whose waits end on time."""
+"""The wall clock, and an event loop with precise waits. This is the only module of the gateway that imports ``time``."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def precise_loop() -> asyncio.AbstractEventLoop:
     """Return asyncio's event loop with waits that end within some 20 us; on systems other than Linux, its usual loop.
 
     epoll counts in milliseconds, so asyncio is up to one millisecond late each time: a silence of 3.5 characters at
-    19200 baud, 2 ms, takes half as long again.
+    19200 baud would take 3 ms instead of 2 ms.
     """
     selector = TimerSelector.make() if sys.platform.startswith("linux") else None
     return asyncio.SelectorEventLoop(selector)
@@ -88,8 +88,8 @@ if sys.platform.startswith("linux"):
             """Select as the base class does; a wait never ends early, and ends at most a millisecond late if the timer
             fails.
 
-            Waking up takes a computer some 50 us. So the timer expires that much earlier, and the rest of the wait is
-            spent polling the descriptors without waiting. That is at most a twentieth of a wait.
+            Waking up a process takes some 50 us. So the timer expires up to `LEAD_NS` earlier, and the rest of the wait is spent
+            polling the descriptors without waiting. That is at most a twentieth of a wait.
             """
             if timeout is None or timeout <= 0:
                 return super().select(timeout)

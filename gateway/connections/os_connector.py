@@ -1,6 +1,7 @@
-"""The plant's `Connector`: it opens the serial port, socket or CAN bus that an endpoint names.
+"""The `Connector` for the real plant: it opens the serial port, socket or CAN bus that an endpoint names.
 
-This module must not know that a simulation exists. A wrapper around the connector may map an endpoint to that of an emulator.
+This module must not know that a simulation exists. A wrapper around this connector may replace the endpoint of a device by that
+of its emulator.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ class OsConnector(Connector):
     """
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open one of `BYTE_SCHEMES`. Raises the errors of `Connector`.
+        """Open an endpoint whose scheme is one of `BYTE_SCHEMES`. Raises the errors of `Connector`.
 
-        The link of a virtual serial port whose program was killed is not followed: it may lead to a foreign terminal.
+        A link to a virtual serial port is not followed if the program that made it was killed: the link may then lead to another
+        program's terminal.
         """
         match endpoint.scheme:
             case "rtu" | "ascii":

@@ -1,7 +1,7 @@
 """The interface ``fieldtwin`` of python-can: a node on the software CAN bus, for any program that uses python-can.
 
 ``python -m can.logger -i fieldtwin -c HOST:PORT``, ``canopen.Network.connect(interface="fieldtwin", channel=...)``. The entry
-point in pyproject.toml names this module. The gateway itself joins the bus with `can.soft_bus`.
+point in pyproject.toml registers this module with python-can. The gateway itself joins the bus with `can.soft_bus`.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ SEND_BUFFER_BYTES = 8 * 1024
 class SoftBus(can.BusABC):
     """The class for python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
 
-    `bitrate` (bit/s) is checked against the bus's; 0 accepts any. With `fd` it also sends and receives CAN FD frames,
-    and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames are received, with
-    ``is_rx`` false, after they were sent on the bus. Time stamps are seconds since 1970, from the bus's exact end of
-    frame. `recv` takes exactly one record from the socket, so its descriptor stays readable while more records wait; `fileno`
-    serves `can.Notifier` with a loop. Errors are those of python-can: `CanInitializationError` if the bus cannot be
-    joined, `CanOperationError` if it is gone, `CanTimeoutError` if it accepts no more frames.
+    `bitrate` (bit/s) is checked against the bus's; 0 accepts any. With `fd` it also sends and receives CAN FD frames, and
+    `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames are received, with ``is_rx`` false,
+    after they were sent on the bus. Time stamps are seconds since 1970, and mark the exact end of the frame on the bus. `recv`
+    takes exactly one record from the socket, so its descriptor stays readable while more records wait; `fileno` serves
+    `can.Notifier` with a loop. Errors are those of python-can: `CanInitializationError` if the bus cannot be joined,
+    `CanOperationError` if it is gone, `CanTimeoutError` if it accepts no more frames.
 
     Error frames have the layout of the kernel's interface and pass all filters. They are received when this node's
     controller becomes error-passive, bus-off or active again, and when frames for it were lost; with `bus_errors` also
     for each error on the bus.
 
-    A program that requests its own messages and never receives them is held back by the bus.
+    If a program requests its own messages but does not read them, the bus stops accepting frames from it.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class SoftBus(can.BusABC):
         )
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Pass `msg` to the bus, waiting up to `timeout` seconds while it accepts no more (None: without a limit)."""
+        """Pass `msg` to the bus, waiting at most `timeout` seconds while the bus accepts no frames (None: without a limit)."""
         if msg.is_fd and not self._fd:
             raise can.CanOperationError("a CAN FD frame needs an interface that was opened with fd=True")
         record = pack_record(_frame_of(msg), fd=self._fd)
@@ -192,7 +192,7 @@ class SoftBus(can.BusABC):
                 raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
 
     def shutdown(self) -> None:
-        """Leave the bus after it has taken the frames sent (waiting at most `CLOSE_TIMEOUT_S`). A second call does nothing."""
+        """Leave the bus after it has accepted the frames sent (waiting at most `CLOSE_TIMEOUT_S`). A second call does nothing."""
         if self._is_shutdown:
             return
         super().shutdown()

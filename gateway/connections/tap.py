@@ -46,7 +46,7 @@ class TappedConnector(Connector):
 
 
 class _Observers:
-    """The taps of a connector, and their clock."""
+    """The taps of a connector, and the clock that time-stamps what they receive."""
 
     def __init__(self, taps: Sequence[Tap], clock: Clock) -> None:
         self._taps = tuple(taps)
@@ -79,7 +79,7 @@ class _Observers:
 
 
 class _TappedBytes(ByteConnection):
-    """A byte connection that reports its calls to the taps. It shares the stream object of the inner connection."""
+    """A byte connection that reports received and sent chunks to the taps. It shares the inner connection's stream object."""
 
     def __init__(self, inner: ByteConnection, endpoint: Endpoint, observers: _Observers) -> None:
         super().__init__(inner.inbound, endpoint, inner.max_pending)
@@ -124,9 +124,9 @@ class _TappedBytes(ByteConnection):
 
 
 class _TappedCan(CanConnection):
-    """A CAN connection that reports its calls to the taps.
+    """A CAN connection that reports received and sent frames to the taps.
 
-    Frames that an overrun dropped are not reported; the inner end counts them.
+    Frames that an overrun dropped are not reported; the inner connection counts them.
     """
 
     def __init__(self, inner: CanConnection, endpoint: Endpoint, observers: _Observers) -> None:
@@ -177,7 +177,7 @@ class _TappedCan(CanConnection):
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """One chunk or frame, as a tap received it."""
+    """One chunk or frame, as a tap received it, with its time, endpoint and direction."""
 
     t_ns: int
     endpoint: Endpoint
@@ -250,8 +250,9 @@ class TapFile(Tap):
         self._write(line)
 
     def on_refusal(self, refusal: Mapping[str, object]) -> None:
-        """Record, with its ``t_ns``, a write that was refused before it reached its device: part of the run's history, though not
-        traffic.
+        """Append a line for a write that was refused before it reached its device. `refusal` holds the time as ``t_ns``.
+
+        A refused write is part of the run's history, although no bytes were sent.
         """
         self._write({"t_ns": refusal["t_ns"], "refused": dict(refusal)})
 

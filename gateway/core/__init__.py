@@ -1,1 +1,1 @@
-"""The vocabulary of all packages: values, errors, endpoints, connections, clocks. Pure: no I/O."""
+"""The basic types that all packages use: values, errors, endpoints, connections, clocks, files."""

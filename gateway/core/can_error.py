@@ -3,7 +3,7 @@
 Such an error frame is never sent on the bus: the controller passes it to its own node. The identifier holds class bits.
 Of the 8 data bytes, byte 1 holds the controller's state, byte 2 the kind of violation, and bytes 6 and 7 the transmit
 and receive error counters. python-can, candump and the kernel's interfaces use the same layout, so a node needs no
-second format for the software bus. How a node reacts to an error frame is decided elsewhere.
+second format for the software CAN bus. This module only packs and reads error frames; it does not act on them.
 """
 
 from __future__ import annotations

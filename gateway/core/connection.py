@@ -1,13 +1,13 @@
-"""Connections: the paper's pure stream, and the asynchronous ends that wrap it.
+"""Connections: the data stream of the paper (docs/explanation/paper.md), and the asynchronous connection ends that contain it.
 
 `Connection` follows the paper's schema exactly: a protocol type and a FIFO of data that is empty after Init, appended to by
 `write`, and read from its head. Drivers and devices hold a `ByteConnection` or a `CanConnection`: one end of a duplex
-medium (paper.md, ruling 4), whose inbound direction is such a stream. An end of the operating system
-(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory end differ only in the
-source of their data.
+medium (paper.md, ruling 4), whose inbound direction is such a stream. The ends for ports and sockets of the operating
+system (fieldtwin.gateway.connections), the ends for emulators (fieldtwin.emulators.endpoints) and ends in memory differ only in
+the source of their data.
 
-Only a `Connector` opens a port, socket or bus. The runtime receives a `Connector`, and no driver knows which kind it
-uses.
+Only a `Connector` opens a port, socket or bus. The runtime is given a `Connector`, and a driver does not know whether
+it leads to a real device or to an emulator.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ class CANConnection(Connection[CanFrame]):
 
 
 class _End(Generic[T]):
-    """The inbound half of an asynchronous end: the receiver calls `feed`, the consumer awaits `_next`.
+    """The inbound half of a connection end: the code that receives from the medium calls `feed`, and the reader awaits `_next`.
 
-    At most `max_pending` items wait. `feed` returns False when that limit is reached, and the receiver then stops reading from
-    the operating system. `on_room` is called when another item fits.
+    At most `max_pending` items wait. `feed` returns False when that limit is reached, and the caller of `feed` then stops reading
+    from the operating system. `on_room` is called when there is room for another item.
     """
 
     def __init__(self, inbound: Connection[T], endpoint: Endpoint, max_pending: int) -> None:
@@ -91,8 +91,8 @@ class _End(Generic[T]):
         self.endpoint = endpoint
         self.max_pending = max_pending
         self.on_arrival: Callable[[T], None] | None = None
-        """A function that is called with every item when it arrives, whether or not it is read later (a tap). It must not
-        feed, read or raise.
+        """A function (such as a tap) that is called with every item when it arrives, whether or not the item is read later. It
+        must not call `feed`, read from the connection, or raise.
         """
         self.intercept: Callable[[T], bool] | None = None
         """A function that is called with each item before any other code sees it. It returns True if it took the item, and may
@@ -134,8 +134,8 @@ class _End(Generic[T]):
         """Resume reading from the medium if it was paused. Called after a consumer took an item."""
 
     def _loss(self) -> FieldtwinError:
-        """Return a new error with the reason. Each `raise` needs a new error, because a reused one collects tracebacks and
-        locations.
+        """Return a new error with the reason why the connection ended. Each `raise` needs a new error, because a reused one
+        collects tracebacks and locations.
         """
         kept = self._lost or closed_locally(self.endpoint)
         fresh = type(kept).__new__(type(kept))
@@ -180,7 +180,7 @@ class _End(Generic[T]):
         return item
 
     def _waits(self, waiter: asyncio.Future[None]) -> asyncio.Future[None]:
-        """Complete `waiter` when an item arrives or the medium is gone. Raises if the medium is already gone."""
+        """Register `waiter`, which completes when an item arrives or the medium is lost. Raises if it is already lost."""
         if self._lost is not None:
             raise self._loss()
         if self._waiter is not None:
@@ -246,7 +246,7 @@ class Client(ByteConnection):
 
 
 class Clients(Protocol):
-    """A listener, the clients that it accepted, oldest first, and counts of the clients that it did not accept."""
+    """The interface of a listener: its accepted clients, oldest first, and counts of the clients that it did not accept."""
 
     accepted: int
     evicted: int
@@ -256,7 +256,7 @@ class Clients(Protocol):
 
     @property
     def bound(self) -> Endpoint:
-        """Return the endpoint with the port that is actually listened on."""
+        """Return the endpoint with the actual port, which matters if port 0 was requested."""
         ...
 
     @property
@@ -313,7 +313,7 @@ class CanConnection(_End[CanFrame], ABC):
 
 
 class Connector(Protocol):
-    """Open a connection to an endpoint. Nothing else opens ports, sockets or buses.
+    """The interface that opens connections to endpoints. No other code opens ports, sockets or buses of devices.
 
     Raises `Unreachable` (or `EndpointBusy`) if the endpoint does not answer, and `UsageError` if this connector does
     not know its kind.
@@ -338,7 +338,7 @@ class Direction(Enum):
 class Tap(Protocol):
     """An observer of the traffic of a Connector (recorder, capture). It must not change, delay or drop anything.
 
-    `t_ns` is monotonic. `endpoint` is the endpoint in the plant, even if it is mapped to a different one.
+    `t_ns` is monotonic. `endpoint` is the device's endpoint in the plant, even if the connection leads to an emulator.
     """
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None: ...
@@ -347,5 +347,5 @@ class Tap(Protocol):
 
 
 def closed_locally(endpoint: Endpoint) -> ConnectionLost:
-    """Return the reason that `read` gives after a local `aclose`."""
+    """Return the error that `read` raises after the local side has called `aclose`."""
     return ConnectionLost("the connection was closed on this side", where=str(endpoint))

@@ -36,8 +36,8 @@ MAX_CLIENTS = 64
 LINE_WITHIN_S = 10.0
 """Time limit in seconds for a request that has begun to arrive, and for a client that has to send a token.
 
-After it, the client is dropped. Without this limit, clients that send nothing, or one byte at a time, would take every
-place.
+After it, the client is dropped. Without this limit, clients that send nothing, or one byte at a time, would occupy
+all connections.
 """
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -170,7 +170,7 @@ async def _read_line(reader: asyncio.StreamReader, until_s: float | None) -> byt
 
 
 def _parse(line: bytes) -> dict[str, Any]:
-    """Return the parsed request. Raises `UsageError` for a malformed one: a client's input is never reported as a bug
+    """Return the parsed request. Raises `UsageError` for a malformed request, because invalid input from a client is not a bug
     of fieldtwin.
     """
     try:
@@ -234,7 +234,7 @@ class ControlClient:
 
     @classmethod
     async def connect_unix(cls, path: Path) -> ControlClient:
-        """Connect to a process on this host. Raises `Unreachable` if it does not run."""
+        """Connect to a process on this host. Raises `Unreachable` if the process does not run."""
         try:
             reader, writer = await asyncio.open_unix_connection(str(path), limit=MAX_LINE)
         except OSError as e:

@@ -1,8 +1,8 @@
-"""The paper's Device: the remote end of a connection, and the agreement between it and its driver.
+"""The Device of docs/explanation/paper.md, and the check that a device and its driver have equal command lists.
 
-Pure. A device holds one end of a link of a concrete kind, has a command list, and answers each command that it reads
-with one response. It knows no driver, no clock (it is passed `now_ns`) and no framing: an item of its connection is a
-whole message. This module does not know drivers; they are in fieldtwin.gateway.devices.driver.
+A device holds one end of a link of a concrete kind, has a command list, and answers each command that it reads with one
+response. It uses no I/O, no clock (it is passed `now_ns`) and no framing: an item of its connection is a whole message. This
+module does not know drivers; they are in fieldtwin.gateway.devices.driver.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class End(Generic[T]):
         self.outbound: Connection[T] = outbound
         self.type = inbound.type
         self.write: Callable[[T], None] = outbound.write
-        """Sends to the other end."""
+        """A function that sends an item to the other end."""
         self.read: Callable[[], T] = inbound.read
-        """Takes the oldest item that the other end sent. There must be one."""
+        """A function that takes the oldest item that the other end sent. There must be one."""
 
 
 def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
@@ -63,12 +63,12 @@ class Device(ABC):
 
     @abstractmethod
     def _execute(self, command: COMMAND, now_ns: int) -> RESPONSE:
-        """Carry out a command of the list."""
+        """Carry out a command of the command list and return the response."""
 
     def execute_command(self, command: COMMAND, now_ns: int) -> RESPONSE:
         """Execute `command` and return the response (ExecuteCommand).
 
-        Raises `UnknownCommand` and does nothing if the list lacks it.
+        Raises `UnknownCommand` and does nothing if the command is not in the command list.
         """
         if command.name not in self.command_list:
             raise UnknownCommand(
@@ -85,7 +85,8 @@ class Device(ABC):
     def receive(self, now_ns: int) -> RESPONSE:
         """Read a message, execute it and send the response (Receive). A message that is not a command is not answered.
 
-        The connection must not be empty. Raises `UnknownCommand`; the protocol decides what follows (paper.md, ruling 11).
+        The connection must not be empty. Raises `UnknownCommand`; the protocol defines how the device then reacts (paper.md,
+        ruling 11).
         """
         command = self.recognise(self.connection.read())
         response = self.execute_command(command, now_ns)
@@ -114,7 +115,7 @@ class Communication:
     device_commands: frozenset[str]
 
     def check(self) -> None:
-        """Raise `CommandListMismatch` with the names that only one side has, unless the lists are equal."""
+        """Raise `CommandListMismatch`, with the commands that only one list contains, unless the lists are equal."""
         if self.driver_commands == self.device_commands:
             return
         only_driver = ", ".join(sorted(self.driver_commands - self.device_commands)) or "nothing"

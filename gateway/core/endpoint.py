@@ -17,7 +17,7 @@ A serial port also accepts ``rs485=1``: the driver switches the transceiver's di
 ``silence_us=1000``: the silence before a request, in microseconds. An endpoint names the files that hold secrets and
 never contains the secrets, because endpoints appear in messages, logs and reports.
 
-Pure text handling: this module opens nothing and knows no operating system.
+This module only handles text: it opens nothing and does not depend on the operating system.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _bracketed(host: str) -> str:
 
 
 def _check_params(endpoint: Endpoint) -> None:
-    """Refuse repeated, invalid and misspelt parameters here, before the port is opened."""
+    """Raise `UsageError` for repeated, invalid and misspelt parameters, before the port is opened."""
     names = [name for name, _ in endpoint.params]
     for name in names:
         if names.count(name) > 1:

@@ -1,8 +1,8 @@
-"""The tree of errors. Each names who is to blame, what was expected, what was received, where, and what to do.
+"""The error classes. An error names the part that has to be corrected, what was expected and received, where, and what to do.
 
-Every error that leaves fieldtwin is a `FieldtwinError`. Foreign exceptions (``OSError``, pymodbus, python-can) are
-translated once, where they arise; code above that place does not catch them. Bad quality is data and never an error
-(paper.md, ruling 11): these classes state why a value is missing.
+Every error that fieldtwin raises to its callers is a `FieldtwinError`. Exceptions of the operating system and of libraries
+(``OSError``, pymodbus, python-can) are translated once, where they arise; the calling code does not catch them. A value of
+bad quality is data and never an error (paper.md, ruling 11): these classes state why a value is missing.
 
 The class decides the exit code of the command line (docs/explanation/design.md, "Command line contract").
 """
@@ -59,7 +59,7 @@ class FieldtwinError(Exception):
         return escape_controls(f"{text} ({self.hint})" if self.hint else text)
 
     def at(self, where: str) -> FieldtwinError:
-        """Put `where` in front of the known location and return this error, for ``raise e.at(...)``."""
+        """Put `where` in front of the location that this error already names, and return this error, for ``raise e.at(...)``."""
         self.where = f"{where}: {self.where}" if self.where else where
         return self
 
@@ -154,7 +154,7 @@ class WireError(FieldtwinError):
 
 
 class ReplyTimeout(WireError):
-    """No possible reply arrived in time."""
+    """No frame that could be the reply arrived in time."""
 
 
 class CrcError(WireError):

@@ -1,4 +1,4 @@
-"""Make foreign text safe for a terminal: characters that would move the cursor or change colours are escaped."""
+"""Make text from files and devices safe for a terminal: escape characters that would move the cursor or change colours."""
 
 from __future__ import annotations
 

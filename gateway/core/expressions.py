@@ -1,9 +1,9 @@
 """The language of expressions: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``, ``demand - speed * dt / 0.8``.
 
 It is a part of Python's expressions, read by Python's parser; no code is ever executed. A time such as ``1.5 s`` is a number
-of seconds. Two domains evaluate it: conditions of scenarios, invariants and what-if questions, where a value may be unknown or
+of seconds. Two modules evaluate it: conditions of scenarios, invariants and what-if questions, where a value may be unknown or
 a text (`fieldtwin.scenarios.language.expression`), and formulas of simulations, which are compiled, with floats only
-(`fieldtwin.emulators.simulation.formula`). This module knows no names, except those of functions of numbers.
+(`fieldtwin.emulators.simulation.formula`). The only names that this module knows are those of the functions of numbers.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ class Parsed:
     def error(
         self, message: str, node: ast.expr, *, expected: str = "", got: str = "", hint: str = ""
     ) -> NotUnderstood:
-        """Return an error at the position of a node. Python's parser counts bytes of UTF-8."""
+        """Return an error at the position of `node`, converted to characters, since Python's parser counts bytes of UTF-8."""
         at = self._column(len(self._plain.encode()[: node.col_offset].decode(errors="ignore")))
         return NotUnderstood(message, at, expected=expected, got=got, hint=hint)
 
     def _column(self, at: int) -> int:
-        """Return the position in `text` that corresponds to character `at` of the text given to Python's parser."""
+        """Return the position in `text` that corresponds to character `at` of the modified text given to Python's parser."""
         grown = 0
         for match in _TOKEN.finditer(self.text, self._lead):
             begins = match.start() - self._lead + grown

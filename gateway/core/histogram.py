@@ -1,4 +1,4 @@
-"""A histogram of durations, whose memory does not grow with their number. This module does not know what is measured."""
+"""A histogram of durations, whose memory does not grow with their number. It does not depend on what is measured."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FINE_NS = (
         for part in range(_PER_DOUBLING)
     ),
 )
-"""32 buckets per power of two: a percentile is at most 1/32 above the true value."""
+"""Upper limits in ns with 32 buckets per power of two: a percentile is at most 1/32 above the true value."""
 
 _SHOWN_NS = tuple(digit * 10**power for power in range(2, 12) for digit in (1, 2, 5))
 """The limits that `Histogram.buckets_us` shows, from 0.1 us to 500 s; the last one has all longer durations."""
@@ -36,7 +36,7 @@ class Histogram:
     """
 
     def __init__(self, limits_ns: Sequence[int] = _FINE_NS, recent: int = 0) -> None:
-        """`recent` is the number of latest durations that `recent_longest_ns` covers."""
+        """Create an empty histogram. `recent` is the number of latest durations that `recent_longest_ns` covers."""
         self.limits_ns = limits_ns
         self.counts = [0] * (len(limits_ns) + 1)
         self.count = self.min_ns = self.max_ns = self.total_ns = 0

@@ -1,14 +1,14 @@
-"""The observatory's state machine, M = (Q, Sigma, delta, q0, F).
+"""The paper's state machine for an ocean observatory, M = (Q, Sigma, delta, q0, F).
 
 Q = {STANDBY, ACTIVE, OFF}, Sigma = Z, q0 = STANDBY, F = {OFF}. delta depends on the sign of the commanded period alone,
-from every state, OFF included (paper.md, ruling 6):
+from every state, OFF included (docs/explanation/paper.md, ruling 6):
 
     x > 0  ->  ACTIVE   the sensor samples every x seconds
     x = 0  ->  STANDBY  nothing is sampled
-    x < 0  ->  OFF      nothing is sampled; accepting for analysis, not absorbing
+    x < 0  ->  OFF      nothing is sampled; an accepting state, but commands can leave it again
 
-Pure: no time, no I/O, no connection to the plant. The control logic, the digital model and every twin each hold one
-instance.
+This module uses no clock and no I/O, and is not connected to the plant. The control logic, the digital model and every twin each
+hold one instance.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PERIOD_MIN, PERIOD_MAX = -32768, 32767
 
 
 class STATE(ABC):
-    """A state; `execute` says whether the sensor samples in it."""
+    """A state of the machine; `execute` returns the sampling period in this state."""
 
     name: str
 
@@ -62,7 +62,7 @@ ACCEPTING = frozenset({"OFF"})
 
 
 def delta(period_s: int) -> STATE:
-    """Return the state that follows a period command. Only the sign of the period counts, and every period is valid."""
+    """Return the state after a command with this period in seconds. Only its sign counts, and every period is valid."""
     if period_s > 0:
         return STATES["ACTIVE"]
     return STATES["STANDBY"] if period_s == 0 else STATES["OFF"]

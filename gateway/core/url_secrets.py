@@ -1,7 +1,7 @@
 """Find passwords in URLs, to refuse them or to hide them in messages and logs.
 
 A URL appears on command lines, in files that are shared, and in messages; a password belongs in the environment or in a
-separate file. Pure text handling.
+separate file. This module only handles text.
 """
 
 from __future__ import annotations

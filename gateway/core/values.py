@@ -1,4 +1,4 @@
-"""The paper's DATA types, and a tag's value with its quality.
+"""The paper's DATA types (docs/explanation/paper.md), and a tag's value with its quality.
 
 DATA is a bit sequence (``bytes``); COMMAND and RESPONSE are DATA, MEASUREMENT and STATUS are RESPONSEs, a RECORDING is
 a RESPONSE. All are frozen: received data cannot be changed on the way (the paper's ControlLogic: "payload unaltered").
@@ -14,7 +14,7 @@ import msgspec
 
 @dataclass(frozen=True, slots=True)
 class DATA:
-    """A bit sequence."""
+    """A bit sequence; `data` holds its bytes."""
 
     data: bytes
 

@@ -1,1 +1,1 @@
-"""Device drivers: a profile and a protocol client become tags."""
+"""Device drivers: each reads and writes one device as its profile describes, and publishes the values as tags."""

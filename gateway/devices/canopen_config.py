@@ -1,4 +1,4 @@
-"""The CANopen configuration without addresses: what the master of a bus produces, and how a node is booted."""
+"""CANopen settings of buses and nodes: the SYNC and TIME that the master produces, and how a node is booted."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CanopenNodeConfig:
 
     `identity` is the expected identity, and `configuration` the configuration that the node has to hold, from the DCF `dcf`.
     `lss` is the LSS address by which the node gets its node ID if no node on the bus has that ID. `tpdos` are the TPDOs of the
-    DCF; None if `adopt_tpdos` asks to read them from the node, or if nothing is configured. `rpdos` and `adopt_rpdos` are the
+    DCF; None if they are read from the node (`adopt_tpdos`), or if nothing is configured. `rpdos` and `adopt_rpdos` are the
     same for RPDOs, and `rpdo1` is the configuration for RPDO1. `sdo_transfer_s` replaces the limit of the bus for this node
     unless it is None.
     """

@@ -1,9 +1,9 @@
 """The driver of a CANopen node: identity, configuration over SDO, values from TPDOs, state from the heartbeat.
 
 The node's values are good while its TPDOs arrive and it is OPERATIONAL; a lost heartbeat makes them bad immediately. If
-writing is not allowed, the driver configures and starts nothing: it reads the PDO mapping from the node and listens.
-The driver writes nothing at all to a node whose identity is not the expected one. An output goes by RPDO if one of the
-node's RPDOs carries it and may be sent, otherwise by SDO.
+writing is not allowed, the driver neither configures nor starts the node: it only reads the PDO mapping and receives TPDOs.
+The driver writes nothing at all to a node whose identity is not the expected one. An output is sent by RPDO if one of
+the node's RPDOs carries it and the gateway may send that RPDO, otherwise by SDO.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ NMT_COMMANDS = {
 
 @dataclass(slots=True)
 class TpdoSeen:
-    """A TPDO of the node that the driver listens to. `frames` counts its frames since it was mapped; 0 means that the
-    node never sent it.
+    """A TPDO of the node that the driver receives. `frames` counts its frames since the driver began to receive it; 0 means that
+    the node has not sent it since then.
 
     `puts` holds the tags of its entries with their full names, and None for an entry that is not a tag of the profile.
     It is built with the first frame, and again after the profile changed.
@@ -92,7 +92,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def message_tag(self) -> str | None:
-        """Return None: a node emits no messages to which a program could be bound."""
+        """Return None, because a CANopen node emits no messages that a PLC program could receive."""
         return None
 
     @property
@@ -109,7 +109,7 @@ class CanopenDriver(DeviceDriver):
             seen.puts = None
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """Return the value of a tag's stored bytes, decoded with the present configuration."""
+        """Return the value of a tag, decoded with the present configuration from the bytes in `held`. `of` is not used."""
         return decode_little(self.profile.tags[tag_name], held.raw, held.t_ns)
 
     @property
@@ -214,7 +214,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def to_configure(self) -> str:
-        """Describe in words what `configure` may write. The text is empty if the system file configures nothing that has to be
+        """Return a text that lists what `configure` may write. It is empty if the system file configures nothing that has to be
         written.
         """
         canopen, parts = self.config.canopen, []
@@ -249,7 +249,7 @@ class CanopenDriver(DeviceDriver):
         await self._take_rpdos()
 
     async def adopt(self) -> None:
-        """Take over the TPDOs that the node or its DCF has, and listen to them. This only reads.
+        """From now on, receive the TPDOs as the node or its DCF configures them. This only reads from the node.
 
         Afterwards `unmapped` holds the tags of the configured `tpdo1` that no TPDO carries.
         """
@@ -279,8 +279,8 @@ class CanopenDriver(DeviceDriver):
                 self.sink.put_bad([f"{self.config.name}.{name}"], Reason.REFUSED)
 
     async def to_be_halted(self) -> bool:
-        """Return whether the node has to be put into PRE-OPERATIONAL first, because its configuration will change and
-        it may be running."""
+        """Return whether the node must enter PRE-OPERATIONAL before `configure`, because its configuration will change and it may
+        be running."""
         configuration, state = self.config.canopen.configuration, self.master.node_state(self.node)
         if configuration is None or state in (NmtState.PRE_OPERATIONAL, NmtState.INITIALISING):
             return False
@@ -310,7 +310,7 @@ class CanopenDriver(DeviceDriver):
             self.master.subscribe_pdo(cob_id, callback)
 
     async def _take_rpdos(self) -> None:
-        """Map RPDO1 as the system file states, take over all other RPDOs from the node or its DCF, and read their values."""
+        """Map RPDO1 as the system file states, use all other RPDOs as the node or its DCF has them, and read their values."""
         boot, chosen = self.config.canopen, []
         if boot.rpdo1 is not None:
             objects = [self._entry(self.profile.tags[t]) for t in boot.rpdo1.tags]

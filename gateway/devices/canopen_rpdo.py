@@ -1,7 +1,7 @@
 """The process data that a node receives: the contents of each RPDO, and which of its RPDOs the gateway may send.
 
 An RPDO always carries all of its objects. So it may be used only if each of them may be written, and the gateway first fills it
-with the values that the node holds when it connects. This module must not know a bus, a master or the time of sending.
+with the values that the node holds when it connects. This module must not depend on a bus, a master or the time of sending.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ObjectTags = Mapping[tuple[int, int] | None, Tag]
 
 @dataclass(eq=False)
 class Rpdo:
-    """One RPDO. `held` is the value of each object as the node holds it.
+    """One RPDO. `held` is the value of each mapped object as the node holds it, in bytes as sent.
 
     `repeat_ms` is the period in which the RPDO is repeated; 0: it is sent only when a value changes."""
 

@@ -1,8 +1,8 @@
 """The driver's value codec: registers or object bytes to engineering values and back.
 
-The emulator has its own codec and shares no code with this one, because a bug in a shared codec would cancel itself
-out. Registers have 16 bits and are sent in big-endian order (Modbus AP 4.2). `order` is the byte order of a value
-longer than one register: ABCD big endian, CDAB words swapped, BADC bytes swapped within words, DCBA little endian.
+The emulator has its own codec and shares no code with this one, because the tests could not find a bug in a shared codec.
+Registers have 16 bits and are sent in big-endian order (Modbus AP 4.2). `order` is the byte order of a value longer than one
+register: ABCD big endian, CDAB words swapped, BADC bytes swapped within words, DCBA little endian.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
 
 
 def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue:
-    """Return the value of the big-endian bytes `ordered`, which were received as `data`."""
+    """Return the value that `ordered` holds: the received bytes `data` in big-endian order."""
     if tag.sentinels and int.from_bytes(ordered) in tag.sentinels:
         return TagValue(None, Quality.BAD, Reason.SENTINEL, t_ns, data)
     unpack = _UNPACK.get(tag.type) if tag.bits is None else None
@@ -73,8 +73,8 @@ def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue
 
 
 def _odd_number(tag: Tag, ordered: bytes) -> int | None:
-    """Return the number that big-endian bytes hold as BCD digits or in some of their bits. Return None if a BCD digit is above
-    9.
+    """Return the number that the big-endian bytes `ordered` hold as BCD digits or in a part of their bits. Return None if a BCD
+    digit is above 9.
     """
     if tag.type.startswith("bcd"):
         digits = ordered.hex()

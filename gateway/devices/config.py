@@ -1,4 +1,4 @@
-"""The configuration of buses and devices: frozen and resolved, without any information about emulation."""
+"""The configuration of buses and devices: immutable, with all defaults filled in, and without information about emulators."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class BusConfig:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """CANopen heartbeat times in milliseconds: the node's producer time and our consumer time.
+    """CANopen heartbeat times in milliseconds: the node's producer time and the gateway's consumer time.
 
     If `producer_ms` is None, the gateway does not change the node's producer time (1017h) and only listens.
     """
@@ -57,10 +57,10 @@ class DeviceConfig:
 
     `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is the offset
     within its period at which a group is read, in milliseconds; the other groups are spread evenly. `timeout_s` and `retries`
-    replace the settings of the bus unless they are None. `spacing_s` is the pause that the device needs after each exchange. A
-    device that does not answer is not asked for `backoff_first_s`, then for twice as long each time, up to `backoff_limit_s`.
-    `writable` holds the tags that the system file allows to be written, and `safe` the values that are written when the
-    controller is lost.
+    replace the settings of the bus unless they are None. `spacing_s` is the pause that the device needs after each exchange. If a
+    device does not answer, the gateway sends it no request for `backoff_first_s`, then for twice as long each time, up to
+    `backoff_limit_s`. `writable` holds the tags that the system file allows to be written, and `safe` the values that are written
+    when the controller is lost.
     """
 
     name: str

@@ -1,8 +1,8 @@
-"""The paper's DeviceDriver: a driver with one concrete connection, an emitter and a consumer.
+"""The DeviceDriver of docs/explanation/paper.md: a driver with one concrete connection, an event emitter and an event consumer.
 
-Its operation Send consumes a command and writes it; its operation Receive reads a message and emits it. A driver opens no
-connection: the runtime opens it through a Connector and attaches the driver. It uses only the clock that it is given, and
-cannot distinguish an emulator from the device.
+The operation Send takes a command from the consumer and writes it to the device; the operation Receive reads a message from the
+device and emits it. A driver opens no connection: the runtime opens it through a Connector and attaches the driver. A driver
+uses only the clock that it is given, and cannot distinguish an emulator from the device.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class DeviceDriver(ABC):
 
     @property
     def command_list(self) -> frozenset[str]:
-        """Return the commands that this driver can send to its device: those of the profile, and those that a quirk adds."""
+        """Return the commands that this driver can send: those of its profile, and those that a class in `quirks` adds."""
         return self.profile.command_list
 
     @property
@@ -103,14 +103,17 @@ class DeviceDriver(ABC):
         return tuple(self.command(form.commands[command], value) for command, value in form.behaviours[name].items())
 
     def change_behaviour(self, name: str) -> int:
-        """Queue all commands of a behaviour, or none, and return their number (ChangeBehavior). Raises as `behaviour`."""
+        """Queue all commands of a behaviour and return their number (ChangeBehavior).
+
+        Raises as `behaviour`; no command is queued then.
+        """
         commands = self.behaviour(name)
         for command in commands:
             self.consumer.observe(command)
         return len(commands)
 
     async def send(self) -> None:
-        """Consume one item and write it to the device (Send). The consumer's queue must not be empty.
+        """Take one item from the consumer's queue and write it to the device (Send). The queue must not be empty.
 
         An item that the device or the configuration refused is dropped. After a communication error, the item stays first in the
         queue.
@@ -125,7 +128,7 @@ class DeviceDriver(ABC):
             raise
 
     async def receive(self, what: str) -> None:
-        """Read from the device and emit what occurred (Receive).
+        """Read from the device and emit the data that has to be passed on, such as messages (Receive).
 
         `what` is a poll group, or another name that the driver can read.
         """
@@ -138,4 +141,4 @@ class DeviceDriver(ABC):
 
     @abstractmethod
     async def _read(self, what: str) -> list[DATA]:
-        """Read from the device, publish tag values, and return what occurred, in order."""
+        """Read `what` from the device, publish the tag values, and return the data to emit, in order."""

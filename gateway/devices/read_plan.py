@@ -3,8 +3,8 @@
 Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with exception
 02 (address) or 03 (too many) has a gap in it or a limit of its own. The read is then halved until each part is accepted or is a
 single value. The gaps that this proves are kept and offered for the profile (case 25 of the test-case list). A gap is proved when
-the device accepts the reads on both sides of it, but not the two joined. A value or a message is never split over two
-transactions.
+the device accepts the reads on both sides of it, but refuses one read that covers both. A value or a message is never split over
+two transactions.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Learnt:
         self.changes += bool(new)
 
     def found(self, tags: Sequence[str]) -> bool:
-        """Note that these tags were read; return True if at least one of them was missing before."""
+        """Record that the device returned these tags; return True if at least one of them was missing before."""
         back = [t for t in tags if t in self.missing]
         self.missing = [t for t in self.missing if t not in back]
         self.changes += bool(back)
@@ -104,7 +104,7 @@ class Learnt:
 
     @property
     def profile_gaps(self) -> tuple[RegisterRange, ...]:
-        """Return the gaps in the form of a profile, sorted by address, without borders."""
+        """Return the gaps that a profile can list in `gaps`, sorted by address, without borders (gaps of 0 registers)."""
         return tuple(sorted((g for g in self.gaps if g.count), key=lambda g: (g.table, g.address)))
 
 
@@ -113,7 +113,7 @@ def plan_reads(profile: DeviceProfile, group: str, learnt: Learnt | None = None)
 
     Gaps up to `max_gap` are read over. No transaction is longer than `read_registers`, and none covers a gap that the
     profile states or that was learnt; a missing tag is read alone. Messages are read with the tag that announces them.
-    Devices that only support pairs of registers (`even_only`) are asked for whole pairs.
+    If a device only supports pairs of registers (`even_only`), only whole pairs are read.
     """
     members: list[Member] = [(t.registers, t) for t in profile.group(group)]
     members += [(m.at, m) for m in profile.messages.values() if profile.tags[m.when].poll == group]
@@ -138,7 +138,7 @@ def plan_reads(profile: DeviceProfile, group: str, learnt: Learnt | None = None)
 
 
 def _crosses(span: RegisterRange, gap: RegisterRange) -> bool:
-    """Return whether `span` covers `gap`; it covers a border if it has registers on both sides."""
+    """Return whether `span` covers `gap`. It covers a border (a gap of 0 registers) if it has registers on both sides of it."""
     if span.table != gap.table:
         return False
     if not gap.count:
@@ -205,7 +205,7 @@ class GroupPlan:
         self.plan_again()
 
     def plan_again(self) -> None:
-        """Make the plan from the profile and from `learnt`. Missing tags are requested again."""
+        """Make the plan again from the profile and from `learnt`. Tags that the device refused are requested again."""
         self.reads = list(plan_reads(self._profile, self._group, self.learnt))
         self._splits.clear()
         self._refused_any = self._found_any = False
@@ -225,7 +225,7 @@ class GroupPlan:
         return parts
 
     def taken(self, read: Read) -> None:
-        """Note that the device answered `read`."""
+        """Record that the device answered `read`, which may prove a gap."""
         if self.learnt.missing:
             self._found_any |= self.learnt.found([t.name for t in read.tags])
         if not self._splits or (whole := self._splits.get(read)) is None:
@@ -239,7 +239,7 @@ class GroupPlan:
             del self._splits[first], self._splits[second]
 
     def pass_ended(self) -> None:
-        """End a pass, in which the device answered or refused every read.
+        """End one pass over the poll group, in which the device answered or refused every read.
 
         If it refused a read, halves that need not be separate are joined again, and missing tags are left out. If no read is
         left, one value is still requested: when the device has that value again, it may also have the missing ones.

@@ -44,7 +44,7 @@ NOTHING_READ = 1 << 16
 
 
 class GroupReading:
-    """A poll group that is being read, transaction by transaction. When the reading is complete, `items` holds what occurred."""
+    """A poll group that is being read, transaction by transaction. When all have been read, `items` holds the data to emit."""
 
     __slots__ = ("blocks", "items", "todo", "values", "what")
 
@@ -68,7 +68,7 @@ class RegisterDriver(DeviceDriver):
     """A driver of a Modbus device, created from its profile.
 
     `receive` reads a whole group. If other devices share the bus, call `begin`, then `read_next` until it returns True, then
-    `finish`, which emits what occurred. Each call of `read_next` carries out one transaction.
+    `finish`, which emits the messages. Each call of `read_next` carries out one transaction.
     """
 
     wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
@@ -79,7 +79,7 @@ class RegisterDriver(DeviceDriver):
         self.plans = {group: GroupPlan(self.profile, group, self.learnt) for group in self.profile.groups}
         self.samples_missed = 0
         self.may_trigger = False
-        """Whether this driver may write the register that makes its device measure; the gateway sets it."""
+        """Whether this driver may write the register that makes its device measure. The gateway sets this attribute."""
         self._client: ModbusClient | None = None
         self._sample_count: int | None = None
         self._sample_t_ns = 0
@@ -118,9 +118,9 @@ class RegisterDriver(DeviceDriver):
             self._client.units.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """Return the value of a tag's stored bytes, decoded with the present configuration.
+        """Return the value of a tag, decoded with the present configuration from the bytes in `held`.
 
-        `of` is the value of the tag that scales it."""
+        `of` is the value of the tag that holds its scale factor, or None if there is none."""
         tag = self.profile.tags[tag_name]
         value = decode(tag, held.raw, held.t_ns)
         return apply_scale(tag, value, of) if tag.scale_by is not None else value
@@ -167,8 +167,8 @@ class RegisterDriver(DeviceDriver):
             )
 
     def cost(self, what: str) -> int:
-        """Return the number of registers or bits that the first transaction of the group `what` reads. A failed attempt costs
-        that much.
+        """Return the number of registers or bits that the first transaction of the group `what` reads. The number
+        stands for the bus time that a failed attempt takes.
 
         A group without any reads cannot show whether the device is present, so its cost is higher than that of any other group.
         """
@@ -224,7 +224,7 @@ class RegisterDriver(DeviceDriver):
             values[tag.name] = self._decode(tag, raw[place], t_ns)
 
     def _decode(self, tag: Tag, raw: bytes, t_ns: int) -> TagValue:
-        """Return the value as `codec.decode` does, which is called only if the bytes differ from the last ones."""
+        """Return the value of `raw`. `codec.decode` is called only if the bytes differ from those of the last reading."""
         last = self._decoded.get(tag.name)
         if last is not None and last.raw == raw:
             return TagValue(last.value, last.quality, last.reason, t_ns, raw)
@@ -232,7 +232,7 @@ class RegisterDriver(DeviceDriver):
         return value
 
     def _complete(self, reading: GroupReading) -> list[DATA]:
-        """Publish the values of a group that was read, and return what occurred."""
+        """Publish the values of a group that was read. Return its messages if the group has a new sample."""
         values, what = reading.values, reading.what
         for name, value in values.items() if self._scales else ():
             tag = self.profile.tags[name]
@@ -271,7 +271,7 @@ class RegisterDriver(DeviceDriver):
     # -- samples ----------------------------------------------------------------------------------------------------
 
     def _note_sample(self, values: dict[str, TagValue]) -> bool:
-        """Return whether the values are a new sample, and set the age of every value of the group.
+        """Return whether the values are a new sample. Replace the values of the group by values with the time of the sample.
 
         The first count is only a baseline, because the age of that sample is unknown.
         """
@@ -298,7 +298,7 @@ class RegisterDriver(DeviceDriver):
         return fresh
 
     def _sample_reason(self, count: int, now_ns: int) -> Reason:
-        """Return why the group's values are not good, or NONE."""
+        """Return the reason why the values of the sample are not good, or `Reason.NONE`. `count` is the sample counter."""
         sampled = self.profile.sampled
         assert sampled is not None
         if count == 0:
@@ -313,7 +313,7 @@ class RegisterDriver(DeviceDriver):
     # -- writing ------------------------------------------------------------------------------------------------------
 
     async def _write(self, item: DATA) -> None:
-        """Write a command's tag with one request and read it back, so that the published value is the one in the device."""
+        """Write the tag of command `item` with one request, and read it back, so that the value in the device is published."""
         if not isinstance(item, COMMAND):
             raise Bug("a register device accepts only commands", got=type(item).__name__, where=self.config.where)
         self.check(item)

@@ -1,12 +1,12 @@
-"""The paper's TransmitterDriver: a pure relay between two mailboxes and two queues (paper.md, ruling 17).
+"""The TransmitterDriver of docs/explanation/paper.md (ruling 17): it passes messages between two mailboxes and two queues.
 
 A mailbox holds one message: sequence, length and payload, in holding registers that are written with one request. The sequence
 that the receiver acknowledges is in a separate register. 0 means empty; sequences run from 1 to 65535 and then start again at 1.
 A message whose sequence equals the acknowledged one is a duplicate and is discarded. A command that is sent twice has two
 sequences and counts as two commands.
 
-The plant's end and the topside end use this same class. The topside end receives COMMANDs and sends RESPONSEs; the plant's end
-does the reverse. Payloads are never interpreted.
+The topside controller and the plant both use this class. In the plant, the driver receives COMMANDs and sends RESPONSEs; topside,
+it does the reverse. Payloads are never interpreted.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def next_sequence(sequence: int) -> int:
 class TransmitterDriver(RegisterDriver):
     """A driver of a transmitter on TCP.
 
-    `receive("inbox")` reads the inbox and emits a message that was not taken before; `acknowledge()` frees it. `send()`
+    `receive("inbox")` reads the inbox and emits its message if it is new; `acknowledge()` frees the inbox. `send()`
     writes the next queued message; it may be called when `outbox_free`, which `check_outbox()` updates.
     """
 
@@ -50,9 +50,9 @@ class TransmitterDriver(RegisterDriver):
         self.emitted = b""
         """The whole inbox as it was when its message was emitted."""
         self.taken_before = b""
-        """The whole inbox of a message that was taken before this driver existed, and perhaps not acknowledged."""
+        """The whole inbox with a message that an earlier run of the gateway took, and perhaps did not acknowledge."""
         self._unconfirmed: tuple[int, DATA] | None = None
-        """The message that was written, and its sequence, until the device confirms it."""
+        """The sequence and the data of the message that was written, until the device confirms it; then None."""
         self._sent = 0
         self.to_acknowledge = 0
         """The sequence of the message that was emitted and is not acknowledged yet; 0 if there is none."""
@@ -65,7 +65,7 @@ class TransmitterDriver(RegisterDriver):
 
     @property
     def outbox_tag(self) -> str:
-        """Return the name under which the control logic sends through this transmitter."""
+        """Return the full name of the tag through which the control logic sends messages with this transmitter."""
         return f"{self.config.name}.outbox"
 
     async def synchronise(self) -> None:
@@ -131,7 +131,7 @@ class TransmitterDriver(RegisterDriver):
             self.to_acknowledge = 0
 
     async def check_outbox(self) -> bool:
-        """Ask the device whether the transmitter took the last message. If the mailbox is still full, count one wait."""
+        """Return whether the transmitter took the last message. If its mailbox is still full, increment `mailbox_waits`."""
         reply = await self.client.read_registers(self.config.address, "holding", self._outbox.ack.address, 1)
         free = reply.registers[0] == self._sent
         self.taken += free and not self.outbox_free

@@ -21,7 +21,7 @@ MAX_VALUE_BYTES = 4096
 
 
 class Kind(IntEnum):
-    """The kind of an event. The numbers are stored and sent, so they never change; there is room for 7."""
+    """The kind of an event. The numbers are stored and sent, so they never change; the format has room for 7 kinds."""
 
     VALUE = 0
     """`name` is a tag; `value` is in engineering units, None if it has none."""
@@ -91,7 +91,7 @@ def plain(value: Scalar | None) -> Value:
 
 
 class StoreFull(Unreachable):
-    """There is no room for more: the disk is full, or the store has reached its limit. The stored events are intact."""
+    """The store cannot take more events: the disk is full, or the store has reached its limit. The stored events are intact."""
 
 
 class KnowledgeStore(Protocol):
@@ -101,7 +101,7 @@ class KnowledgeStore(Protocol):
     """
 
     async def own(self, name: str, *, system: str, prototype: bool, log: str) -> str:
-        """Return the origin under which this side of `system` writes: the existing one, or a new one named
+        """Return the origin under which this process writes events of `system`: the existing one, or a new one named
         ``name:log``.
 
         `prototype` is part of the identity of an origin (paper.md, ruling 15). `log` distinguishes a new store from an earlier
@@ -144,15 +144,15 @@ class KnowledgeStore(Protocol):
         ...
 
     def replay(self, origin: str, since_ms: int, until_ms: int) -> AsyncIterator[list[Event]]:
-        """Yield all events of a time range, in order, in blocks."""
+        """Yield, in blocks and in order, all events of the time range (UTC in ms)."""
         ...
 
     async def note_lost(self, origin: str, first: int, last: int) -> None:
-        """Note that the writer no longer has these events, so they no longer count as gaps."""
+        """Record that the writer no longer has events `first` to `last`, so that they do not count as gaps."""
         ...
 
     async def forget(self, origin: str, through: int) -> int:
-        """Delete an origin's events up to a number; return how many were deleted."""
+        """Delete an origin's events up to and including number `through`; return how many were deleted."""
         ...
 
     def room_bytes(self) -> int | None:
@@ -160,12 +160,12 @@ class KnowledgeStore(Protocol):
         ...
 
     async def aclose(self) -> None:
-        """Close the connection; the store remains."""
+        """Close the connection to the database. The stored events remain."""
         ...
 
 
 def merged(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the ranges in order, with those that touch or overlap joined."""
+    """Return the ranges (first, last) in order, with adjacent and overlapping ranges joined."""
     out: list[tuple[int, int]] = []
     for first, last in sorted(ranges):
         if out and first <= out[-1][1] + 1:
@@ -176,7 +176,7 @@ def merged(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def without(ranges: Iterable[tuple[int, int]], holes: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the parts of `ranges` that are not in `holes`, in order."""
+    """Return the parts of the ranges (first, last) that are not in `holes`, in order."""
     out = merged(ranges)
     for hole_first, hole_last in merged(holes):
         parts: list[tuple[int, int]] = []

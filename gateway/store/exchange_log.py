@@ -1,8 +1,8 @@
 """The exchange log: the control logic's dataLog, kept in SQLite.
 
 While its period is positive, the PLC logs each exchanged message (paper.md, ruling 1) and sends the record through the process
-image. This module stores the records in order, duplicates included. Rows are committed in batches, outside the event loop's
-critical path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are counted.
+image. This module stores the records in order, duplicates included. Rows are committed in batches, so that the event loop does
+not wait for the disk: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are counted.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from fieldtwin.gateway.store.schema import migrate, refuse_newer
 QUEUE = 10_000
 KNOWN = 1_000
 """The number of rows at the end of the store that are compared with new rows, so that no row is stored twice. A PLC cannot
-have as many rows under way.
+have that many unconfirmed rows.
 """
 
 
 class ExchangeLog:
-    """One database file. `dropped` counts rows that did not fit the queue.
+    """The log in one database file. `dropped` counts rows that did not fit into the queue.
 
     A killed gateway process leaves neither gaps nor duplicates, because it reports to the PLC only rows that are stored
     (`pending`). The next gateway process receives the other rows again, and ignores those that were stored but not reported.
@@ -61,7 +61,7 @@ class ExchangeLog:
         self._known.update(self._db.execute(last, (KNOWN,)))
 
     def append(self, rows: list[tuple[str, int, int, bytes]]) -> None:
-        """Queue rows of (tag, sequence, monotonic ns, payload). Rows that an earlier process stored are left out."""
+        """Queue rows of (tag, sequence, monotonic ns, payload). Rows that an earlier process stored are ignored."""
         for row in rows:
             if self._known and row[:3] in self._known:
                 continue
@@ -113,7 +113,7 @@ class ExchangeLog:
         return len(rows)
 
     def close(self) -> None:
-        """Flush and close."""
+        """Write the queued rows and close the file."""
         try:
             self.flush()
         finally:

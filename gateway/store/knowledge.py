@@ -1,4 +1,4 @@
-"""Open the knowledge store from the path of a file or the URL of a PostgreSQL database."""
+"""Open a knowledge store (events of plants and twins): a SQLite file by its path, or a PostgreSQL database by its URL."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def check_place(place: str) -> None:
 async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | None = None) -> KnowledgeStore:
     """Open the store at a path or URL.
 
-    `max_bytes` and `offload` apply to files only. Raises `Unreachable`, `FileInvalid`, `UsageError`.
+    `max_bytes` (0: no limit) and `offload` apply to SQLite files only; see `SqliteKnowledge`. Raises `Unreachable`,
+    `FileInvalid`, `UsageError`.
     """
     if not place.startswith(URLS):
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)

@@ -1,4 +1,4 @@
-"""Knowledge in a PostgreSQL database, for twins that share one server (the extra `postgres`).
+"""A store of events in a PostgreSQL database, for twins that share one server. It needs the extra `postgres`.
 
 All tables are in a separate schema, `fieldtwin`, which also holds the schema's version. One connection is used; it is opened
 again after it was lost.

@@ -1,4 +1,4 @@
-"""The numbered schemas of our SQLite files, and the migration of an old file.
+"""The numbered schemas of the SQLite files of fieldtwin, and the migration of an old file.
 
 Each version has a script in this folder. The script runs once, in the transaction that also stores the new version number, so a
 file never has an intermediate state. A file that a newer fieldtwin wrote is not changed.

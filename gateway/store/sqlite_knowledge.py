@@ -1,7 +1,7 @@
-"""Knowledge in a SQLite file (write-ahead log), the default: no server, one file, readable while it is written.
+"""A store of events in a SQLite file (write-ahead log), the default: no server, one file, readable while it is written.
 
-`offload` carries out the work on the file: in a separate thread in real time (`in_thread`), in the caller's thread in virtual
-time.
+`offload` carries out the work on the file: in a separate thread in real time (the default), in the caller's thread in virtual
+time (`in_place`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 Work = Callable[[], Any]
 Offload = Callable[[Work], Awaitable[Any]]
 BLOCK = 20_000
-"""The number of events that a replay reads in one block: so many that the switch to the thread costs little."""
+"""The number of events that a replay reads in one block, large enough that switching to the thread costs little."""
 NAMES_MAX = 100_000
 PAGE = 4096
 BUSY_S = 5.0
@@ -30,7 +30,7 @@ _COLUMNS = "sequence, t_ms, kind, name, value, quality, reason"
 
 
 async def in_place(work: Work) -> Any:
-    """Run the work immediately in the caller's thread, for virtual time, which uses no threads."""
+    """Run `work` immediately in the caller's thread and return its result. Used in virtual time, which has no threads."""
     return work()
 
 
@@ -264,7 +264,7 @@ class SqliteKnowledge:
         ]
 
     def _text(self, number: int) -> str:
-        """Return a name that another process added."""
+        """Return the event name with this number, which another process added. Raises `FileInvalid` if there is none."""
         row = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
         if row is None:
             raise FileInvalid(f"damaged: events refer to name {number}, which does not exist", path=str(self.path))

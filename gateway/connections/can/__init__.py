@@ -1,1 +1,1 @@
-"""CAN buses: SocketCAN, adapters that python-can knows, and the software bus."""
+"""CAN buses: SocketCAN, adapters that python-can supports, and the software CAN bus (a bus simulated by a TCP server)."""

@@ -1,9 +1,9 @@
-"""A CAN adapter of any kind that python-can knows: PCAN, Kvaser, slcan, gs_usb, IXXAT, Vector, its virtual bus...
+"""A CAN adapter of any kind that python-can supports: PCAN, Kvaser, slcan, gs_usb, IXXAT, Vector, its virtual bus...
 
 Endpoints use python-can's own names, ``can:INTERFACE/CHANNEL``: ``can:pcan/PCAN_USBBUS1?bitrate=250000``,
-``can:kvaser/0``, ``can:slcan//dev/ttyACM0@115200``. The adapter's driver is imported when the adapter is opened, so a
-computer needs it only then. Reading blocks in a thread, because few drivers have a descriptor that an event loop could
-watch.
+``can:kvaser/0``, ``can:slcan//dev/ttyACM0@115200``. The adapter's driver is imported when the adapter is opened, so only
+computers that use such an adapter need the driver. A thread reads from the driver, because few drivers have a descriptor that
+an event loop could watch.
 
 This module does not interpret frames.
 """
@@ -37,7 +37,7 @@ RATELESS = frozenset({"virtual", "udp_multicast"})
 
 
 class AdapterConnection(CanConnection):
-    """One handle on an adapter; create it with `open`. `bitrate` is the adapter's setting in bit/s, or 0 if it has none."""
+    """An open CAN adapter; create it with `open`. `bitrate` is the adapter's setting in bit/s, or 0 if it has none."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC, bitrate: int = 0, max_pending: int = 4096) -> None:
         super().__init__(CANConnection(), endpoint, max_pending)
@@ -74,7 +74,7 @@ class AdapterConnection(CanConnection):
         return cls(endpoint, bus, rate, max_pending)
 
     async def send(self, frame: CanFrame) -> None:
-        """Pass `frame` to the driver.
+        """Pass `frame` to the driver, waiting while its transmit queue is full.
 
         Raises `ConnectionLost` if the adapter is gone, `WireError` if its queue stays full for `SEND_TIMEOUT_S`.
         """
@@ -173,7 +173,7 @@ def _bitrate(endpoint: Endpoint, asked: int) -> int:
 
 
 def _words(endpoint: Endpoint, rate: int) -> dict[str, Any]:
-    """Return the arguments for python-can's constructor."""
+    """Return the arguments for `can.Bus`. Raises `UsageError` for an unknown interface or an invalid parameter."""
     if endpoint.interface not in can.VALID_INTERFACES:
         known = sorted(set(can.VALID_INTERFACES) | {"socketcan", "fieldtwin"})
         raise UsageError(f"{endpoint}: unknown kind of CAN interface {endpoint.interface!r}", expected=", ".join(known))
@@ -198,7 +198,7 @@ def _typed(text: str) -> Any:
 
 
 def _listen_only(endpoint: Endpoint) -> dict[str, Any]:
-    """Return the arguments that put this driver into listen-only mode, as far as python-can supports it."""
+    """Return the arguments that put this driver into listen-only mode. Raises `UsageError` if python-can has none for it."""
     match endpoint.interface:
         case "slcan":
             return {"listen_only": True}
@@ -249,7 +249,7 @@ def _no_driver(endpoint: Endpoint, error: Exception) -> UsageError:
 
 
 def _shut_unwanted(opening: asyncio.Future[can.BusABC]) -> None:
-    """Close an adapter whose opening was cancelled by the caller."""
+    """Close the adapter that `opening` has opened although the caller was cancelled meanwhile."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().shutdown()
 

@@ -1,4 +1,4 @@
-"""The properties of a CAN endpoint that can be determined without joining its bus. Opens nothing, sends nothing."""
+"""The properties of a CAN endpoint that can be determined without joining its bus, opening it or sending frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of frames to python-can's messages, for ends that send through python-can."""
+"""Conversion of frames to python-can's messages, for connections that send through python-can."""
 
 from __future__ import annotations
 

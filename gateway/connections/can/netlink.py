@@ -1,7 +1,7 @@
-"""The kernel's information about a network interface: whether it is CAN, whether it is up, its bit rate (rtnetlink(7)).
+"""Ask the kernel about a network interface: whether it is a CAN interface, whether it is up, its bit rate (rtnetlink(7)).
 
-Read-only: the kernel owns a CAN interface's bit rate, which is checked and never set. Decoding is separate from asking
-the kernel, so that it can be tested on any system. This module sends and receives no frames.
+This module only reads: the kernel owns a CAN interface's bit rate, and fieldtwin checks it but never sets it. Decoding is
+separate from the query, so that it can be tested on any system. This module sends and receives no CAN frames.
 """
 
 from __future__ import annotations

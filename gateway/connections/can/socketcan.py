@@ -1,7 +1,7 @@
 """A kernel CAN interface (SocketCAN), through python-can.
 
-The kernel owns the interface: it must exist, be up, and run at the bit rate that the system file names. All three are
-checked; none is changed. Frames arrive through `add_reader`, without threads. This module does not interpret frames.
+The kernel owns the interface: it must exist, be up, and run at the bit rate that the system file names. This module checks all
+three and changes none of them. Frames arrive through `add_reader`, without threads. This module does not interpret frames.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ is bus-off.
 class SocketCanConnection(CanConnection):
     """One socket on a kernel CAN interface; create it with `open`.
 
-    Error frames are received as frames with `error` set. `t_ns` is the kernel's time of reception, monotonic.
+    Error frames are received as frames with `error` set. A frame's `t_ns` is the kernel's time of reception, monotonic.
     """
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC, max_pending: int = 4096) -> None:

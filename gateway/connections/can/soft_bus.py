@@ -1,7 +1,7 @@
 """The client side of the software CAN bus as a `CanConnection` on asyncio.
 
 The bus is a TCP server; a frame is a record of 24 bytes (gateway/core/canframe.py). This module does not know how the
-bus is modelled, or which other nodes are on it.
+server models the bus, or which other nodes are on it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ CLOSE_TIMEOUT_S = 1.0
 class SoftBusConnection(CanConnection):
     """One node on a software CAN bus; create it with `open`.
 
-    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock. Error frames among
-    them report the state of this node's controller (gateway/core/can_error.py).
+    The `t_ns` of a received frame is the exact time at which it ended on the bus, on this host's monotonic clock. Error frames
+    among them report the state of this node's controller (gateway/core/can_error.py).
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 4096) -> None:
@@ -123,13 +123,13 @@ class SoftBusConnection(CanConnection):
             self.feed(replace(frame, t_ns=frame.t_ns + self._offset_ns) if self._offset_ns else frame)
 
     def on_lost(self, error: FieldtwinError) -> None:
-        """Handle the loss of the bus."""
+        """Record that the connection to the bus ended because of `error`, and wake a waiting `send`."""
         self.feed_lost(error)
         self._progress.set()
 
 
 class _Wire(asyncio.Protocol):
-    """The TCP connection to the bus. It cuts the stream into records; the first record is the answer to the hello."""
+    """The TCP connection to the bus. It cuts the stream into records. The first record answers the request to join."""
 
     def __init__(self, connection: SoftBusConnection) -> None:
         loop = asyncio.get_running_loop()

@@ -1,8 +1,8 @@
-"""The request to join the software CAN bus, and the bus's answer. Bytes only, no sockets.
+"""The request to join the software CAN bus (hello), and the bus's answer. This module handles bytes and opens no sockets.
 
-A hello is a record of 24 bytes like any other on that connection; bit 7 of its first byte distinguishes it from a
-frame's. In network byte order: mark 80h, version, status, options, bit rate u32, the bus's monotonic clock u64 (ns),
-``ftcb``, transmit window u16, two zero bytes. The joining side sends first; bit rate 0 accepts any bit rate.
+Both are records of 24 bytes like all others on that connection; bit 7 of the first byte distinguishes them from the record of a
+frame. In network byte order: mark 80h, version, status, options, bit rate u32, the bus's monotonic clock u64 (ns),
+``ftcb``, transmit window u16, two zero bytes. The joining node sends first; bit rate 0 accepts any bit rate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WELCOME, _WRONG_BITRATE, _UNKNOWN_VERSION, _FULL = range(4)
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The bus's answer: its bit rate, how many unconfirmed frames it accepts, and its clock when it answered."""
+    """The bus's answer: its bit rate, the unconfirmed frames that it accepts from a node, and its clock (ns) when it answered."""
 
     bitrate: int
     window: int
@@ -35,8 +35,8 @@ class Welcome:
     def clock_offset_ns(self, asked_ns: int, answered_ns: int) -> int:
         """Return the difference to add to the bus's time stamps to get this host's monotonic time.
 
-        `asked_ns` and `answered_ns` are this host's clock before and after the hello. The result is zero on one host,
-        where all processes share a clock; otherwise it is accurate to half the round trip.
+        `asked_ns` and `answered_ns` are this host's clock before the request and after the answer. The result is zero on one
+        host, where all processes share a clock; otherwise it is accurate to half the round trip.
         """
         if asked_ns <= self.bus_ns <= answered_ns:
             return 0

@@ -1,9 +1,9 @@
 """A serial port as a `ByteConnection`, on systems whose ports have descriptors (`threads` is for other systems).
 
-`port` finds, locks and configures the port. Reading and writing are non-blocking operations of the event loop on
-the descriptor, so a port needs no thread and a chunk is delivered when the driver has it.
+`port` finds, locks and configures the port. Reading and writing are non-blocking operations of the event loop on the descriptor,
+so a port needs no thread and a chunk is delivered as soon as the driver has it.
 
-This module must not know a protocol: no frames, gaps or unit IDs. A frame that arrives in five pieces, because a USB
+This module must not depend on a protocol: no frames, gaps or unit IDs. A frame that arrives in five pieces, because a USB
 adapter delivers data every 16 ms, is five chunks here.
 """
 
@@ -30,16 +30,16 @@ DRAIN_LIMIT_S = 1.0
 class SerialConnection(ByteConnection):
     """One end of a serial line (in the paper, an RS232 connection).
 
-    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the port is not read until half of them have been
+    This object holds at most `max_pending` unread chunks of `CHUNK` bytes. Then the port is not read until half of them have been
     taken; meanwhile the operating system's buffer, and then the flow control of the line if it has one, holds the rest.
 
-    If the port is unplugged, or the other side of a pty is gone, the bytes that arrived are still read; then `read` and
-    `write` raise `ConnectionLost`. The descriptor is closed immediately, so that the port gets its old name back when
-    it returns.
+    If the port is unplugged, or the other side of a pty is gone, the bytes that arrived are still read; then `read` and `write`
+    raise `ConnectionLost`. The descriptor is closed immediately, so that the port gets its old name back when it is plugged in
+    again.
     """
 
     def __init__(self, port: Port, endpoint: Endpoint, max_pending: int = 1024) -> None:
-        """Take over an open, non-blocking `port`; use `open`."""
+        """Take over an open, non-blocking `port`. Create a connection with `open` instead."""
         super().__init__(RS232Connection(), endpoint, max_pending)
         self._port = port
         self._fd = int(port.fileno())
@@ -149,7 +149,7 @@ class SerialConnection(ByteConnection):
             self._on_writable()  # wakes a writer that waits
 
     async def _drain(self) -> None:
-        """Wait until the driver's buffer is empty, and discard what cannot be sent, since close(2) would wait 30 s for it."""
+        """Wait until the driver's buffer is empty. Discard unsendable bytes, because close(2) would wait 30 s for them."""
         deadline_s = self._loop.time() + DRAIN_LIMIT_S
         try:
             while self._lost is None and self._port.out_waiting:

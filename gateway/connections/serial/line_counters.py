@@ -1,7 +1,7 @@
 """The counters and control lines of a serial port's driver: ``TIOCGICOUNT`` and ``TIOCMGET`` of Linux (tty_ioctl(4)).
 
-A pty, many USB adapters and other operating systems have no counters; the result is then None, never zeros. This module only
-reads.
+Ptys, many USB adapters and other operating systems have no counters; the result is then None, never zeros. This module only
+reads, and changes no setting of the port.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class UartCounters:
 
 @runtime_checkable
 class CountsErrors(Protocol):
-    """A connection whose port may count errors."""
+    """The interface of a connection whose serial port may count receive errors."""
 
     def counters(self) -> UartCounters | None:
         """Return the port's counters, or None if it has none."""
@@ -72,7 +72,7 @@ def read_counters(descriptor: int) -> UartCounters | None:
 
 
 def read_control_lines(descriptor: int) -> dict[str, bool]:
-    """Return the state of the driver's control lines, or an empty result if it has none."""
+    """Return the state of each control line by name (CTS, DSR...); empty if the driver has none."""
     answer = _ask(descriptor, TIOCMGET, _INT.size)
     if answer is None:
         return {}

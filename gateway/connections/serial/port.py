@@ -38,7 +38,7 @@ _ABSENT = (errno.ENOENT, errno.ENXIO, errno.ENODEV)
 
 
 def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> Port:
-    """Lock and configure the port. Reads and writes wait at most `read_s` and `write_s` seconds; 0 does not wait.
+    """Open, lock and configure the port. Its reads and writes wait at most `read_s` and `write_s` seconds; 0: they do not wait.
 
     Raises the errors of `SerialConnection.open`. This may take seconds: call it in a thread.
     """
@@ -98,7 +98,7 @@ def _set_rs485(port: Port, endpoint: Endpoint) -> None:
 
 
 def close_unwanted(opening: asyncio.Future[Port]) -> None:
-    """Close a port whose opening was cancelled by the caller."""
+    """Close the port that `opening` has opened although the caller was cancelled meanwhile."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().close()
 

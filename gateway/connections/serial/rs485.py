@@ -1,8 +1,8 @@
 """RS485 direction control by the kernel (Linux: ioctl TIOCSRS485, Documentation/driver-api/serial/serial-rs485.rst).
 
 The driver raises RTS, which opens the transmitter, before the first character and drops it after the last one: a
-program outside the kernel cannot do that in time. This module handles bytes and one ioctl; it must not know what the
-port is used for.
+program outside the kernel cannot do that in time. This module only packs the settings and calls one ioctl; it must not depend on
+the use of the port.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def settings_sent(driver: bytes) -> bytes:
 def let_driver_switch(fd: int) -> None:
     """Turn RS485 mode on.
 
-    Raises `OSError` (ENOTTY if the port has no such mode, as ptys and most USB adapters, or ignores it).
+    Raises `OSError`: ENOTTY if the port ignores the setting or has no such mode; ptys and most USB adapters have none.
     """
     import fcntl  # not on Windows, which has no such request
 

@@ -1,7 +1,7 @@
 """A serial port as a `ByteConnection` on systems whose ports have no descriptors for an event loop: Windows' COM ports.
 
-One thread reads and another writes; both wait in pyserial. Delivery takes longer than in `line` by the time that it takes to
-wake a thread. Otherwise both behave the same. This module must not know a protocol.
+One thread reads and another writes; both wait in pyserial. Bytes are delivered later than in `line` by the time that it
+takes to wake a thread. Otherwise both modules behave the same. This module must not depend on a protocol.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ThreadedSerialConnection(ByteConnection):
     """One end of a serial line, with the same limits and errors as `SerialConnection`."""
 
     def __init__(self, port: Port, endpoint: Endpoint, max_pending: int = 1024) -> None:
-        """Take over an open `port`; use `open`."""
+        """Take over an open `port`. Create a connection with `open` instead."""
         super().__init__(RS232Connection(), endpoint, max_pending)
         self._port = port
         self._loop = asyncio.get_running_loop()
@@ -51,7 +51,7 @@ class ThreadedSerialConnection(ByteConnection):
         return cls(port, endpoint, max_pending)
 
     async def write(self, data: bytes) -> None:
-        """Pass `data` to the driver; concurrent writes are not mixed. Raises `ConnectionLost`."""
+        """Pass `data` to the driver. Bytes of concurrent writes are not mixed. Raises `ConnectionLost`."""
         async with self._turn:
             if self._lost is not None:
                 raise self._loss()

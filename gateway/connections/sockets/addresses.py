@@ -6,6 +6,6 @@ import asyncio
 
 
 def address_of(transport: asyncio.BaseTransport) -> str:
-    """Return ``HOST:PORT`` of the local end, or an empty text if the transport has no such address."""
+    """Return the local ``HOST:PORT`` of a socket, or an empty text if the transport has no such address."""
     name = transport.get_extra_info("sockname")
     return f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) >= 2 else ""

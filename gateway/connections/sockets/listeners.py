@@ -1,7 +1,7 @@
 """The gateway's listening side: a TCP port, optionally with TLS, whose clients become `ByteConnection`s.
 
-This module must not know a protocol. Its owner decides by address which clients may connect, interprets what they send,
-and decides what the role in a client's certificate permits.
+This module must not depend on a protocol. The code that opens the listener decides by address which clients may connect,
+interprets the bytes that they send, and decides what the role in a client's certificate permits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreacha
 MAX_CLIENTS = 32
 BACKLOG = 64
 CLIENT_CHUNKS = 16
-"""The number of chunks of a client that may wait (64 KiB); then its socket is not read, and TCP holds the client back."""
+"""The number of unread chunks kept per client (64 KiB). Then its socket is not read, and TCP flow control stops the client."""
 
 ACCEPT_PAUSE_S = 0.1
 """The time to wait when the system has no free descriptor for another client."""
@@ -31,8 +31,8 @@ ACCEPT_PAUSE_S = 0.1
 class ClientConnection(TcpConnection, Client):
     """The connection of one client.
 
-    `peer` is the client's address, and `last_used_s` the loop's time when it last sent data. `role` is the role that its
-    certificate names (MBTLS 8.4), or empty.
+    `peer` is the client's address, and `last_used_s` the event loop's time in seconds when it last sent data. `role` is the role
+    that its certificate names (MBTLS 8.4), or empty.
     """
 
     def __init__(self, endpoint: Endpoint, peer: str, port: int) -> None:
@@ -78,7 +78,7 @@ class ClientConnection(TcpConnection, Client):
         return super()._waits(waiter)
 
     def evict(self, why: str) -> None:
-        """End the connection immediately."""
+        """Close the connection immediately and discard unread data; `read` then raises `ConnectionLost` with the text `why`."""
         self.feed_lost(ConnectionLost(why, where=f"{self.endpoint}: {self.peer}"))
         self.inbound.data_stream.clear()
         if hasattr(self._wire, "transport"):
@@ -89,11 +89,12 @@ OnClient = Callable[[Client], Awaitable[None]]
 
 
 class TcpListener:
-    """A listener that runs `on_client(connection)` for each client that `admits` accepts, and then closes the client.
+    """A listener that runs `on_client(connection)` for each client that `admits` accepts, and then closes its connection.
 
-    When `max_clients` are connected, the next one takes the place of the one that has been silent for longest (TG
-    4.2.1, case MB-065). A client that has been silent for `idle_s` is closed as well; 0 means never. `refused` counts
-    clients that were not admitted, `unshaken` failed TLS handshakes, `retired` clients that were silent for too long.
+    If `max_clients` are connected and another client connects, the connection of the client that has been silent for longest is
+    closed (TG 4.2.1, test case MB-065). The connection of a client that has been silent for `idle_s` seconds is closed as well;
+    0: never. `refused` counts clients that were not admitted, `unshaken` failed TLS handshakes, `retired` clients that were
+    silent for too long.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class TcpListener:
         tls: ssl.SSLContext | None = None,
         idle_s: float = 0.0,
     ) -> None:
-        """Take over a listening socket; use `open`."""
+        """Take over a listening socket. Create a listener with `open` instead."""
         self.accepted = self.evicted = self.refused = self.unshaken = self.retired = 0
         self._endpoint = endpoint
         self._sock = sock
@@ -130,9 +131,10 @@ class TcpListener:
         admits: Callable[[str], bool] = lambda address: True,
         idle_s: float = 0.0,
     ) -> TcpListener:
-        """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 uses a free one (`bound` has its number).
+        """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 selects a free port (`bound` has its number).
 
-        Raises `EndpointBusy`, or `Unreachable` with a hint how to solve it.
+        Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened for another reason; a hint says what to
+        do. Raises `UsageError` for any other kind of endpoint.
         """
         if endpoint.scheme not in ("tcp", "tls"):
             raise UsageError(
@@ -161,7 +163,7 @@ class TcpListener:
 
     @property
     def bound(self) -> Endpoint:
-        """Return the endpoint with the port that is actually listened on."""
+        """Return the endpoint with the actual port, which matters if port 0 was requested."""
         if self._sock.fileno() < 0:
             return self._endpoint
         return self._endpoint.with_address(self._endpoint.host, self._sock.getsockname()[1])

@@ -1,6 +1,7 @@
 """A TCP connection as a `ByteConnection`.
 
-This module must not know a protocol: it does not look for the start of an ADU, and segment boundaries mean nothing.
+This module must not depend on a protocol: it does not look for the start of an ADU, and TCP segment boundaries have no meaning
+for it.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ UNACKNOWLEDGED_MS = 20_000
 class TcpConnection(ByteConnection):
     """One end of a TCP stream.
 
-    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the socket is not read until half of them have been taken, and
-    TCP holds the sender back. When the stream has ended, was reset, or the peer gave no sign of life, `read` still returns the
-    bytes that arrived, and then raises `ConnectionLost`.
+    This object holds at most `max_pending` unread chunks of `CHUNK` bytes. Then the socket is not read until half of them have
+    been taken, and TCP flow control stops the sender. When the stream has ended, was reset, or the peer gave no sign of life,
+    `read` still returns the bytes that arrived, and then raises `ConnectionLost`.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
-        """Create an unconnected object; use `open`."""
+        """Create an object that is not connected. Create a connection with `open` instead."""
         super().__init__(TCPConnection(), endpoint, max_pending)
         self._wire = _Wire(self)
 
@@ -194,7 +195,7 @@ async def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> list[str]:
 
 
 def _tune(sock: socket.socket) -> None:
-    """Disable delayed sending (requests are small and wait for their reply), and detect a peer that is gone."""
+    """Disable Nagle's algorithm, which would delay small requests, and enable keep-alive, which detects a peer that is gone."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (

@@ -1,7 +1,7 @@
 """TLS over TCP as a `ByteConnection` (MODBUS/TCP Security Protocol Specification, MBTLS below; port 802).
 
 Both sides present certificates; the local one may carry a role, by which the server decides what the client may do.
-Certificates and keys are files: an endpoint contains no secrets. This module must not know the protocol inside.
+Certificates and keys are files: an endpoint contains no secrets. This module must not depend on the protocol inside TLS.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TlsConnection(TcpConnection):
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
         super().__init__(endpoint, max_pending)
         self.role = ""
-        """The role in the local certificate (MBTLS 8.4), which was presented to the server; empty without one."""
+        """The role in the local certificate (MBTLS 8.4), which was presented to the server; empty if there is none."""
 
     @classmethod
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:
@@ -47,7 +47,7 @@ class TlsConnection(TcpConnection):
 
     @property
     def peer_role(self) -> str:
-        """Return the role in the server's certificate, or an empty text."""
+        """Return the role in the server's certificate (MBTLS 8.4), or an empty text if it names none."""
         certificate = self._ssl_object().getpeercert(binary_form=True)
         return role_in(certificate) if certificate else ""
 
@@ -74,7 +74,7 @@ class TlsConnection(TcpConnection):
 def client_context(endpoint: Endpoint) -> ssl.SSLContext:
     """Return the context of a TLS client, with ``ca``, ``cert`` and ``key`` as in `TlsConnection`.
 
-    Reads files, and raises the errors of `open`.
+    Reads files. Raises `Unreachable` and `UsageError` as `TlsConnection.open` does.
     """
     return _context(endpoint)[0]
 

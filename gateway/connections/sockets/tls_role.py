@@ -1,7 +1,7 @@
 """The role extension of a certificate (MODBUS/TCP Security Protocol Specification, 8.4).
 
 It is an X.509 extension with object identifier 1.3.6.1.4.1.50316.802.1 whose value is one UTF8String. The DER (X.690)
-is decoded only as far as needed to find it, and nothing is verified. Pure.
+is decoded only as far as needed to find it, and no signature is verified. This module does no I/O.
 """
 
 from __future__ import annotations

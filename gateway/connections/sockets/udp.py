@@ -1,7 +1,7 @@
 """A UDP socket as a `ByteConnection`: each chunk is one datagram, and so is each `write`.
 
-There is no connection that could be lost. An absent peer is noticed only by its silence, or by the network's error that the port
-is closed. This module must not know a protocol: it interprets neither the content nor the order of datagrams.
+UDP has no connection that could be lost. An absent peer shows only in missing replies, or in the network's error (ICMP) that the
+port is closed. This module must not depend on a protocol: it interprets neither the content nor the order of datagrams.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ OPEN_TIMEOUT_S = 5.0
 class UdpConnection(ByteConnection):
     """One end of an exchange of datagrams (in the paper, a TCP connection, since it has no other network connection).
 
-    Only datagrams of the peer are accepted. At most `max_pending` of them wait here; further ones are dropped and
-    counted, as in the network. If boundaries matter, do not use `read_pending`, which joins the waiting datagrams.
+    Only datagrams of the peer are accepted. This object holds at most `max_pending` unread datagrams; it drops and counts
+    further ones. If the boundaries of datagrams matter, do not use `read_pending`, which joins the waiting datagrams.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 256) -> None:
-        """Create an object without a socket; use `open`."""
+        """Create an object without a socket. Create a connection with `open` instead."""
         super().__init__(TCPConnection(), endpoint, max_pending)
         self.dropped = 0
         """Datagrams that arrived while `max_pending` were waiting, and empty ones."""
@@ -76,7 +76,7 @@ class UdpConnection(ByteConnection):
 
 
 class _Wire(asyncio.DatagramProtocol):
-    """The protocol object that asyncio calls."""
+    """The asyncio protocol object of the socket; it passes datagrams and errors to the `UdpConnection`."""
 
     transport: asyncio.DatagramTransport
 

@@ -1,4 +1,4 @@
-"""Start several parts together or not at all, and end them in reverse order. This module must not know what the parts are."""
+"""Start several parts together or not at all, and end them in reverse order. It must not depend on what the parts are."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class AsyncResource(ABC):
         """Start the parts, in order."""
 
     async def _stop(self) -> None:  # noqa: B027  # most resources have nothing to do here
-        """Do what has to happen before the first part is ended. The default does nothing."""
+        """Carry out work that is needed before the first part is ended. The default does nothing."""
 
     async def __aenter__(self) -> Self:
         try:

@@ -1,7 +1,8 @@
 """The paper's event handlers: one Producer, many Consumers, each with its own bounded queue.
 
-A queue is a bounded FIFO, not a set (paper.md, ruling 2): it keeps the order and duplicates; when it overflows, it drops the
-oldest item and counts it. Everything is synchronous and free of I/O: the owner of a Consumer drains it.
+A queue is a bounded FIFO, not a set (docs/explanation/paper.md, ruling 2): it keeps the order and duplicates; when it overflows,
+it drops the oldest item and counts it. No method waits or does I/O: the code that owns a Consumer takes the items out of its
+queue.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A fair lock: it is granted in the order of requests, and costs next to nothing while it is not contended.
+"""A fair lock: tasks get it in the order in which they request it, and taking it while it is free costs little.
 
     if not turn.take():
         await turn.wait()
@@ -7,7 +7,7 @@
     finally:
         turn.pass_on()
 
-`asyncio.Lock` does the same with five calls and two coroutines, which is too slow for code that runs with every exchange.
+`asyncio.Lock` does the same with five calls and two coroutines, which is too slow for code that runs for every request on a bus.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from contextlib import suppress
 
 
 class FairLock:
-    """A fair lock for the tasks of one event loop. Not for threads."""
+    """A fair lock for the tasks of one event loop. It must not be used between threads."""
 
     __slots__ = ("_taken", "_waiting")
 
@@ -34,7 +34,7 @@ class FairLock:
         return True
 
     async def wait(self) -> None:
-        """Return when the caller holds the lock. If the wait is cancelled, the lock goes to the next waiting task."""
+        """Wait until the caller holds the lock. If the wait is cancelled, the lock goes to the next waiting task."""
         mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append(mine)
         try:

@@ -23,7 +23,7 @@ def on_stop_signal(call: Callable[[], object]) -> None:
 def stop_signal() -> asyncio.Event:
     """Return an event that SIGINT and SIGTERM set from now on.
 
-    Call this before the program prints its endpoint: a parent process that reads it may send the signal immediately.
+    Call this before the program prints its endpoint: a parent process that reads the endpoint may send the signal immediately.
     """
     stop = asyncio.Event()
     on_stop_signal(stop.set)

@@ -1,7 +1,8 @@
 """Wait for an event with a time limit: the future that is awaited, and the timer that ends the wait.
 
-An event loop for simulated time may offer `timer(delay_s)`, which returns a future that is done after the delay, or
-earlier if the caller sets its result. This takes half the steps of a future and a timer, which all other loops use.
+An event loop for simulated time may offer `timer(delay_s)`, which returns a future that is done after the delay, or earlier if
+the caller sets its result. This takes half as many steps of the event loop as the future and the timer that are used on all other
+loops.
 """
 
 from __future__ import annotations
@@ -25,6 +26,6 @@ def start_timeout(
 
 
 def ring(waiter: asyncio.Future[None]) -> None:
-    """End the wait, unless it has already ended."""
+    """End the wait for `waiter` by setting its result, unless the wait has already ended."""
     if not waiter.done():
         waiter.set_result(None)

@@ -1,4 +1,4 @@
-"""A sleep of a task until a time, which another task can end earlier."""
+"""A wait of a task until a given time, which another task can end earlier."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fieldtwin.gateway.core.concurrency.timeout import ring, start_timeout
 
 
 class Wakeup:
-    """The sleep of one task. It calls `reset`, looks at its work and sleeps; a `wake` since `reset` ends the sleep at once."""
+    """The sleep of one task, which calls `reset`, checks for work and calls `sleep`; a `wake` after `reset` ends the sleep."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -1,4 +1,4 @@
-"""Collects the errors of files, so that one check reports all of them instead of the first."""
+"""Collect the errors in files, so that one check reports all of them instead of only the first."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 class FollowingError(FileInvalid):
     """A part of a file cannot be checked, because a part that it refers to has an error itself.
 
-    `ErrorCollector` drops it: the user has to correct the other error first.
+    `ErrorCollector` does not report it, because the user has to correct the other error first.
     """
 
 
@@ -27,7 +27,7 @@ class ErrorCollector:
 
     @contextmanager
     def collect(self) -> Iterator[None]:
-        """Add a `FileInvalid` of the block, with its `others`, and continue after the block."""
+        """Catch a `FileInvalid` that the ``with`` block raises, add it with its `others`, and continue after the block."""
         try:
             yield
         except FileInvalid as e:

@@ -1,9 +1,9 @@
 """The marker file next to the link of a virtual serial port. It shows whether the program that made the link still runs.
 
 A program that is killed leaves its link, and the kernel gives the number of its pseudo-terminal to the next program that opens
-one. The link then leads to a foreign terminal. The marker is a file beside the link. It names the pseudo-terminal, and the
-program that made the port keeps it locked; the kernel releases the lock when that program ends, however it ends. A link
-without a marker belongs to the user, and is not checked.
+one. The link then leads to the terminal of another program. The marker is a file in the folder of the link. It names the
+pseudo-terminal, and the program that made the port keeps it locked; the kernel releases the lock when that program ends, however
+it ends. A link without a marker belongs to the user, and is not checked.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _SUFFIX = ".fieldtwin"
 
 
 def mark_port(link: Path, device: str) -> int:
-    """Write the marker of `link`, which leads to `device`. Return a descriptor; the port counts as open until it is closed.
+    """Write the marker of `link`, which leads to `device`. Return a descriptor; the port counts as open until the descriptor
+    is closed.
 
     Raises `OSError`.
     """

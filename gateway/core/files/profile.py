@@ -1,8 +1,8 @@
-"""A device profile with everything resolved: addresses as sent, sizes, groups, commands.
+"""A device profile after its file was read: with the addresses as sent, sizes, poll groups and commands.
 
 The driver and the emulator read the same profile and share nothing else: the driver decodes with
 fieldtwin.gateway.devices.codec, the emulator encodes with its own codec, so that a mistake in one codec is not hidden by the
-same mistake in the other. Addresses are shown in two forms, as printed in manuals and as sent.
+same mistake in the other. Messages show addresses in two forms, as printed in manuals and as sent.
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ class Tag:
 
     @property
     def registers(self) -> RegisterRange:
-        """Return the registers of a Modbus tag; the profile's protocol guarantees that it has some."""
+        """Return the registers of a Modbus tag. Must not be called for a tag of a CANopen profile."""
         assert self.at is not None
         return self.at
 
     def number_of(self, value: int | float | str) -> int | float | str:
-        """Return the number for a name of a value (`values: {0: OFF}`), and every other value unchanged."""
+        """Return the number of a value name of the profile (`values: {0: OFF}`), and every other value unchanged."""
         return next((number for number, name in self.values if name == value), value)
 
     @property
@@ -128,7 +128,7 @@ class Tag:
 
 @dataclass(frozen=True, slots=True)
 class MessageBlock:
-    """A block of registers that is passed on unaltered when the tag `when` changes."""
+    """A block of registers that the driver emits unaltered as one message when the tag `when` changes."""
 
     name: str
     at: RegisterRange
@@ -137,7 +137,10 @@ class MessageBlock:
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """The tags that describe samples: one counts them, and one holds their period in seconds."""
+    """The tags that describe the samples of group `poll`: tag `count` counts them, tag `period` holds their period in seconds.
+
+    If no new sample arrives within this period and `slack_ms` milliseconds, the values become uncertain.
+    """
 
     count: str
     period: str
@@ -147,7 +150,10 @@ class Sampled:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """One mailbox: two registers (sequence, length in bytes), the payload after them, and the acknowledged sequence elsewhere."""
+    """One mailbox: `at` covers one register each for sequence and length in bytes, and the payload after them.
+
+    `ack` is the register of the acknowledged sequence.
+    """
 
     name: str
     at: RegisterRange
@@ -301,8 +307,8 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
 
 
 def resolve_gap(text: str, numbering: str) -> RegisterRange:
-    """Read a range of registers, both ends included: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as
-    sent.
+    """Read a gap, a range of registers that a device does not have: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as
+    sent, both ends included.
 
     Raises ValueError with a sentence that names a valid form.
     """

@@ -130,7 +130,7 @@ def _table(form: ProfileForm, at: int | str) -> Table | None:
 def _register_address(
     file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | str, count: int
 ) -> RegisterRange:
-    """Return the address of registers; refuse a coil or a discrete input."""
+    """Return the address of `count` registers. Raises `FileInvalid` for the address of a coil or a discrete input."""
     if _table(form, at) in BIT_TABLES:
         got = resolve_address(at, form.numbering, 1)
         raise file.error(loc, "a single bit", expected="a holding or input register", got=f"{got.table}:{got.address}")

@@ -107,7 +107,7 @@ class TagForm(Strict):
 
 
 class MessageForm(Strict):
-    """A block of registers that is passed on unaltered, as one message, each time the tag `when` changes."""
+    """A block of registers that the driver emits unaltered as one message each time the tag `when` changes."""
 
     at: Address
     registers: int = Field(ge=1, le=125)
@@ -153,7 +153,7 @@ class IdentifyForm(Strict):
 
 
 class TriggerForm(Strict):
-    """The device measures when `tag` is written with `value`; the group `poll` can be read `wait_ms` later."""
+    """The device measures when `value` is written to `tag`; the poll group `poll` can be read `wait_ms` milliseconds later."""
 
     tag: str
     value: int

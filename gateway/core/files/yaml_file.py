@@ -1,7 +1,7 @@
-"""Read YAML as users mean it, with errors that name line and column.
+"""Read YAML without its surprising conversions, and with errors that name line and column.
 
 Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and no number is sexagesimal, so ``OFF``
-and ``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). It is stricter than 1.2 in one respect: a
+and ``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). The reader is stricter than 1.2 in one respect: a
 float needs a point, so that ``8E1`` is a serial frame and not 80. Duplicate keys are refused. The line and column of
 every key and value are kept, so that a validation error can name them.
 
@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
-"""A configuration file larger than this is a mistake (a recording given as a system file, say)."""
+"""The largest size of a configuration file. A larger file is a mistake, such as a recording given as a system file."""
 
 MAX_VALUES = 100_000
 
@@ -164,7 +164,7 @@ def parse(text: str, path: str, *, merges: bool = False) -> YamlFile:
 def _note_positions(
     loader: _Loader, node: yaml.Node, loc: tuple[Key, ...], out: dict[tuple[Key, ...], Position], path: str
 ) -> None:
-    """Walk the node tree, note the position of each value, and refuse duplicate keys."""
+    """Walk the node tree and store the position of each value in `out`. Raises `FileInvalid` for duplicate keys."""
     out.setdefault(loc, (node.start_mark.line + 1, node.start_mark.column + 1))
     if len(out) > MAX_VALUES:  # a few aliases of aliases can expand to millions of values
         raise FileInvalid("the file contains too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
@@ -290,7 +290,7 @@ def _inside(loc: tuple[Key, ...]) -> str:
 
 
 def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
-    """Return pydantic's location without the parts that are not in the file (union tags, "[key]")."""
+    """Return the key path `loc` of a pydantic error without the parts that are not in the file (union tags, "[key]")."""
     out: tuple[Key, ...] = ()
     for part in loc:
         if (*out, part) in file.positions:

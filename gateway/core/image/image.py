@@ -1,13 +1,13 @@
-"""The process image: the data that gateway and PLC share, as a layout over a memory that the caller provides.
+"""The process image: the data that gateway and PLC share, laid out in memory that the caller provides.
 
-There are normally two regions: `INPUTS`, written by the gateway, and `OUTPUTS`, written by the PLC. Each publication
-carries a counter and a time, which show the other process that the writer is alive. Both ends of the memory compare a
-hash of the layout. This module has no mmap, no file and no clock: the caller provides the memory and the time.
+There are normally two regions: `INPUTS`, written by the gateway, and `OUTPUTS`, written by the PLC. Each publication carries a
+counter and a time, which show the other process that the writer is alive. Both processes compare a hash of the layout. This
+module has no mmap, no file and no clock: the caller provides the memory and the time.
 
-Messages (a modem's mailbox) go through a region as rings. The *other* region holds the sequence of the last message that has
-been handled: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for every
-message tag of INPUTS. So neither process overruns a ring, and a mailbox is acknowledged only up to the messages that were
-consumed.
+Messages (the contents of a modem's mailbox) go through ring buffers, one for each message tag of a region. The *other* region
+holds the sequence of the last message that has been handled: the gateway publishes ``<tag>.taken`` for every message tag of
+OUTPUTS, the PLC ``<tag>.consumed`` for every message tag of INPUTS. So neither process overwrites messages that were not handled,
+and a mailbox is acknowledged only up to the messages that were consumed.
 """
 
 from __future__ import annotations

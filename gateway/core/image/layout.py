@@ -1,12 +1,12 @@
 """The contents of a process image: tags, regions, and the positions in bytes that follow from them.
 
-This module only describes the layout. It must not know the memory itself, who maps it, or what a tag means in a plant.
+This module only describes the layout. It must not depend on the memory, the process that maps it, or the meaning of a tag.
 
 A region (one writer, any number of readers) lies in memory as
 
     published counter, u64, alone in its 64 bytes
     4 slots           check sum, counter, time, flags, then every tag's time, value, quality and reason
-    a ring a MESSAGE  2 x depth records of sequence, time, length, check sum, payload
+    ring per MESSAGE  2 x depth records of sequence, time, length, check sum, payload
 
 All numbers are little endian. A ring has twice the depth because a writer that dies between writing new messages and
 publishing them has then overwritten none of the last `depth` published ones.
@@ -37,7 +37,7 @@ RECORD_HEAD = struct.Struct("<QqII")
 
 
 class TagKind(Enum):
-    """The type of a tag's eight bytes. For a MESSAGE they hold the sequence of its last message."""
+    """The type of a tag's value, which has eight bytes. For a MESSAGE the value is the sequence of its last message."""
 
     REAL = "real"
     INT = "int"

@@ -6,7 +6,7 @@ the check sum is right and the slot carries the same number; otherwise it tries 
 then returns its last snapshot, which is counted. A writer that is killed at any instant leaves the last publication
 whole, because it was writing into another slot. There is no lock, and neither writer nor readers wait.
 
-This module must not know who maps the memory, what time it is, or what a value is used for.
+This module must not depend on the process that maps the memory, on a clock, or on the meaning of a value.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class NotEncodable(Bug):
 
 
 class _Region:
-    """Views into the memory of a region, shared by writer and reader. `release` gives them back."""
+    """The base of writer and reader: views into the memory of a region. `release` releases them."""
 
     def __init__(self, memory: memoryview, shape: RegionShape) -> None:
         self.shape = shape
@@ -111,9 +111,10 @@ class RegionWriter(_Region):
     ) -> int:
         """Publish all tags together and return the publication's counter.
 
-        `values` has one entry per tag in the layout's order; of a MESSAGE's entry only quality, reason and time count.
-        `messages` maps a MESSAGE tag to its new messages as (source time in ns, payload), at most `depth` of them.
-        `now_ns` is the heartbeat. Raises `NotEncodable` and publishes nothing if a value or message does not fit.
+        `values` has one entry per tag in the layout's order; of a MESSAGE's entry only quality, reason and time count. `messages`
+        maps a MESSAGE tag to its new messages as (source time in ns, payload), at most `depth` of them. `now_ns` is the time of
+        the publication, the heartbeat of the writer. Raises `NotEncodable` and publishes nothing if a value or message does not
+        fit.
         """
         return self._publish(
             [v.value for v in values],
@@ -139,7 +140,7 @@ class RegionWriter(_Region):
         """Publish from columns that have one entry per tag in the layout's order.
 
         `same` says that values, qualities and reasons are unchanged since the caller last published them, as in most cycles.
-        Those columns are then not examined, which saves 10 to 19 % of a scan. Times may have changed.
+        Those columns are then not examined, which saves 10 to 19 % of the time of a PLC scan. Times may have changed.
         """
         stamps = self._stamps(times_ns)
         if same and not messages and self._packed:
@@ -159,7 +160,7 @@ class RegionWriter(_Region):
         same: bool = False,
         missing: Mapping[int, Reason] | None = None,
     ) -> int:
-        """Publish values that all have one quality and time (a scan), without creating an object per tag.
+        """Publish values that all have one quality and time (the outputs of a PLC scan), without creating an object per tag.
 
         `but` holds the quality of the few tags that differ, by index. A value of None is published as BAD, with the reason that
         `missing` holds for its index, else NEVER_READ. `same` says that `values`, `quality`, `reason` and `but` are unchanged
@@ -227,7 +228,7 @@ class RegionWriter(_Region):
         return self._commit(stamps, now_ns, flags)
 
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
-        """Publish the packed columns with these times."""
+        """Publish the columns packed in `_body`. `stamps` holds the packed time of each tag, `now_ns` is the heartbeat."""
         shape, body, counter = self.shape, self._body, self.counter + 1
         body[shape.times_at : shape.columns_at] = stamps
         shape.head.pack_into(body, 0, counter, now_ns, flags)
@@ -245,7 +246,7 @@ class RegionWriter(_Region):
         marks: bytes | bytearray,
         reasons: bytes | bytearray,
     ) -> None:
-        """Pack the columns into `_body`, with `last` as the messages' sequences."""
+        """Pack the columns into `_body`. `marks` are the qualities; `last` holds the last sequence of each MESSAGE tag."""
         shape, plain = self.shape, list(values)
         for ring in shape.rings:
             plain[ring.index] = last[ring.spec.name]
@@ -385,7 +386,7 @@ class RegionReader(_Region):
         return Snapshot(shape, counter, t_ns, named, values, marks, reasons, stamps, messages)
 
     def _decode_columns(self, columns: bytes) -> tuple[tuple[Scalar | None, ...], bytes, bytes]:
-        """Return values, qualities and reasons."""
+        """Unpack a snapshot's columns; return values, qualities and reasons."""
         values = list(self.shape.columns.unpack(columns))
         reasons, marks = values.pop(), values.pop()
         for i in self.shape.bool_indexes:

@@ -1,6 +1,6 @@
-"""One complete publication of a region, as a reader of a process image receives it. Values only.
+"""One complete publication of a region, as a reader of a process image receives it.
 
-This module must not know where the memory is or who wrote it.
+This module only holds values. It must not depend on the memory or on the process that wrote it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
     `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them for
     one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, the messages that are
     new since the reader's last snapshot, in order; a tag without new messages has no entry. Times stay packed in
-    `stamps` until they are requested, which is rare. As long as no value, quality or reason changes, snapshots share
+    `stamps` until the caller requests one, which is rare. As long as no value, quality or reason changes, snapshots share
     those columns.
     """
 
@@ -67,7 +67,7 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
         return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
 
     def all(self) -> dict[str, TagValue]:
-        """Return every tag by name."""
+        """Return the value of every tag, by name."""
         return {name: self.value(i) for name, i in self.shape.index.items()}
 
     @property

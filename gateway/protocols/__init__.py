@@ -1,1 +1,3 @@
-"""Modbus and CANopen without I/O: bytes and times in, bytes and results out."""
+"""Modbus and CANopen. Most modules do no I/O: the caller passes received bytes and the time; the results are bytes to send, and
+decoded replies.
+"""

@@ -1,1 +1,1 @@
-"""The running gateway: buses, polls, outputs, the bridge, the mailboxes and the image."""
+"""The running gateway: buses and polls, outputs, Modbus bridges, the mailboxes of modems, and the process image."""

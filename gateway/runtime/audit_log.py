@@ -30,8 +30,9 @@ class AuditLog:
         self._file: BinaryIO = os.fdopen(descriptor, "ab", buffering=0)
 
     def note(self, action: str, device: str, *, by: str, result: str, **details: Any) -> None:
-        """Write one entry. `action` is write, nmt, sdo or refuse; `result` is asked, done, refused or failed, with a
-        reason."""
+        """Write one entry. `action` is write, nmt, sdo or refuse. `result` is asked (about to be sent), done, refused or failed,
+        with a reason. `by` names the source. Raises `Unreachable` if the entry cannot be written.
+        """
         entry = {
             "utc_ns": self._clock.utc_ns(),
             "action": action,

@@ -1,7 +1,7 @@
 """The gateway: buses, drivers, tags, outputs and the process image, assembled and run.
 
-The gateway is given a Connector, a clock and an image, and cannot distinguish a plant from its prototype. Its status is plain
-data for the control channel, not formatted for display.
+The caller passes a Connector, a clock and a process image, so the gateway runs in the same way on a real plant and in a
+simulation (digital twin prototype). Its status is plain data for the control channel, not formatted for display.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
-"""The time that a PLC may take to appear after the gateway's start. After it, the outputs are made safe."""
+"""The time after the gateway's start within which the PLC has to appear. Otherwise the outputs get their safe values."""
 _NUMBERS = (int, float)
 
 
@@ -56,7 +56,7 @@ class GatewayConfig:
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()
     delegated: frozenset[str] = frozenset()
-    """Transmitters whose mailboxes belong to a digital thread."""
+    """Names of the transmitters (modems) whose mailboxes a digital thread reads and writes instead of the gateway."""
 
 
 def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
@@ -142,7 +142,7 @@ class Gateway:
             self.tags.declare([name], stale_ms)
 
     def let_trigger(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """Set whether this driver may write the register that makes its device measure."""
+        """Allow or forbid the driver to write the register that starts a measurement of its device, as configured."""
         device, trigger = driver.config, driver.config.profile.form.trigger
         if isinstance(driver, RegisterDriver) and trigger is not None:
             driver.may_trigger = self.config.allow_writes and trigger.tag in device.writable
@@ -184,7 +184,7 @@ class Gateway:
             self.outputs.outputs += [self._make_output(tag) for tag in tags if tag not in known]
 
     def offer(self, tag: str) -> None:
-        """Add a `writable` tag that neither a program nor a server writes as an output, so that a user can write it.
+        """Make a `writable` tag an output, so that a user can write it although neither a program nor a server does.
 
         Any other tag is left as it is; a write of it is then refused.
         """

@@ -1,4 +1,4 @@
-"""The status of a gateway on the control channel: the answer to `get`, for sender and receivers.
+"""The status of a gateway: the answer to `get` on the control channel. The gateway and its clients use these classes.
 
 The fields are the keys of the JSON object, in this order. Fields that apply to some buses or devices only are absent
 where they do not (`msgspec.UNSET`). This module declares data; `fieldtwin.gateway.runtime.status` fills it.
@@ -59,7 +59,7 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     errors: int
     """The number of polls that failed, and of PDOs that were malformed."""
     samples_missed: int | UnsetType = UNSET
-    """For a Modbus device that samples: the number of samples between two polls that were never read."""
+    """For a Modbus device that counts its samples: the number of samples that were replaced before a poll read them."""
     mailbox: bool | UnsetType = UNSET
     conflicts: int | UnsetType = UNSET
     """For a CANopen node: the number of replies from a second node with the same ID."""
@@ -201,11 +201,11 @@ class BridgeStatus(FrontStatus, frozen=True, kw_only=True):
     """A bridge to the units of buses."""
 
     away: list[str]
-    """The units that did not answer and are not asked for a while, as BUS/UNIT."""
+    """The units that did not answer and get no requests for a time, as BUS/UNIT."""
 
 
 class LearntStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """Addresses at which a device refuses reads, as the gateway has found."""
+    """Addresses at which a device refuses reads, as the gateway has found by polling it; see `learnt_gaps`."""
 
     profile: str
     gaps: list[str]
@@ -235,7 +235,7 @@ class ConfigStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole gateway."""
+    """The status of a gateway."""
 
     devices: dict[str, DeviceStatus]
     buses: dict[str, BusStatus]

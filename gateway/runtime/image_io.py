@@ -28,7 +28,7 @@ _BAD = Quality.BAD  # a local name, because looking up an Enum's members is slow
 
 
 class ImageExchange:
-    """The exchange with the PLC: publishes INPUTS from the tag table and the message queues, and reads OUTPUTS.
+    """The exchange with the PLC: publishes the region INPUTS from the tag table and the message queues, and reads OUTPUTS.
 
     `sources` are the queues of input messages by tag. The caller reads `outputs` (values by tag) and `new_messages` (by
     tag, in order) after each `exchange`, and sets `undelivered` to how many of the output messages it has not handled yet.
@@ -49,7 +49,9 @@ class ImageExchange:
         self.undelivered: dict[str, int] = {}
         """By output message tag: how many messages that were read have not been handled yet."""
         self.outputs: dict[str, TagValue] = {}
-        """A new dictionary is made when a value or quality changes; its times are those of that change."""
+        """The PLC's outputs by tag. Replaced by a new dictionary when a value or quality changes; until then, times stay
+        unchanged.
+        """
         self._seen: Snapshot | None = None
         self._taken = [
             (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)
@@ -85,8 +87,11 @@ class ImageExchange:
         self._publish(now_ns)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
-        """Return whether values, qualities and reasons are those of the last call, which snapshots then share. Without
-        this, the virtual run of a scan each 10 ms takes a fifth longer."""
+        """Return whether values, qualities and reasons are the same as at the last call.
+
+        Such snapshots share one list of values. Without this check, a run in virtual time with a scan each 10 ms takes 20 %
+        longer.
+        """
         before, self._seen = self._seen, snapshot
         return before is not None and snapshot.values is before.values
 
@@ -95,8 +100,9 @@ class ImageExchange:
         return (now_ns - self._plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
 
     def all_consumed(self, tag: str) -> bool:
-        """Return whether the PLC has consumed every message of `tag` that it was given; always False if no program
-        takes them."""
+        """Return whether the PLC has consumed every message of `tag` that was published; always False if no program reads this
+        tag.
+        """
         return tag in self._depth and self._consumed.get(tag, 0) >= self._writer.last_sequence(tag)
 
     def _publish(self, now_ns: int) -> None:
@@ -131,10 +137,13 @@ class ImageExchange:
 
 
 class _Columns:
-    """The columns of INPUTS. Only values that are new, or that may have become stale, are looked up again in the tag table."""
+    """The values, qualities, reasons and times of INPUTS, as lists in the order of its tags.
+
+    Only values that are new, or that may have become stale, are looked up again in the tag table.
+    """
 
     def __init__(self, specs: Sequence[TagSpec], tags: TagTable, others: Container[int]) -> None:
-        """Create the columns. `others` are the positions that the exchange itself writes."""
+        """Create the lists. `others` are the positions of tags that are not in the tag table; `put` sets them."""
         self._tags = tags
         self._index = {s.name: at for at, s in enumerate(specs) if s.kind is not TagKind.MESSAGE and at not in others}
         self.values: list[Scalar | None] = [0 if s.kind is TagKind.MESSAGE else None for s in specs]
@@ -147,7 +156,7 @@ class _Columns:
         """No tag becomes stale before this time; it may be earlier than the first one that does."""
 
     def refresh(self, now_ns: int) -> None:
-        """Take over the table's new values, and those that became stale by `now_ns`."""
+        """Copy the tag table's new values, and mark those that became stale by `now_ns`."""
         news = self._tags.take_changes()
         if now_ns > self._earliest_ns:
             self._earliest_ns = FOREVER_NS
@@ -170,7 +179,7 @@ class _Columns:
             self._earliest_ns = until_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
-        """Set a number that the exchange itself provides. It is good from the first time on."""
+        """Set the number at position `at`, which the exchange itself provides. Its quality is good."""
         self.times_ns[at] = now_ns
         if self.values[at] != value:
             self.values[at] = value

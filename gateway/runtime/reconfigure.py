@@ -1,6 +1,7 @@
 """Apply a new configuration to a running gateway: timing, limits, scaling and safe values.
 
-It takes effect between two polls, and no poll is lost or doubled. The plant's switch takes effect at once.
+It takes effect between two polls, and no poll is lost or doubled. Only `remote` (whether remote commands are accepted) takes
+effect at once.
 
 Buses, devices, addresses, tags and their bindings must be unchanged: the caller has compared the files
 (`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never a mixture; stored values are
@@ -24,7 +25,7 @@ OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, 
 
 
 async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
-    """Apply `config`. Return when every device has it, which may be after a long group has been read."""
+    """Apply `config`. Return when every device uses it; this may take until the present read of a long group has ended."""
     gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices, remote=config.remote)
     for pump in gateway.pumps:
         pump.remote = config.remote
@@ -59,7 +60,7 @@ class _Taking:
     def _understand(self, driver: AnyDriver, before: DeviceProfile) -> None:
         """Decode the last values of the device again with the new profile.
 
-        Their age, and a bad quality for another reason, stay.
+        Their age stays unchanged, and so does a bad quality whose reason is not in `OF_DECODING`.
         """
         tags, name = self._gateway.tags, driver.config.name
         changed = {n for n, tag in driver.profile.tags.items() if tag != before.tags[n] and tag.readable}

@@ -76,7 +76,7 @@ class ServedTag:
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """One server. `if_bad` "nan" is for floats; other types have no bit pattern that cannot be a value.
+    """The configuration of one server. With `if_bad` "nan", a bad float reads as NaN; no other type has a value for that purpose.
 
     Clients whose certificate has one of `roles` (MBTLS 8.4) may read, and those with one of `write_roles` may also write; None:
     every client, also without a certificate. A client that is silent for `idle_s` is disconnected; 0: never.
@@ -216,7 +216,7 @@ class TagServer:
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def _read(self, function: int, access: Access) -> bytes:
-        """Read the whole range, or nothing (for reads, the same as case MB-041)."""
+        """Return the data of the whole range, or raise the exception reply: a range is never read in part (case MB-041)."""
         now_ns = self._clock.monotonic_ns()
         parts = [self._cell_bytes(function, cell, now_ns) for cell in self._covered(function, access)]
         if access.table not in BIT_TABLES:

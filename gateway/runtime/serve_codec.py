@@ -1,4 +1,6 @@
-"""Tag values as registers for the gateway's clients, and back. Pure; big endian (AP 4.2), `order` as in profiles."""
+"""Tag values as registers for the gateway's clients, and back. Registers are big-endian (AP 4.2); `order` is the byte order
+as in profiles.
+"""
 
 from __future__ import annotations
 

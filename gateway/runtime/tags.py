@@ -24,7 +24,7 @@ _GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an En
 
 
 class Published(msgspec.Struct, frozen=True, gc=False):
-    """A good value that was published: number (from 1), tag, bytes that the device sent, engineering value, source time."""
+    """A good value that was published: number (from 1), tag, bytes that the device sent, engineering value, source time (ns)."""
 
     number: int
     tag: str
@@ -52,7 +52,7 @@ class Held:
 
 
 class TagTable:
-    """The values by full tag name: the `TagSink` of the drivers, and the source for image, status and store."""
+    """The values by full tag name. Drivers write them (`TagSink`); the process image, the status and the data store read them."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

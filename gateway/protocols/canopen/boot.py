@@ -1,7 +1,7 @@
 """Boot a node as CiA 302-2 describes: check that it is the expected node, and that it holds the required configuration.
 
-The procedures use a master. They know object numbers of the standards but no particular device. The caller decides whether
-writing is allowed, and how to react to an error.
+The procedures use a master. They use objects of the standards only, and are independent of particular devices. The caller decides
+whether writing is allowed, and how to react to an error.
 """
 
 from __future__ import annotations

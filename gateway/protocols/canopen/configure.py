@@ -1,6 +1,6 @@
 """Configure a node over SDO when it starts, as CiA 301 prescribes, and read the configuration back.
 
-The procedures use a master; they know object numbers of CiA 301 but no particular device.
+The procedures use a master. They use objects of CiA 301 only, and are independent of particular devices.
 """
 
 from __future__ import annotations

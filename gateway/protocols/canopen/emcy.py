@@ -1,4 +1,4 @@
-"""Emergency messages (CiA 301, 7.2.7), by which a node reports its errors. Parsing only; keeps no history."""
+"""Parse emergency messages (CiA 301, 7.2.7), by which a node reports its errors. `emcy_log` keeps their history."""
 
 from __future__ import annotations
 

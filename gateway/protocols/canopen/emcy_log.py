@@ -1,4 +1,4 @@
-"""The errors that a node has reported: the last emergency messages and the errors that are still active. Pure, bounded."""
+"""The errors that a node has reported: the last emergency messages and the errors that are still active. Limited in size."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The CANopen master on one bus: the only reader of a CanConnection, and the services that drivers use.
+"""The CANopen master on one bus. It alone reads the bus's CanConnection, and it provides the services that drivers use.
 
-It is a thin asyncio layer around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no particular device and no bus
-hardware; the parts quote the clauses of the standard.
+It is a thin asyncio layer around the protocol modules (`sdo`, `nmt`, `pdo`, `emcy`), which quote the clauses of the standard. It
+is independent of particular devices and of bus hardware.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class CanopenMaster:
     async def end_transfers(self, timeout_s: float) -> None:
         """Send no further SDO request: wait for the transfers under way, for `timeout_s` seconds at most.
 
-        A transfer that is asked for later waits until it is cancelled. NMT commands and PDOs can still be sent.
+        A transfer that is requested later waits until it is cancelled. NMT commands and PDOs can still be sent.
         """
         ending = [asyncio.ensure_future(channel.end()) for channel in self._channels.values()]
         if ending:

@@ -1,4 +1,4 @@
-"""Scan the bus for nodes: first listen for heartbeats, then ask every node ID for its device type. The scan writes nothing.
+"""Scan the bus for nodes: first listen for heartbeats, then read the device type of every node ID. The scan writes nothing.
 
 It sends one request at a time, with a pause in between, so that a running plant is not disturbed.
 """
@@ -41,7 +41,7 @@ async def scan_nodes(
     timeout_s: float = 0.1,
     on_progress: Callable[[int], None] | None = None,
 ) -> tuple[FoundNode, ...]:
-    """Return the nodes of the bus, by node ID. `on_progress` is called with each node ID before it is asked.
+    """Return the nodes of the bus, by node ID. `on_progress` is called with each node ID before the request to it.
 
     The scan takes `listen_s`, plus `timeout_s` and `pause_s` for each absent node ID: with the defaults, at most 17 s. Raises
     `ConnectionLost`.
@@ -60,7 +60,7 @@ async def scan_nodes(
 
 
 async def _ask(master: CanopenMaster, node: int, timeout_s: float) -> tuple[bool, Identity | None]:
-    """Return whether the node answers, and its identity."""
+    """Return whether the node answers SDO requests, and its identity, None if the node does not report it."""
     try:
         await master.sdo_upload(node, DEVICE_TYPE, 0, timeout_s, retries=0)
     except ReplyTimeout:

@@ -1,7 +1,7 @@
 """The Modbus client. It has one connection, carries out one exchange at a time, and sends each request once.
 
-It moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the silences of the line, and counts results. It never
-retries, reconnects or scales values: the runtime and the drivers do that. It opens nothing.
+It moves bytes between a `ByteConnection` and a `Transaction`, keeps the silences that a serial line requires, and counts results.
+It never retries, reconnects or scales values: the runtime and the drivers do that. The caller opens the connection.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ R = TypeVar("R", bound=Reply)
 
 
 class ModbusClient:
-    """A Modbus client on `connection`, which the client owns from now on.
+    """A Modbus client on `connection`, which the client owns, and closes in `aclose`.
 
     `serial` gives the character time of a serial line. It is used for silences, and for deadlines that exclude the time of
     transmission. Without it (RTU inside TCP) frames need no silence. `timeout_s` is the time in which a unit has to answer,
     `turnaround_s` the time that all units get to execute a broadcast, `spacing_s` a pause after every exchange, and `silence_s`
-    the silence before a request if it differs from that of SL 2.5.1.1. `RtuFramer` describes `echo` and `strict`, and
-    `MbapFramer` `accepts_zero_id`. The constructor raises `UsageError` for a setting that the framing does not have.
+    the silence before a request if it differs from that of SL 2.5.1.1. `echo` and `strict` are described in `RtuFramer`,
+    `accepts_zero_id` in `MbapFramer`. The constructor raises `UsageError` for a setting that the framing does not have.
     """
 
     def __init__(
@@ -356,15 +356,17 @@ class ModbusClient:
         return self._line.may_go(self._clock.monotonic_ns())
 
     async def _await_spacing(self, unit: int) -> None:
-        """Wait for the pause of `unit`. Bytes that arrive meanwhile belong to no request."""
+        """Wait until `unit` needs no more pause. Bytes that arrive meanwhile belong to no request; they are counted and
+        discarded.
+        """
         while (until_ns := self.units.spaced_ns(unit)) > self._clock.monotonic_ns() and self._connection.lost is None:
             data = await self._read_until(until_ns)
             self._drain(data, self._clock.monotonic_ns(), live=True)
 
     async def _await_silence(self) -> None:
-        """Wait until a request may be sent, and return the time. Bytes that arrive before belong to no request and are drained.
+        """Wait until a request may be sent. Bytes that arrive before belong to no request; they are counted and discarded.
 
-        Raises `Desync` if the line does not become silent, `ConnectionLost` if it is gone.
+        Raises `Desync` if the line does not become silent, `ConnectionLost` if the connection was lost.
         """
         now_ns = self._clock.monotonic_ns()
         babble_ns = self._line.babble_ns(now_ns)
@@ -404,7 +406,7 @@ class ModbusClient:
     async def _read_pending(self) -> bytes:
         """Return the bytes that have already arrived, possibly none.
 
-        Of datagrams, only the first one is returned, so that they are never joined.
+        If the link carries datagrams, only the first one is returned, so that two are never joined.
         """
         connection = self._connection
         if not self._framer.datagrams:

@@ -1,8 +1,9 @@
 """The serial line between two exchanges: the silence before a request, and the quarantine after a failed exchange.
 
 On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no request
-is sent until the line has been silent for as long as the slowest reply so far took (case MB-013). Pure: the caller reports
-what arrived and when, and this module returns the time until which the caller has to wait. Times are monotonic nanoseconds.
+is sent until the line has been silent for as long as the slowest reply so far took (case MB-013). This module does no I/O: the
+caller reports the times of sent and received bytes, and gets the time until which it has to wait. Times are monotonic
+nanoseconds.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _LONGEST_LATENCY_NS = 60 * NS_PER_S
 
 _BABBLE_FACTOR = 3
 _BABBLE_GRACE_NS = 500 * NS_PER_MS
-"""The time beyond `_BABBLE_FACTOR` required silences after which a line that is still not silent is reported."""
+"""The wait for silence fails after `_BABBLE_FACTOR` times the required silence plus this time."""
 
 
 class LineSilence:
@@ -51,7 +52,7 @@ class LineSilence:
         self._before_quarantine = (0, 0)
 
     def restate(self, *, turnaround_ns: int, spacing_ns: int) -> None:
-        """Use these pauses from the next exchange on."""
+        """Use these pauses (see the class) from the next exchange on."""
         self._turnaround_ns, self._spacing_ns = turnaround_ns, spacing_ns
 
     def may_go(self, now_ns: int) -> bool:
@@ -65,7 +66,7 @@ class LineSilence:
         return True
 
     def clear_ns(self, now_ns: int) -> int:
-        """Return when a request may be sent if nothing more arrives."""
+        """Return the time at which a request may be sent if no more bytes arrive."""
         silent_ns = now_ns if self._active_ns is None else self._active_ns + self._required_ns
         return max(silent_ns, self._not_before_ns)
 
@@ -82,7 +83,10 @@ class LineSilence:
             self.longest_latency_ns, self._required_ns = self._before_quarantine
 
     def heard(self, now_ns: int, *, live: bool) -> None:
-        """Note bytes that arrived between exchanges. If they arrived just now (`live`), they show how late a reply can be."""
+        """Note bytes that arrived between exchanges.
+
+        `live` says that they arrived at `now_ns`, not earlier. During a quarantine such bytes show how late a reply can be.
+        """
         self._active_ns = now_ns
         if live and self._in_quarantine:
             self._note_latency(now_ns)
@@ -108,9 +112,9 @@ class LineSilence:
             self._before_quarantine = self.longest_latency_ns, self._required_ns
 
     def passed_over(self, now_ns: int) -> None:
-        """Note that a unit did not answer, and that the line stays usable for other units.
+        """Note that a unit did not answer, without a quarantine: the line stays usable for other units.
 
-        The caller does not ask the unit again before its late reply can no longer arrive.
+        The caller sends the unit no request until its late reply can no longer arrive.
         """
         self._end(now_ns, self._t35_ns)
 

@@ -1,7 +1,7 @@
-"""One request that awaits its reply: bytes and `now` in, the reply or a typed error out.
+"""One request and its reply, without I/O: the caller passes received bytes and the time, and gets the reply or a typed error.
 
 A Modbus client has at most one transaction on a link. It ends exactly once: by its reply, by an error, or by its
-deadline. A transaction does not wait or retry, and knows no connection.
+deadline. A transaction does not wait or retry, and does not access a connection.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Transaction(Generic[R]):
         if char_time_ns and (nominal := request.nominal_length()):
             self._granted_ns += framer.wire_length(nominal) * char_time_ns
         self.sent_ns = 0
-        """The time at which the last character was sent."""
+        """The monotonic time (ns) at which the last character was sent."""
         self.deadline_ns = self._granted_ns
-        """The time at which the reply has to be complete."""
+        """The monotonic time (ns) at which the reply has to be complete."""
         self.done = False
 
     @property
@@ -81,8 +81,8 @@ class Transaction(Generic[R]):
             raise
 
     def poll(self, now_ns: int) -> R | None:
-        """Handle the passing of time. Returns as `feed`; at the deadline raises the error of `Framer.overdue`, usually
-        `ReplyTimeout`.
+        """Handle the passing of time, and return a reply as `feed` does; at the deadline raises the error of `Framer.overdue`,
+        usually `ReplyTimeout`.
         """
         if self.done or not self._frame:
             raise _not_under_way()

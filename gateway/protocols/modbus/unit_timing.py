@@ -1,6 +1,6 @@
 """The timing of a client's units: the timeout and the pause of each, shortened timeouts, and replies that may still arrive.
 
-Pure: times are monotonic nanoseconds, passed in. This module sends nothing.
+This module does no I/O. Times are monotonic nanoseconds, which the caller passes.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class UnitTiming:
         removes the entries.
         """
         self.shortened_timeouts = 0
-        """The number of `timeouts` that were of units with a shortened timeout."""
+        """The number of timeouts of units whose timeout was shortened. `ClientCounters.timeouts` includes them."""
         self.not_waited = 0.0
         """The sum of the time saved by shortened timeouts, each as a fraction of the unit's normal timeout."""
 
@@ -103,9 +103,9 @@ class UnitTiming:
         return unit in self.shortened_ns
 
     def spaced_ns(self, unit: int) -> int:
-        """Return the time (ns) from which `unit` may be asked, or 0 if it may be asked now.
+        """Return the time (ns) from which a request may be sent to `unit`, or 0 if it needs no pause.
 
-        That is when its pause is over and a late reply can no longer arrive. A broadcast (unit 0) waits for the pauses of all
+        At that time its pause is over, and a late reply can no longer arrive. A broadcast (unit 0) waits for the pauses of all
         units.
         """
         if unit == 0 and self._has_broadcast:
@@ -122,9 +122,10 @@ class UnitTiming:
                 self.spaced[one] = now_ns + round(pace.spacing_s * NS_PER_S)
 
     def pass_over(self, unit: int, sent_ns: int, now_ns: int, timeout_ns: int, latency_ns: int) -> None:
-        """Delay only the next request to a unit that did not answer within its shortened `timeout_ns`.
+        """Note that `unit` did not answer within its shortened `timeout_ns`: delay its next request; other units can use the
+        line.
 
-        Other units can use the line.
+        The request was sent at `sent_ns`; `latency_ns` is the longest response time on the line so far.
         """
         own_ns = round(self._timeout_of(unit) * NS_PER_S)
         self.shortened_timeouts += 1
@@ -147,7 +148,7 @@ class UnitTiming:
 
 
 def checked_timeout(timeout_s: float) -> float:
-    """Return `timeout_s`. Raises `UsageError` if it is outside of 0 to 3600 s, or 0."""
+    """Return `timeout_s`. Raises `UsageError` unless it is above 0 and at most 3600 s."""
     if not 0.0 < timeout_s <= 3600.0:
         raise UsageError("Modbus timeout out of range", expected="over 0 to 3600 s", got=f"{timeout_s} s")
     return timeout_s

@@ -18,7 +18,7 @@ MOST_CLIENTS = 256
 
 
 class WriteRecord:
-    """The audit entries of one bridge. `lost` counts entries that could not be written."""
+    """Writes the audit entries of one bridge. `lost` counts entries that could not be written."""
 
     def __init__(self, audit: AuditLog, clock: Clock) -> None:
         self.lost = 0

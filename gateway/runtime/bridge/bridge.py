@@ -1,10 +1,10 @@
 """The bridge: it forwards a client's request to the addressed unit, and returns that unit's answer.
 
-Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A unit ID without a route gets
-exception 0A, a unit that does not answer gets 0B, each once (TG 4.4.2.5). The request goes through the target bus's own queue,
-after the PLC's writes and alternating with its polls. After a unit did not answer, the bridge sends it no requests for a time
-that grows with each failure. Meanwhile its clients get 0B immediately (case MB-062). Every write is recorded in the audit log
-before it is sent.
+Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A request is answered with a
+single exception 0A if its unit ID has no route, and with a single 0B if the unit does not answer (TG 4.4.2.5). The request goes
+through the target bus's own queue, after the PLC's writes and alternating with the bus's polls. After a unit did not answer, the
+bridge sends it no requests for a time that grows with each failure. Meanwhile clients that address the unit get 0B immediately
+(case MB-062). Every write is recorded in the audit log before it is sent.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Route:
 @dataclass(frozen=True)
 class BridgeConfig:
     """One bridge. `listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose client
-    sends requests to us.
+    sends requests to the gateway.
 
     `routes` are searched first; a unit ID that is not in them keeps its ID on the bus `to`, if that is given. With `broadcast`,
     unit ID 0 is forwarded to every serial line that the bridge reaches, and no unit answers; with `answer_broadcast` the bridge
@@ -105,9 +105,9 @@ class BridgeConfig:
 class BridgeCounters:
     """Counters of the outcomes of requests.
 
-    Requests in `no_path` and `refused` were not forwarded. Those in `spared` and `full` were answered without using the bus,
-    because the unit had not answered before or the queue was full. Those in `silent` got no answer from the unit, and those in
-    `unread` were answered after the client had disconnected.
+    Requests in `no_path` and `refused` were not forwarded. Those in `spared` and `full` were answered without using the bus:
+    `spared` because the unit had not answered before, `full` because the queue was full. Those in `silent` got no answer from the
+    unit, and those in `unread` were answered after the client had disconnected.
     """
 
     requests: int = 0
@@ -131,7 +131,8 @@ class _Away:
 class Bridge:
     """One bridge, which runs until cancelled.
 
-    `buses` are those of the gateway. `blocked` returns the reason why a unit must not be written to, or ""."""
+    `buses` are those of the gateway, by name. `blocked(bus, unit)` returns the reason why a unit must not be written to, or "".
+    """
 
     def __init__(
         self,
@@ -185,7 +186,7 @@ class Bridge:
         await self.front.run()
 
     def status(self) -> BridgeStatus:
-        """Return where the bridge listens, its clients, its counters, and the units that are away."""
+        """Return where the bridge listens, its clients, its counters, and the units that get no requests for a time."""
         front, now_ns = self.front.status(), self._clock.monotonic_ns()
         return BridgeStatus(
             listening=front.listening,

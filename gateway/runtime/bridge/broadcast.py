@@ -1,7 +1,6 @@
 """The answer to a client that sent a broadcast through a bridge, for clients that expect an answer to every request.
 
-Units on a serial line do not answer a broadcast (SL 2.1), so the answer only shows that it was sent. This module must
-not know a connection.
+Units on a serial line do not answer a broadcast (SL 2.1), so the answer only shows that it was sent. This module does no I/O.
 """
 
 from __future__ import annotations

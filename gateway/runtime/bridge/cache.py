@@ -1,7 +1,7 @@
-"""A short-lived cache of read replies, so that ten screens cause no more traffic on the bus than one.
+"""A short-lived cache of read replies, so that ten HMIs cause no more traffic on the bus than one.
 
 The cache is limited in size. A reply older than `age_ms` is never returned, and a write to a unit deletes the replies of that
-unit. Pure.
+unit. This module does no I/O.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 
 @dataclass
 class BridgeLineCounters:
-    """Counters: all frames, requests to our units, answers that came too late, and bytes that were not part of a frame."""
+    """Counters: all frames, requests to unit IDs for which the gateway answers, late answers, and bytes outside of frames."""
 
     frames: int = 0
     requests: int = 0
@@ -36,7 +36,7 @@ class BridgeLineCounters:
 class LineFront:
     """A serial line, which runs until cancelled; a lost port is opened again.
 
-    `ours` returns whether the gateway answers for a unit.
+    `ours` returns whether the gateway answers for a unit ID.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """The allow-list of a bridge: which client networks and roles may use which units, functions and address ranges. Every
 other request is refused.
 
-Pure: clients' addresses and roles are text, requests are `ServerRequest`. This module does not know connections, buses or time.
+The addresses and roles of clients are text, and requests are `ServerRequest`. This module does no I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Modbus TCP clients of the gateway, with or without TLS: their connections, and answers in the order of the requests.
 
-This module does not know how a request is answered: the caller's `ask` takes a request and returns its answer or a future. A
+The function `ask`, which the caller passes, takes a request and returns its answer or a future. A
 client may have a limited number of unanswered requests (further ones get exception 06, case MB-053). While a client does not read
 its answers, its requests are not read either. When its connection is lost, the pending futures are cancelled, because the answers
 are no longer needed (case MB-060). A client that only closes its own direction (FIN after its last request) gets its answers
@@ -27,8 +27,8 @@ from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 
 REQUEST_WITHIN_S = 10.0
-"""A request that has begun must be complete within this time; otherwise its client is closed. Without this limit, a
-client that sends one byte at a time would keep its place without end."""
+"""A request that has begun must be complete within this time; otherwise the client is disconnected. Without this limit, a
+client that sends one byte at a time would keep its connection forever."""
 
 MOST_UNSENT = 64
 """The number of answers that may wait for a client to read them. While more wait, no more of its requests are accepted."""
@@ -63,7 +63,7 @@ Refused = Callable[[Caller, int, bytes, int, str], None]
 
 
 def _ignore(caller: Caller, unit: int, pdu: bytes, code: int, why: str) -> None:
-    """Do nothing."""
+    """Do nothing; the default for `Refused`."""
 
 
 @dataclass

@@ -16,7 +16,7 @@ class Backoff:
         self._first_s, self._limit_s = first_s, limit_s
 
     def next_s(self) -> float:
-        """Note a failure, and return the delay before the next try."""
+        """Note a failure, and return the delay before the next attempt, in seconds."""
         delay = min(self._limit_s, self._first_s * 2.0 ** min(self.failures, 20))
         self.failures += 1
         return delay

@@ -1,7 +1,7 @@
 """The interface of a bus to the gateway and its outputs, the same for each protocol.
 
 Devices and tags are named as in the system file (``speed`` of ``drive``), so that a caller needs no driver of a certain
-protocol. This module must not know a protocol: services that only one protocol has (jobs, LSS) are methods of its bus class.
+protocol. This module is independent of protocols: services that only one protocol has (jobs, LSS) are methods of its bus class.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_LOCALS = 64
 
 
 class HeldBack(NotAllowed):
-    """A member of a group was not written, because a different member of the group could not be written."""
+    """A tag of an output group was not written, because a different tag of the group could not be written."""
 
 
 def not_sent(where: str) -> HeldBack:

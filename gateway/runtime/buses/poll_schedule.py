@@ -1,8 +1,8 @@
 """The schedule of a device's poll groups: each group has its own period and its own phase in that period.
 
 Groups with the same period are spread over it in the file's order, so that a bus does not get all requests at the same time. All
-times are on a grid that begins when the bus starts. A missed period is counted and skipped; the read is not made up for. Pure:
-times are monotonic nanoseconds, passed in.
+times are on a grid that begins when the bus starts. A missed period is counted and skipped; the read is not made up for. This
+module does no I/O. Times are monotonic nanoseconds, which the caller passes.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def spread(
 ) -> dict[K, PollSlot]:
     """Return a phase for each of `groups` (key, period in ms), which are all on one bus.
 
-    The k-th of the n groups of one period P is at P x (k + offset) / n. `offset`, 0 to less than 1, keeps several buses
-    apart. A configured phase is used as it is, modulo the period.
+    The k-th of the n groups of one period P is at P x (k + offset) / n. `offset`, 0 to less than 1, shifts these phases,
+    so that several buses are not polled at the same time. A configured phase is used as it is, modulo the period.
     """
     stated = stated_ms or {}
     members: dict[int, list[K]] = {}
@@ -113,7 +113,7 @@ class PollSchedule:
             self.due_ns.pop(group, None)
 
     def _place(self, rate: PollSlot, after_ns: int) -> int:
-        """Return the first slot on the grid of `rate` after `after_ns`."""
+        """Return the time (ns) of the first slot on the grid of `rate` after `after_ns`."""
         start_ns = self._epoch_ns + rate.phase_ns
         return start_ns + ((after_ns - start_ns) // rate.period_ns + 1) * rate.period_ns
 
@@ -162,5 +162,5 @@ class PollSchedule:
         )
 
     def defer(self, group: str, until_ns: int) -> None:
-        """Make `group` due at `until_ns` instead of its slot on the grid, because the device asked for time."""
+        """Make `group` due at `until_ns` instead of its slot on the grid, because the device is busy or is measuring."""
         self.due_ns[group] = until_ns

@@ -1,1 +1,1 @@
-"""The mailboxes of a transmitter, connected to the control logic."""
+"""The mailboxes (inbox and outbox registers) of a transmitter, such as an acoustic modem, and their use by the control logic."""

@@ -1,8 +1,7 @@
-"""The exchanges with a transmitter's mailboxes, one at a time: acknowledge what was received, and send when there is
-room.
+"""The requests to a transmitter's mailboxes, one at a time: acknowledge a received message, and send one when the outbox is free.
 
 The outbox is not checked more often than the modem's own speed justifies. Both ends of a link use this module: the plant's
-gateway and the topside end.
+gateway and the topside controller.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ INBOX_KEPT = 256
 class Patience:
     """The decision when to check a full outbox, from the time that the previous message took to leave it.
 
-    The next check is after three quarters of that time, so that a modem that became faster is noticed. Pure; times are monotonic
+    The next check is after three quarters of that time, so that a modem that became faster is noticed. Times are monotonic
     nanoseconds.
     """
 
@@ -50,7 +49,7 @@ class Patience:
         self._was_full = True
 
     def sent(self, now_ns: int) -> None:
-        """Note that there was room, and a message was put into the outbox."""
+        """Note that the outbox was free, and that a message is written into it at `now_ns`."""
         if self._sent_ns is not None:
             took_ns = (now_ns - self._sent_ns) * 3 // 4
             # If the outbox was not checked while it was full, it became free at an unknown earlier time.
@@ -72,7 +71,9 @@ class Inbox(Consumer[DATA]):
 
 
 class Mailboxes:
-    """The exchanges of `driver` on `bus`. When one ends, `busy` becomes False, and `ended` is called with its error or None."""
+    """The mailbox requests of `driver` on `bus`. When one ends, `busy` becomes False, and `ended` is called with its error or
+    None.
+    """
 
     def __init__(
         self,
@@ -88,15 +89,15 @@ class Mailboxes:
 
     @property
     def ready(self) -> bool:
-        """Return whether another exchange may begin."""
+        """Return whether the next request may begin: none is under way, and the device is online."""
         return not self.busy and self._bus.online(self.driver)
 
     def acknowledge(self) -> None:
-        """Acknowledge the message that was taken, so that the next one can arrive."""
+        """Acknowledge the received message, so that the transmitter can put the next one into the inbox."""
         self._submit(self.driver.acknowledge)
 
     def send(self, now_ns: int) -> None:
-        """Send the first queued message, into an outbox that is free."""
+        """Write the first queued message into the outbox, which must be free."""
         self._patience.sent(now_ns)
         self._submit(self.driver.send)
 
@@ -106,7 +107,7 @@ class Mailboxes:
             self._submit(self._check)
 
     def next(self, now_ns: int, *, taken: bool) -> None:
-        """Start the exchange that is due, if any. `taken` says that everything that was received may be acknowledged."""
+        """Start the request that is due, if any. `taken` says that the received message may be acknowledged."""
         if not self.ready:
             return
         if self.driver.to_acknowledge and taken:

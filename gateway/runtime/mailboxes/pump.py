@@ -1,10 +1,9 @@
-"""The connection between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send if there
-is room.
+"""Pass messages between a transmitter's mailboxes and the control logic.
 
-A mailbox is acknowledged only when the PLC has consumed its message, so a command is not lost if the gateway process dies before.
-The consumption is stored before the acknowledgement, so that the next gateway process does not deliver the message again. A plant
-whose switch is set to `local` accepts no commands: they are acknowledged, refused and recorded. While mailboxes are delegated to
-a digital thread, this module does not read or write them.
+A mailbox is acknowledged only when the PLC has consumed its message, so a command is not lost if the gateway process dies before
+that. The consumption is stored before the acknowledgement, so that the next gateway process does not deliver the message again.
+If `remote` is `local` in the system file, the plant accepts no commands: they are acknowledged, refused and recorded. While
+mailboxes are delegated to a digital thread, this module does not read or write them.
 """
 
 from __future__ import annotations
@@ -26,7 +25,10 @@ RETRY_NS = 1000 * NS_PER_MS
 
 
 class MailboxPump:
-    """The pump of one transmitter. `inbox` holds the received messages that the PLC has not got yet. `tick` never waits."""
+    """The message transfer of one transmitter. `inbox` holds received messages that are not yet passed to the PLC.
+
+    `tick` never waits.
+    """
 
     def __init__(
         self,
@@ -40,15 +42,14 @@ class MailboxPump:
         taken: AckedCommandStore | None = None,
         journal: Refusals | None = None,
     ) -> None:
-        """Create the pump.
+        """Create the message transfer.
 
         `journal` records the messages that do not reach the transmitter, and the commands that are refused.
         """
         self.driver = driver
         self._journal = journal
         self._withheld: tuple[str, object] | None = None
-        """The last report to the journal about a plant that must not be written, so that each message is reported
-        once."""
+        """The last message that was reported to the journal because the plant is read-only, so that each is reported once."""
         self._taken = taken or AckedCommandStore(None)
         driver.taken_before = self._taken.of(driver.config.name)
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
@@ -56,7 +57,7 @@ class MailboxPump:
             driver.emitter.subscribe(self.inbox)
         self.commands_refused = 0
         self.remote = remote
-        """The plant's switch; it may change at any time."""
+        """Whether the plant accepts remote commands (`remote` in the system file); it may change at any time."""
         self._boxes = Mailboxes(driver, bus, self._ended)
         self._bus = bus
         self._audit = audit
@@ -69,7 +70,7 @@ class MailboxPump:
     def command(self, payload: bytes, by: str) -> bool:
         """Handle and record a command that did not come through the mailbox.
 
-        Return False if the plant's switch is set to `local`.
+        Return False if the command is refused because the plant accepts no remote commands.
         """
         name = self.driver.config.name
         result = "taken" if self.remote else "the plant is switched to local"
@@ -84,7 +85,7 @@ class MailboxPump:
     def offer(self, payloads: list[bytes]) -> None:
         """Queue messages of the control logic, in order.
 
-        If the mailbox is delegated, its thread reads them from the process image.
+        If the mailbox is delegated, do nothing: the digital thread reads the messages from the process image.
         """
         if self._lent:
             return
@@ -97,7 +98,7 @@ class MailboxPump:
         return len(self.driver.consumer.queue) + self._sending
 
     def refuse_when_local(self) -> None:
-        """Refuse the messages that arrived while the plant's switch is set to `local`."""
+        """Refuse the received messages if the plant accepts no remote commands."""
         if not self.remote:
             for item in self.inbox.drain():
                 self.commands_refused += 1
@@ -130,7 +131,7 @@ class MailboxPump:
                 )
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
-        """Start the next exchange. `all_consumed` says that the PLC has consumed all messages that it got."""
+        """Start the next mailbox request. `all_consumed` says that the PLC has consumed all messages that were passed to it."""
         self._now_ns = now_ns
         self._keep(all_consumed)
         if not self._allow_writes:
@@ -148,8 +149,10 @@ class MailboxPump:
                 self._boxes.send(now_ns)
 
     def _keep(self, all_consumed: bool) -> None:
-        """Store whether the message in the inbox was taken. Until the device is online, the content of the inbox is
-        unknown."""
+        """Store whether the message in the inbox was consumed, so that it is not delivered again.
+
+        Until the device is online, the content of the inbox is unknown.
+        """
         driver, name = self.driver, self.driver.config.name
         with suppress(Unreachable):  # without the file the message may be delivered twice
             if driver.to_acknowledge:
@@ -159,7 +162,7 @@ class MailboxPump:
                 self._taken.note(name, b"")
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
-        """Record the write before it is sent. If it cannot be recorded, it waits and is tried again."""
+        """Record a write in the audit log before it is sent. Return False if that fails; the write is then tried again later."""
         name = self.driver.config.name
         try:
             self._audit.note("write", name, by="plc", result="asked", tag=f"{name}.{tag}", old=None, new=new)

@@ -78,7 +78,7 @@ class Output:
         return any(tag in driver.profile.group(group) for group in driver.config.poll)
 
     def shown(self, value: object) -> object:
-        """Return `value` for the audit log; a secret value is hidden."""
+        """Return `value` as it is written into the audit log: a secret value is replaced by a fixed text."""
         return "(secret)" if self.driver.profile.tags[self.local].secret else value
 
     def answer(self, error: FieldtwinError | None) -> None:

@@ -101,7 +101,7 @@ class OutputWriter:
             self._start(output, value)
 
     def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[RefusalCause, FieldtwinError | None]:
-        """Return the cause and the error if a client's write of a tag must not be started; the error is None if it may."""
+        """Return the cause and the error if a client's write of a tag must not be started; the error is None if it may start."""
         if output is None or output.by == "plc":
             return RefusalCause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded by this client", where=where)
         if output.tag in self._group_of:
@@ -165,7 +165,7 @@ class OutputWriter:
 
     @property
     def settled(self) -> bool:
-        """Return whether every output that can be written has its wanted value."""
+        """Return whether no write is under way, and every output that can be written has its wanted value."""
         return not any(
             o.pending or (o.wanted is not None and o.held != o.wanted and self._possible(o)) for o in self.outputs
         )
@@ -225,8 +225,7 @@ class OutputWriter:
         return False
 
     def _may(self, output: Output) -> bool:
-        """Return whether the wanted value may be written. A value that is not allowed is refused even if the device
-        already holds it."""
+        """Return whether the wanted value may be written. If not, it is refused even if the device already holds it."""
         try:
             self._check(output)
             output.driver.command(output.local, output.wanted or 0.0)

@@ -61,13 +61,13 @@ class RefusalCause(Enum):
     FAILED = "failed"
     """The write was sent and not confirmed (no reply, a corrupted reply, a busy device). The gateway tries again."""
     LOCAL = "local"
-    """The topside controller sent a command to a plant whose switch is set to `local`."""
+    """The topside controller sent a command to a plant that accepts none (`remote: local` in the system file)."""
     NOT_NOW = "not now"
     """A client requested a write while another was under way or the outputs were in their safe state."""
 
 
 OF_PROGRAM = frozenset({RefusalCause.LIMIT, RefusalCause.NOT_WRITABLE})
-"""Causes that a change to the program or the configuration has to remove, whatever happens in the plant."""
+"""Causes that do not depend on the plant: the program or the configuration has to be changed."""
 OF_DEVICE = frozenset({RefusalCause.WRONG_DEVICE, RefusalCause.DEVICE})
 """Causes that a disturbed device may also produce."""
 
@@ -108,7 +108,10 @@ class RefusedOutput:
     place: str = ""
     known: bool = True
     standing: bool = True
-    """Whether the refusal still applies: False once a different value was wanted, or the value was written."""
+    """Whether the refusal still applies: False once a different value was wanted or the tag was written.
+
+    It is always False for a client's write, because a client requests a single write.
+    """
 
     @property
     def of_program(self) -> bool:
@@ -207,7 +210,7 @@ class Refusals:
             self.on_new(entry)
 
     def settle(self, tag: str) -> None:
-        """End the present refusal of a tag, because the tag was written, or because the wanted value is now allowed."""
+        """Set `standing` of the tag's newest entry to False, because the tag was written, or the wanted value is now allowed."""
         if tag in self._newest:
             self._newest[tag].standing = False
 

@@ -1,7 +1,7 @@
 """The concise DCF (CiA 302-3, object 1F22h): a node's configuration as one block of bytes, converted from a DCF.
 
 Format, all little-endian: UNSIGNED32 number of entries; then for each entry UNSIGNED16 index, UNSIGNED8 subindex,
-UNSIGNED32 size in bytes, and the data. Pure; sends nothing.
+UNSIGNED32 size in bytes, and the data. This module only converts; it sends nothing.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _is_pdo(index: int) -> bool:
 
 
 def _pdo(index: int, wanted: dict[tuple[int, int], Setting], dictionary: ObjectDictionary) -> list[Setting]:
-    """Return one PDO's settings in order."""
+    """Return the settings of the PDO with the communication record `index`, in the order that `settings_of` describes."""
     mapping = index + _TO_MAPPING
     cob_id = wanted.get((index, 1))
     held = dictionary.get(index, 1)

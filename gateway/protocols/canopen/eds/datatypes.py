@@ -1,6 +1,6 @@
 """The basic data types of CiA 301 (7.1.6, codes of table 44): conversion between transmitted bytes and Python values.
 
-All numbers are little-endian (7.1.3). Pure; knows no objects and no transfers.
+All numbers are little-endian (7.1.3). This module only converts single values; objects and transfers are handled elsewhere.
 """
 
 from __future__ import annotations

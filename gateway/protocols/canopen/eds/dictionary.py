@@ -1,8 +1,8 @@
 """The object dictionary of a node as its EDS or DCF describes it, in immutable form.
 
 This is the only file of the gateway that imports the `canopen` package, whose reader turns text into objects. That
-reader tolerates few errors and reports no line numbers: `text` repairs the text before, `values` reads the
-values, and errors of the package are translated here. This module does not communicate with a node.
+reader tolerates few errors and reports no line numbers. So the module `text` repairs the text first, the module `values`
+reads the values, and this module translates the errors of the package. It does not communicate with a node.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def parse_dictionary(
 ) -> ObjectDictionary:
     """Read the text of an EDS or DCF.
 
-    `node_id` replaces $NODEID; if it is not given, the node ID of the DCF does, if there is one. Files that the text names are
-    read from `folder`, or not at all if `folder` is None.
+    $NODEID is replaced by `node_id`, or by the node ID of the DCF if `node_id` is None and the DCF states one. Files that the
+    text names are read from `folder`, or not at all if `folder` is None.
     """
     if node_id is not None:
         check_node(node_id)
@@ -179,7 +179,10 @@ def _entries(
 def _downloads(
     entries: Mapping[tuple[int, int], DictionaryEntry], values: _Values, folder: Path | None
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """Set each DOMAIN that names a DownloadFile to the content of the file. A file that cannot be read gives None and a note."""
+    """Return the entries of the DOMAINs that name a DownloadFile, with the content of the file as `default`.
+
+    If a file cannot be read, `default` is None, and the reason is added to `mended`.
+    """
     found: dict[tuple[int, int], DictionaryEntry] = {}
     for key, entry in entries.items():
         section = values.section(*key)

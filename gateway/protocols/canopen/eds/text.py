@@ -2,7 +2,7 @@
 
 Vendors' files leave numbers empty, write octal numbers, vary the case of keys, put sub-objects before their object and use the
 encoding of the vendor's editor. This module accepts such files and lists its repairs. It refuses ambiguous content, with file,
-section and key. It produces the repaired text; it knows no data types and no nodes.
+section and key. It produces the repaired text; `values` reads the values in it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_BYTES = 16 * 1024 * 1024
 
 _OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME|VALUE|DENOTATION))?$", re.IGNORECASE)
 _DOMAIN = "0xF"
-"""The type code of DOMAIN. (CANFestival's editor defines its type A0h in ``[A0sub1]``, which names the basic data type.)"""
+"""The type code of DOMAIN, as text."""
 _COMMENT = re.compile(r"\s;.*$")
 _HEADING = re.compile(r"\[([^\]]+)\]")
 _OCTAL = re.compile(r"^0[0-7]+$")
@@ -247,7 +247,10 @@ def _holds_values(section: Section, path: str) -> bool:
 
 
 def _data_type(section: Section, kept: Section, sections: dict[str, Section], path: str, mended: list[str]) -> str:
-    """Return the basic data type of a value as text; a type that is not defined becomes DOMAIN."""
+    """Return the basic data type of a value as text; a type that is not defined becomes DOMAIN.
+
+    CANFestival's editor defines types of its own: the DefaultValue of ``[A0sub1]`` is the basic data type of its type A0h.
+    """
     if _kind(section, path) == 0x2:
         return _DOMAIN
     if not kept.values.get("DataType"):

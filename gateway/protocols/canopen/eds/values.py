@@ -1,7 +1,7 @@
 """Convert the values in an electronic data sheet (CiA 306-1, 4.6.3.2) from text to a number, a string or bytes.
 
 The `canopen` package also reads these texts, but it does not support octal numbers, limits of real types and signed numbers that
-are written as their bits, and it does not report a value that it cannot read. Pure; knows no sections and no nodes.
+are written as their bits, and it does not report a value that it cannot read. This module handles single values, not sections.
 """
 
 from __future__ import annotations
@@ -76,7 +76,9 @@ def _whole(text: str) -> int:
 
 
 def _held(value: int, size: int, *, signed: bool) -> int:
-    """Return the number in the range of the type. Raises `ValueError` if it does not fit."""
+    """Return `value` as a number of an integer type of `size` bytes. For a signed type, the bits of a negative number are
+    converted to that number (FFh to -1). Raises `ValueError` if `value` does not fit.
+    """
     bits = 8 * size
     if not (-(1 << bits - 1) if signed else 0) <= value < 1 << bits:
         raise ValueError("the type has no room for it")
@@ -84,7 +86,9 @@ def _held(value: int, size: int, *, signed: bool) -> int:
 
 
 def _real(form: str, text: str, size: int) -> float:
-    """Return a number of a REAL type. A hexadecimal number is read as the bits of the floating-point number."""
+    """Return a number of a REAL type of `size` bytes; `form` is its `struct` format. A hexadecimal number is read as the bits of
+    the floating-point number. Raises `ValueError` if it does not fit.
+    """
     try:
         raw = _whole(text).to_bytes(size, "little") if text[:2].lower() == "0x" else struct.pack(form, float(text))
     except OverflowError as e:

@@ -1,4 +1,4 @@
-"""LSS frames (CiA 305): requests of the master on 7E5h, replies of slaves on 7E4h. Pure; it does not wait."""
+"""LSS frames (CiA 305): requests of the master on 7E5h, replies of slaves on 7E4h. `master` sends and receives them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ INQUIRE = (0x5A, 0x5B, 0x5C, 0x5D)
 INQUIRE_NODE_ID = 0x5E
 
 ANY_SLAVE = 0x80
-"""The bit number of a fastscan request that every unconfigured slave answers, and that restarts its scan."""
+"""The bit number of the fastscan request that every slave without a node ID answers, and that starts the scan again."""
 
 UNCONFIGURED = 0xFF
 """The node ID of a slave that has none."""
@@ -75,8 +75,10 @@ def request(command: int, data: bytes = b"") -> CanFrame:
 
 
 def fastscan(number: int, bit: int, part: int, following: int) -> CanFrame:
-    """Return a fastscan request: it asks whether a slave's `part` (0 vendor to 3 serial) agrees with `number` from bit 31 to
-    `bit`.
+    """Return a fastscan request.
+
+    A slave replies if bits 31 to `bit` of its `part` (0 vendor, 1 product, 2 revision, 3 serial) equal those of `number`.
+    `following` is the part with which the slave continues.
     """
     return request(FASTSCAN, number.to_bytes(4, "little") + bytes([bit, part, following]))
 

@@ -1,9 +1,9 @@
 """The LSS master (CiA 305): gives node IDs and bit rates to slaves that are addressed by their identity.
 
-It is the asynchronous part around `lss`; it sends over the CANopen master, one request at a time, and receives the frames on
-7E4h. Simultaneous replies of several slaves have the same bits and look like one reply. A reply of another slave may also arrive
-later. So if more than one slave may answer, the master waits for the whole reply time; otherwise a late reply could be taken for
-the answer to the next request (CO-056, CO-059).
+This is the asynchronous part; `frames` encodes the requests. Requests are sent over the CANopen master, one at a time, and the
+replies are received on 7E4h. Simultaneous replies of several slaves have the same bits and look like one reply. A reply of
+another slave may also arrive later. So if more than one slave may answer, the master waits for the whole reply time; otherwise a
+late reply could be taken for the answer to the next request (CO-056, CO-059).
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class LssMaster:
         return number
 
     async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> int:
-        """Give the slave with `address` the node ID `node` and switch it to waiting; return its previous node ID.
+        """Give the slave with `address` the node ID `node` and switch it to the waiting state; return its previous node ID.
 
         A slave that had no node ID (255) boots immediately with the new one; any other slave boots when its communication is
         reset. Calls of `assign` do not overlap, because a slave that another call has selected would also get the node ID.
@@ -178,7 +178,10 @@ class LssMaster:
     # -- requests ---------------------------------------------------------------------------------------------------
 
     async def _ask(self, frames: list[CanFrame], expected: int, why: str = "", wait_s: float = 0.0) -> bytes:
-        """Send a request and return the reply with this specifier; other replies are skipped and counted."""
+        """Send `frames` and return the first reply with the command specifier `expected`; other replies are skipped and counted.
+
+        Raises `ReplyTimeout`, with the text `why`, if none arrives within `wait_s` seconds (0: the usual reply time).
+        """
         self._begin()
         try:
             for frame in frames:

@@ -1,8 +1,8 @@
 """The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): the states of the nodes, and the loss of heartbeats.
 
-A pure object: heartbeats and `now` in, events out. Monitoring of a node starts at its first heartbeat (CO-036). A late
-heartbeat within the consumer time is not an event (CO-037). A boot-up counts as a sign of life of a node that is being
-monitored, but does not end a heartbeat loss: only a heartbeat does (CO-038).
+The consumer does no I/O: its caller passes heartbeats and the time, and it returns events. Monitoring of a node starts at its
+first heartbeat (CO-036). A late heartbeat within the consumer time is not an event (CO-037). A boot-up counts as a sign of life
+of a node that is being monitored, but does not end a heartbeat loss: only a heartbeat does (CO-038).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class HeartbeatConsumer:
             known.boot_expected = True
 
     def observe(self, node: int, data: bytes, t_ns: int) -> tuple[NodeEvent, ...]:
-        """Handle a message of `node` on 700h + node ID, received at `t_ns`."""
+        """Handle a message of `node` on 700h + node ID, received at `t_ns`, and return the events that it causes."""
         state = heartbeat_state(data)
         if state is None:
             self.ignored += 1

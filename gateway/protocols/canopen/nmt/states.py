@@ -1,6 +1,6 @@
 """NMT commands and states, and the events that a master reports about its nodes (CiA 301, 7.2.8 and 7.3.2).
 
-Pure values, without sending or receiving.
+This module defines values and encodes frames; it does not send or receive them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """PDO mappings (CiA 301, 7.5.2.36 and 7.5.2.38): the positions of objects in the 8 bytes of a PDO.
 
-Pure: it reads mapping entries in the form of 1A00h and divides the data of a PDO into objects. It knows no data types;
-`datatypes` reads each object.
+This module reads mapping entries in the form of 1A00h and divides the data of a PDO into objects. It leaves each object as
+bytes; `eds.datatypes` converts them to values.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The SYNC and TIME producers (CiA 301, 7.2.5 and 7.2.6), which determine when each frame is due.
 
-Pure: `now` in, frames out. The average period is kept even if `due` is called late; missed frames are skipped and
-counted, never sent in a burst.
+The producers do no I/O: the caller passes the time and sends the frames. The average period is kept even if `due` is called late;
+missed frames are skipped and counted, never sent in a burst.
 """
 
 from __future__ import annotations

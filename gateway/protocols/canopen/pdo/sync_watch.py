@@ -4,7 +4,7 @@ All SYNCs have one identifier, so a frame does not name its producer. A second p
 arrives while this master produces SYNC, by counters (1019h) that are out of order, by intervals that are alternately
 short and long, or by SYNCs that are more frequent than the communication cycle period (1006h) allows. If that period is
 not known, two producers without counters whose SYNCs are evenly spaced look like one producer with half the period;
-listening cannot tell them apart. Pure.
+listening cannot tell them apart. This module does no I/O.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 _INTERVALS = 16
 """The number of intervals that are compared, so large that a few late frames do not change the result."""
 _APART = 2.0
-"""With two producers, the ratio of the long to the short quarter of the intervals."""
+"""The ratio of the long to the short intervals (upper to lower quartile) above which there are two producers."""
 _TOO_OFTEN = 1.5
-"""With two producers, the SYNCs in one communication cycle: 2, with a margin for clocks and a busy bus."""
+"""The number of SYNCs per communication cycle from which there are two producers: 2, less a margin for clocks and a busy bus."""
 _OUT_OF_ORDER = 3
-"""The number of counters out of order that prove a second producer: a producer that restarted causes one."""
+"""The number of counters out of order that prove a second producer. A single one may be caused by a restart of a producer."""
 
 
 class SyncWatch:
@@ -69,7 +69,7 @@ class SyncWatch:
         return f"SYNC comes at intervals of {times} in turn: there seem to be two producers"
 
     def _too_often(self) -> str:
-        """Return whether SYNCs at even intervals are more frequent than the cycle period allows."""
+        """Return a text if SYNCs at even intervals are more frequent than the cycle period allows, else an empty text."""
         mean_ns = sum(self._intervals) / len(self._intervals)
         if not self._period_ns or mean_ns <= 0 or self._period_ns / mean_ns < _TOO_OFTEN:
             return ""

@@ -1,13 +1,15 @@
-"""SDO block transfers, both ways (CiA 301, 7.2.4.3.9 to 7.2.4.3.16): up to 127 segments for one acknowledgement.
+"""SDO block upload and download (CiA 301, 7.2.4.3.9 to 7.2.4.3.16): up to 127 segments for one acknowledgement.
 
-Pure, as `sdo`. Segments carry a sequence number, so that lost segments can be sent again: the receiver acknowledges the last good
-segment, and the sender resends the rest, renumbered from 1 (CO-016). Two rules ensure that the result is never a wrong object:
+As in `transfers`, the classes do no I/O. Segments carry a sequence number, so that lost segments can be sent again: the receiver
+acknowledges the last good segment, and the sender resends the rest, renumbered from 1 (CO-016). Two rules ensure that the result
+is never a wrong object:
 
 - When no more segments arrive, the client acknowledges the part of the sub-block that it received. If it received nothing, the
-node may take this for the acknowledgement of the previous sub-block and send that sub-block again. So the client does this only
-once, and only if the announced size shows in the end whether data was repeated. - The client requests at most 63 segments per
-block. Their first bytes then differ from those of a reply to an upload or of an abort (01h to 3Fh and 81h to BFh against 40h to
-7Fh and 80h), so that segments that arrive late, after the transfer was given up, cannot be taken for a reply to a later request.
+  node may take this acknowledgement for that of the previous sub-block and send the previous sub-block again. So the client
+  acknowledges an empty sub-block only once, and only if the announced size shows in the end whether data was repeated.
+- The client requests at most 63 segments per block. Their first bytes (01h to 3Fh and 81h to BFh) then differ from those of a
+  reply to an upload (40h to 7Fh) and of an abort (80h). So segments that arrive late, after the transfer was given up, cannot be
+  taken for a reply to a later request.
 
 At the end of the transfer, size and CRC are checked.
 """
@@ -123,7 +125,10 @@ class SdoBlockUpload(SdoUpload):
         return self._acknowledge() if last or number == self._block else WaitForFrame()
 
     def _again(self, data: bytes) -> Step:
-        """Acknowledge a sub-block that ended with a part missing."""
+        """Acknowledge the received part of an incomplete sub-block, so that the node sends the rest again.
+
+        Abort after more than `MAX_REPEATS` sub-blocks without a new segment.
+        """
         self._repeats += not self._good
         if self._repeats > MAX_REPEATS:
             return self._break(abort_codes.INVALID_SEQUENCE, "blocks without new segments", data)

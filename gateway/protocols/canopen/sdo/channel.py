@@ -1,8 +1,8 @@
 """One node's default SDO channel. It carries out one transfer at a time, and never uses a reply to one request as the reply to
 another request.
 
-It connects the pure transfers (`sdo`), the tracking of late replies (`late_replies`) and the master, which owns the bus
-and delivers the frames on 580h + node ID. It knows nothing about the objects transferred.
+It connects the transfers (`transfers`, `block`), the tracking of late replies (`late_replies`) and the master, which owns the
+bus and delivers the frames on 580h + node ID. It does not interpret the objects transferred.
 """
 
 from __future__ import annotations
@@ -46,12 +46,11 @@ class NodeRestarted(ReplyTimeout):
 class SdoCounters:
     """Counters of a master since it was created.
 
-    Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent,
-    each reply that advanced or ended a transfer. Aborts sent by the node count in `sdo_aborts` only, aborts sent by the
-    master in `frames_out` only. `sdo_timeouts` counts requests without a reply, `sdo_retries` repeated transfers,
-    `sdo_probes` the transfers made to get past late replies, and `ignored` frames that no service used.
-    `foreign_sdo_requests` counts SDO requests of other clients on the bus, and `foreign_syncs` the SYNCs of other
-    producers.
+    Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent, each reply
+    that advanced or ended a transfer. Aborts sent by the node count in `sdo_aborts` only, aborts sent by the master in
+    `frames_out` only. `sdo_timeouts` counts requests without a reply, `sdo_retries` repeated transfers, `sdo_probes` the reads
+    that ensure that no late reply can arrive any more (see `late_replies`), and `ignored` frames that no service used.
+    `foreign_sdo_requests` counts SDO requests of other clients on the bus, and `foreign_syncs` the SYNCs of other producers.
     """
 
     frames_in: int = 0
@@ -89,7 +88,7 @@ def multiplexor_of(data: bytes) -> Multiplexor:
 
 
 class SdoChannel:
-    """The client's end of one channel. The bus's reader calls `deliver`; code that accesses an object calls `run`."""
+    """The client's end of one channel. The master calls `deliver` with each received frame, and `run` for each transfer."""
 
     def __init__(
         self,
@@ -141,7 +140,7 @@ class SdoChannel:
         return repeated
 
     def foreign_request(self, frame: CanFrame) -> None:
-        """Note a request of another client to the node, so that its reply is not taken for a second reply to our request."""
+        """Note a request of another client, so that the node's reply is not taken for a second reply to this client's request."""
         self._counters.foreign_sdo_requests += 1
         if len(frame.data) == 8 and frame.data[0] >> 5 in (1, 2, 5, 6):  # not the segments of a transfer
             if len(self._foreign) >= MAX_ANSWERS:
@@ -149,8 +148,9 @@ class SdoChannel:
             self._foreign[multiplexor_of(frame.data)] = None
 
     def lose(self, error: ConnectionLost | None) -> None:
-        """Note that the master no longer reads the bus (None: that it reads the bus again). Waiting and later transfers fail
-        immediately.
+        """Note that the master no longer reads the bus: waiting and later transfers fail immediately with `error`.
+
+        None means that the master reads the bus again.
         """
         self._lost = error
         self._arrived.set()
@@ -172,7 +172,7 @@ class SdoChannel:
             return await self._run(transfer)
 
     async def end(self) -> None:
-        """Wait for the transfers that were asked for before this call. A transfer that is asked for later waits until it is
+        """Wait for the transfers that were requested before this call. A transfer that is requested later waits until it is
         cancelled.
         """
         await self._turn.acquire()  # the lock is never released, so that no later transfer begins
@@ -240,8 +240,8 @@ class SdoChannel:
             self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
 
     async def _send_owed_abort(self, transfer: SdoTransfer) -> None:
-        """Send the abort of a transfer that was abandoned earlier. Otherwise the node might take our request for one of its
-        segments.
+        """Send the abort of a transfer that was abandoned earlier. Otherwise the node might take the next request for a segment
+        of the abandoned transfer.
         """
         if self._owed is not None:
             try:
@@ -270,7 +270,7 @@ class SdoChannel:
             step = await self._next_step(transfer)
 
     async def _after_send(self, transfer: SdoTransfer) -> Step | None:
-        """Return the next frame of a sequence, unless a frame from the node waits to be handled (CO-018)."""
+        """Return the next frame of a sequence; None if none is left, or if a frame from the node has to be handled (CO-018)."""
         await asyncio.sleep(0)  # otherwise a bus that accepts frames immediately would never let the reader run
         return None if self._inbox else transfer.more(self._clock.monotonic_ns())
 
@@ -323,7 +323,7 @@ class SdoChannel:
         raise failed.error
 
     async def _next_frame(self, transfer: SdoTransfer) -> CanFrame | None:
-        """Return the next frame for the transfer, or None if its reply is overdue."""
+        """Return the next received frame, or None if the reply is overdue. Raises `ConnectionLost` or `NodeRestarted`."""
         while not self._inbox:
             if self._lost is not None:
                 raise self._again(self._lost)
@@ -369,9 +369,10 @@ class SdoChannel:
         return first is not None
 
     def _settle_earlier(self, request: Multiplexor) -> None:
-        """Settle the requests before the one that a reply for the present `request` answers, when the reply arrives.
+        """Note a reply that names the object of the present `request`, and settle the earlier requests that it proves to be over.
 
-        This cannot wait until the transfer's task runs, because replies that arrive after this one would settle this one too.
+        This is done when the reply arrives, not when the transfer's task runs, because a reply that arrives between the two would
+        otherwise settle the present request as well.
         """
         if self._late.answered(request) and not self._final_seen:
             self._late.unanswered(request)  # this may be the reply to an earlier request, so one more is expected

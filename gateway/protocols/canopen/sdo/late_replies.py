@@ -1,4 +1,4 @@
-"""Track which replies may still arrive after an SDO request was not answered, and prevent that a late reply is used wrongly.
+"""Track which replies may still arrive after an SDO request was not answered, and prevent their use for a different request.
 
 An SDO reply names index and subindex, but not the request. If a request timed out and the same object is requested
 again, a late reply to the first request could be taken for a reply to the second: an old value would be delivered as a
@@ -7,12 +7,12 @@ time on a channel and its replies share one CAN-ID, so they arrive in the order 
 request for a *different* object therefore proves that no reply to an earlier request can still arrive. So:
 
 - A request for an object without an outstanding reply is sent immediately: its multiplexor distinguishes its reply
-  from every late one, and when that reply arrives, it settles all earlier requests.
+  from every late one. When that reply arrives, it settles all earlier requests: they need no longer be tracked.
 - A request for an object with an outstanding reply is preceded by a probe: a read of a mandatory object without an
-  outstanding reply. A reply to the probe (an abort is enough) settles the earlier requests. A dead node thus costs one
-  timeout per request, as before, and a boot-up settles everything.
+  outstanding reply. A reply to the probe (an abort is enough) settles the earlier requests.
 
-Pure; knows no frames and no time.
+So a node that does not answer still costs only one timeout per request. A boot-up message settles all requests. This module
+handles index and subindex only; frames and times are handled by `channel`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The SDO client's transfers, expedited and segmented (CiA 301, 7.2.4.3.1 to 7.2.4.3.8 and 7.2.4.3.17).
 
-A transfer is a pure object: `start` returns the request, `feed` takes a received frame and returns the next step,
-`expire` ends the transfer when its time is over. It knows no bus, no clock and no other transfer; `late_replies`
+A transfer does no I/O: `start` returns the request, `feed` takes a received frame and returns the next step,
+`expire` ends the transfer when its time is over. The caller owns the bus and the clock; `late_replies`
 decides which replies may belong to an *earlier* transfer. Block transfers are in `block`.
 
 A frame is not accepted as a reply if it has fewer than 8 bytes (`tolerate_short` pads it: CO-026), a different COB-ID or a
@@ -29,7 +29,7 @@ segments.
 
 WHOLE_TIMEOUTS = 10
 WHOLE_NS_PER_BYTE = 50_000_000
-"""Limit of a whole transfer: this many of its timeouts, and this many nanoseconds for each transferred byte. Without
+"""Limit of a whole transfer: `WHOLE_TIMEOUTS` of its timeouts, plus `WHOLE_NS_PER_BYTE` for each transferred byte. Without
 this limit a node that sends one byte just before each timeout would occupy the client for days. A segment of 7 bytes
 takes 26 ms at 10 kbit/s.
 """
@@ -72,7 +72,9 @@ class WaitForFrame:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The transfer succeeded. `data` is the object's value (upload) or empty (download). The caller still has to send `last`."""
+    """The transfer succeeded. `data` is the object's value (upload) or empty (download). The caller still has to send `last`,
+    unless it is None.
+    """
 
     data: bytes
     last: CanFrame | None = None
@@ -137,7 +139,7 @@ class SdoTransfer(ABC):
 
     @property
     def name(self) -> str:
-        """Return the object's name in the usual notation."""
+        """Return the object's name for messages, such as ``SDO 1018h:01``."""
         return f"SDO {self.index:04X}h:{self.subindex:02X}"
 
     def start(self, now_ns: int) -> CanFrame:
@@ -177,8 +179,8 @@ class SdoTransfer(ABC):
 
     @property
     def to_abort(self) -> bool:
-        """Return whether the node needs an abort if this transfer is abandoned, because it could take the next request for a
-        segment.
+        """Return whether the node needs an abort if this transfer is abandoned. Without the abort, the node could take the next
+        request for a segment of this transfer.
         """
         return self.answered and not self.over
 
@@ -225,7 +227,7 @@ class SdoTransfer(ABC):
         return data[0] == ABORT
 
     def _is_reply(self, data: bytes) -> bool:
-        """Return whether `data`, whose multiplexor matches, is the reply to the initiate request, by its specifier."""
+        """Return whether `data`, whose multiplexor matches, has the command specifier of the reply to the initiate request."""
         return data[0] >> 5 == self._reply
 
     def _on_next(self, data: bytes) -> Step:

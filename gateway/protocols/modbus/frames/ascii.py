@@ -1,8 +1,7 @@
 """Modbus ASCII (SL 2.5.2): ``:``, the frame in hexadecimal, LRC, CR LF.
 
 A frame extends from a colon to LF, so its length is not needed to recognise it. A pause of more than a second inside
-a frame also ends it (case MB-070). As in RTU, a reply does not say which request it answers. This module knows no
-ports.
+a frame also ends it (case MB-070). As in RTU, a reply does not say which request it answers. This module does no I/O.
 """
 
 from __future__ import annotations
@@ -131,7 +130,7 @@ class AsciiFramer(Framer):
         return text
 
     def _examine(self, text: bytes, request: Request[Any]) -> bytes | None:
-        """Return the PDU of a frame with the requested unit ID and function, or None for any other frame. Raises as `feed`."""
+        """Return the PDU of a frame with the requested unit ID and function, or None for other frames. Raises like `feed`."""
         frame = _decoded(text)
         ours = f":{self._unit:02X}{request.function:02X}".encode()
         if frame is None:

@@ -2,7 +2,7 @@
 reply.
 
 The modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides which bytes are the reply, and whether the
-reply is complete and undamaged; the request checks the reply's content. A framing has no clock: `now_ns` is passed.
+reply is complete and undamaged; the request checks the reply's content. A framing has no clock; the caller passes the time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Framer(ABC):
     """
 
     confirms_transmission: bool = False
-    """Whether a reply identifies its request, so that a late reply needs no quarantine."""
+    """Whether a reply identifies its request. If not, a failed exchange is followed by a quarantine, see `LineSilence`."""
 
     has_broadcast: bool = False
     """Whether unit ID 0 is a broadcast, which no unit answers (SL 2.1); otherwise 0 is an ordinary unit ID (TG 4.4.1.2)."""
@@ -45,12 +45,12 @@ class Framer(ABC):
         self.noise_bytes = 0
         self.foreign_frames = 0
         self.strays: dict[int, int] = {}
-        """By unit ID: the time in ns of a reply that arrived while the client awaited no reply, or the reply of a different
-        unit. 0 means just now.
+        """By unit ID: the time in ns at which a frame of this unit arrived while the client awaited no reply, or awaited the
+        reply of a different unit. 0 means that it arrived just now.
         """
 
     def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
-        """Note a frame of `unit` that is not the reply to a present request.
+        """Note in `strays` a frame of `unit` that is not the awaited reply.
 
         Exception 0A or 0B comes from a gateway and does not show that the unit is alive.
         """
@@ -70,9 +70,9 @@ class Framer(ABC):
         """Take the bytes that arrived; return the reply PDU when it is complete. Raises `CrcError` or `Desync`."""
 
     def settle(self) -> bytes | None:
-        """Stop waiting for the rest of a frame that is not our reply, because the link was silent for `gap_ns`.
+        """Stop waiting for the rest of a frame that is not the awaited reply, because the link was silent for `gap_ns`.
 
-        Returns as `feed`.
+        Return the reply PDU if it follows in the bytes received so far, else None. Raises the errors of `feed`.
         """
         return None
 

@@ -2,7 +2,7 @@
 
 The transaction ID identifies a reply, so a late reply is recognised and discarded. In a stream, chunk boundaries have no meaning.
 After an invalid header (its length is out of bounds) or an ADU that is never completed, the boundaries of ADUs are unknown; the
-stream is then searched for the header of the awaited reply. This module knows no sockets.
+stream is then searched for the header of the awaited reply. This module does no I/O.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Modbus RTU: a reply is recognised by its expected length and its check sum, never by silence alone.
 
-The framer parses received bytes from the front. A frame of another device is skipped *as a whole*, so that nothing inside it can
-be mistaken for the awaited reply. A frame of the requested unit that answers a different request is an error. Any other byte is
-noise and dropped. The framer waits for the rest of an incomplete foreign frame until the line has been silent for `gap_ns`:
-silence decides only if length and check sum cannot.
+The framer parses received bytes from the front of its buffer. A frame of another device is skipped *as a whole*, so that nothing
+inside it can be mistaken for the awaited reply. A frame of the requested unit that answers a different request is an error. Any
+other byte is noise and dropped. The framer waits for the rest of an incomplete foreign frame until the line has been silent for
+`gap_ns`: silence decides only if length and check sum cannot.
 
-This module knows no ports. `char_time_ns` is only for the two silences of SL 2.5.1.1.
+This module does no I/O. `char_time_ns` is used only for the two silences of SL 2.5.1.1.
 """
 
 from __future__ import annotations
@@ -126,9 +126,9 @@ class RtuFramer(Framer):
     # -- reading from the front ----------------------------------------------------------------------------------
 
     def _is_our_reply(self, data: bytes) -> bool:
-        """Return whether a chunk is exactly the reply, which is the usual case; `_scan` handles all others.
+        """Return whether `data` is exactly the awaited reply, which is the usual case; `_scan` handles all other cases.
 
-        It saves 22 % of a read of 10 registers (benchmarks/modbus_codec.py).
+        This shortcut saves 22 % of the time of a read of 10 registers (benchmarks/modbus_codec.py).
         """
         request = self._request
         if request is None or self._echo_due or len(data) < _EXCEPTION_FRAME or data[0] != self._unit:
@@ -149,7 +149,10 @@ class RtuFramer(Framer):
         return None
 
     def _starts_our_reply(self, request: Request[Any]) -> bool:
-        """Return whether the buffer may start with our reply: unit ID, function and, for a normal reply, the next bytes match."""
+        """Return whether the buffer may start with the awaited reply.
+
+        Unit ID and function have to match, and also the next bytes of a normal reply.
+        """
         buffer = self._buffer
         if buffer[0] != self._unit:
             return False
@@ -160,7 +163,10 @@ class RtuFramer(Framer):
         return buffer[1] == request.function and request.reply_length(bytes(buffer[1:])) != IMPOSSIBLE
 
     def _take_reply(self, request: Request[Any]) -> bytes | None:
-        """Take the reply PDU from the front; return None while it is incomplete. Raises `CrcError` if it is damaged."""
+        """Remove the reply from the front of the buffer and return its PDU; return None while it is incomplete.
+
+        Raises `CrcError` if it is damaged, `Desync` if the bytes are a valid frame that answers a different request.
+        """
         buffer = self._buffer
         if len(buffer) < 2:
             return None
@@ -186,7 +192,10 @@ class RtuFramer(Framer):
         return frame[1:-2]
 
     def _step_over(self, request: Request[Any], settled: bool) -> bool:
-        """Drop a foreign frame or a byte of noise from the front; return False if more bytes are needed to decide."""
+        """Drop a foreign frame or a byte of noise from the front of the buffer; return False if more bytes are needed to decide.
+
+        `settled` says that the line was silent for `gap_ns`, so that no more bytes are awaited.
+        """
         buffer = self._buffer
         if len(buffer) >= 2:
             lengths, more = self._candidates(request)
@@ -210,9 +219,9 @@ class RtuFramer(Framer):
         return True
 
     def _candidates(self, request: Request[Any]) -> tuple[list[int], bool]:
-        """Return the possible lengths of the frame at the front.
+        """Return the possible lengths of the frame at the front of the buffer, and whether more bytes could add one.
 
-        They include the length of the awaited reply if unit ID and function are as requested.
+        The lengths include that of the awaited reply if unit ID and function are as requested.
         """
         lengths, more = frame_lengths(self._buffer)
         nominal = request.nominal_length()
@@ -221,14 +230,14 @@ class RtuFramer(Framer):
         return lengths, more
 
     def _whole_frame(self, lengths: list[int]) -> int:
-        """Return the first of `lengths` whose bytes have arrived with a right check sum, else 0."""
+        """Return the first of `lengths` for which the buffer starts with a frame of that length and a right check sum, else 0."""
         for size in lengths:
             if MIN_FRAME <= size <= min(len(self._buffer), MAX_FRAME) and crc16(self._buffer[:size]) == 0:
                 return size
         return 0
 
     def _refuse_other_frame(self, request: Request[Any]) -> None:
-        """Raise `Desync` if the front is a whole frame of the requested unit that does not answer the request."""
+        """Raise `Desync` if the buffer starts with a whole frame of the requested unit that is not the awaited reply."""
         size = self._whole_frame(self._candidates(request)[0])
         if not size:
             return
@@ -242,7 +251,7 @@ class RtuFramer(Framer):
         raise Desync(other, expected=expected, got=short_hex(frame), hint=hint)
 
     def _strip_echo(self) -> bool:
-        """Remove the echo of the request from the front; return False while the echo is incomplete."""
+        """Remove the echo of the request from the front of the buffer; return False while it is incomplete. Raises `Desync`."""
         while self._buffer and self._buffer[0] in _IDLE_NOISE and not self._sent.startswith(self._buffer[:1]):
             self._skip(1)
         size = min(len(self._buffer), len(self._sent))
@@ -284,7 +293,10 @@ class RtuFramer(Framer):
         del self._buffer[:count]
 
     def _end(self, size: int) -> None:
-        """End the exchange. Its frame of `size` may be followed by a tail of zeros (case MB-009) or a repeated reply (MB-014)."""
+        """End the exchange with a frame of `size` bytes, and count and discard the bytes after it.
+
+        These may be zeros (case MB-009) or a repeated reply (MB-014).
+        """
         if self._buffer:
             del self._buffer[:size]
             rest = len(self._buffer.rstrip(b"\x00"))

@@ -1,4 +1,4 @@
-"""Select the framing of an endpoint, and create its framer. This module only reads the endpoint's text; it opens nothing."""
+"""Select the framing of an endpoint, and create its framer. This module opens no connection."""
 
 from __future__ import annotations
 

@@ -45,7 +45,9 @@ def _check_table(table: str, known: dict[str, int]) -> None:
 
 
 def _counted(head: bytes, byte_count: int) -> int:
-    """Return the length of a reply whose second byte must be `byte_count`."""
+    """Return the length of the reply PDU that begins with `head`, see `Request.reply_length`; its byte count must be
+    `byte_count`.
+    """
     if len(head) < 2:
         return NEED_MORE
     return 2 + byte_count if head[1] == byte_count else IMPOSSIBLE

@@ -1,7 +1,7 @@
 """File records and FIFO queues: 14h, 15h and 18h (AP 6.14, 6.15, 6.18).
 
 This module encodes the requests itself, because pymodbus's classes for them check nothing, and its replies to 18h do not work
-with our framings. A file has a number and up to 10,000 records of one word; the device defines their meaning.
+with the framings of this project. A file has a number and up to 10,000 records of one word; the device defines their meaning.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The concrete requests are in `requests`, `files`, `diagnostics`, `identity` and `user`.
 
-A request knows its own bytes, how long its reply has to be, and whether a reply answers it. It knows neither unit ID,
-framing nor time.
+A request encodes itself, states how long its reply has to be, and checks whether a reply answers it. It contains neither
+unit ID, framing nor time.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Request(ABC, Generic[R_co]):
         """Note a silence on the line after the last byte. A silence ends a reply of unknown length (SL 2.5.1.1)."""
 
     def unanswered(self, t_ns: int) -> R_co:
-        """Return the result of a broadcast of this request. Raises `UsageError` if the request reads data (SL 2.1)."""
+        """Return the result of a request without a reply, sent at `t_ns`. Raises `UsageError` if it reads data (SL 2.1)."""
         raise UsageError(
             f"function {self.function:02X}h cannot be broadcast: no unit answers a broadcast",
             expected="a write, or a unit from 1",
@@ -111,6 +111,6 @@ def describe_length(request: Request[Reply]) -> str:
 
 
 def short_hex(data: bytes | bytearray, most: int = 16) -> str:
-    """Return size and first bytes of `data`, for an error message."""
+    """Return size and first bytes (at most `most`) of `data` as text, for an error message."""
     dots = " ..." if len(data) > most else ""
     return f"{len(data)} bytes: {bytes(data[:most]).hex(' ')}{dots}"

@@ -1,6 +1,6 @@
 """User-defined functions (AP 5: 41h to 48h and 64h to 6Eh; devices also use other codes, such as 78h).
 
-On a serial line only the length tells where a reply ends, so the caller has to state the length of the reply: a fixed
+On a serial line only its length determines where a reply ends, so the caller has to state the length of the reply: a fixed
 number of bytes, or the position of its byte count.
 """
 

@@ -1,1 +1,1 @@
-"""The Modbus servers of the gateway: they parse requests of the gateway's clients, and forward them to devices."""
+"""The Modbus servers of the gateway, without I/O: parse the requests of clients, check them, and forward them to devices."""

@@ -1,8 +1,8 @@
 """Analyse requests to the gateway's own servers: function, addresses, and whether the request changes anything.
 
-Pure arithmetic on a request PDU (AP 6). Quantities (exception 03) are checked before addresses (02) (case MB-038). A request that
-passes can be sent to a unit, checked against an allow-list, or answered. This module must not know the sender of the request, and
-holds no registers. It shares no code with the emulators' server.
+Only the request PDU is used (AP 6), not its sender and no register values. Quantities (exception 03) are checked before addresses
+(02) (case MB-038). A request that passes can be sent to a unit, checked against an allow-list, or answered. This module shares no
+code with the emulators' server.
 """
 
 from __future__ import annotations

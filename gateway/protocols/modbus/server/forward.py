@@ -1,7 +1,7 @@
-"""A forwarded request: the PDU of a gateway's client as a `Request`, its reply returned byte for byte.
+"""Forward the request PDU of a client of the gateway as a `Request`, and return the reply byte for byte.
 
 The request determines the form of the reply, so a late or foreign reply is refused as it is for the gateway's own requests. This
-module must not know the sender of the request or a transaction ID.
+module does not depend on the sender of the request or on a transaction ID.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Modbus RTU requests, received by a server on a line that it may share with other servers: bytes and times in, requests out.
+"""Find Modbus RTU requests in the bytes that a server receives on a line that it may share with other servers.
 
 A frame is recognised by length and check sum. Requests to other servers and their replies are skipped as a whole. Any other byte
 is dropped, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In continuous noise, the
-search is only for requests to the units of interest. This module knows no ports.
+search is only for requests to the units of interest. This module does no I/O.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class LineRequest:
 class RtuRequests:
     """The receiver of frames on a line whose characters take `char_time_ns`. Its buffer is limited to about `MAX_FRAME` bytes.
 
-    `units` are the unit IDs whose requests are of interest. Other frames are also returned, except in continuous noise.
+    `units` are the unit IDs of interest: those for which the server answers. Other frames are also returned, except in continuous
+    noise.
     """
 
     def __init__(self, char_time_ns: int, units: Collection[int] = range(_LAST_UNIT + 1)) -> None:
@@ -69,7 +70,8 @@ class RtuRequests:
         return self._scan(silent=False)
 
     def silence(self) -> list[LineRequest]:
-        """Note that the line was silent for `gap_ns`: an incomplete frame will not be completed. Returns as `feed`.
+        """Note that the line was silent for `gap_ns`: an incomplete frame will not be completed. Return the frames, as `feed`
+        does.
 
         All bytes since the last frame or silence are returned as one request of a wrong length if they are addressed to
         one of `units` and their check sum is right: the addressed device refuses it (AP 7, exception 03).

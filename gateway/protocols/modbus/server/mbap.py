@@ -1,8 +1,8 @@
 """The server's side of the MBAP header (TG 3.1.3): parses Modbus TCP requests and encodes replies.
 
 Each client has one object. An ADU of another protocol is dropped, and the stream continues. After an invalid length the
-boundaries of ADUs are unknown, so the stream is given up (`desync`) and its owner closes it. This module knows no sockets, units
-or registers.
+boundaries of ADUs are unknown, so `desync` is set, and the caller closes the connection. This module does no I/O; the caller
+answers the requests.
 """
 
 from __future__ import annotations

@@ -314,7 +314,7 @@ class CanopenBus:
         status.up.set()
 
     async def _keep_up(self, status: NodeStatus) -> None:
-        """Bring the node up now, and again at each request."""
+        """Check, configure and start the node now, and again whenever `status.wanted` is set, until cancelled."""
         while True:
             await status.wanted.wait()
             status.wanted.clear()

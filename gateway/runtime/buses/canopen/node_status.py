@@ -16,8 +16,10 @@ from fieldtwin.gateway.runtime.gateway_status import DeviceStatus, EmcyStatus, T
 
 @dataclass
 class NodeStatus:
-    """The bus's record of one node. `wanted` is set while the node has to be brought up (again), `up` while it is
-    up."""
+    """The bus's record of one node.
+
+    `wanted` is set while the node has to be checked, configured and started (again), `up` while this is done and valid.
+    """
 
     driver: CanopenDriver
     writes: NodeWrites
@@ -33,7 +35,7 @@ class NodeStatus:
     polls: int = 0
     poll_errors: int = 0
     reading: bool = False
-    """A group is being read."""
+    """Whether a poll group of the node is being read over SDO."""
     polling: asyncio.Task[None] | None = None
     start_again: asyncio.TimerHandle | None = None
     wanted: asyncio.Event = field(default_factory=asyncio.Event)

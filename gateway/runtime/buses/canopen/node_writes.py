@@ -1,8 +1,7 @@
 """Pending writes to one CANopen node: RPDOs with their newest values, and a queue of SDO downloads.
 
 Values that are written together go in one frame. Process data is never queued: a newer value replaces an older one, and both
-callers get the result of the same frame. This module must not know which values are wanted or safe, or whether writing is allowed
-at all.
+callers get the result of the same frame. The caller decides which values to write, and checks whether writing is allowed.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from fieldtwin.gateway.protocols.canopen.pdo.sync import FrameProducer, SyncProd
 
 
 class Producing:
-    """The production of one bus. `not_produced` counts the messages that were not sent in time."""
+    """The sending of SYNC and TIME on one bus. `not_produced` counts the messages that were not sent in time."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -1,7 +1,7 @@
 """The queue of bridge clients' requests that wait for a bus: limited in number and fair between clients.
 
 The requests of a client that disconnected are dropped. The bus takes one request at a time, after the PLC's writes, and never two
-between two polls that are due. This module must not know the source of a request or the device that answers it.
+between two polls that are due. This module is independent of the source of a request and of the device that answers it.
 """
 
 from __future__ import annotations
@@ -93,8 +93,10 @@ class BridgeQueue:
         return None
 
     async def carry_out(self, guest: BridgeRequest, client: ModbusClient, on_line: bool) -> None:
-        """Carry out one attempt. A request that was lost on the bus is queued again while attempts are left. Raises
-        only `ConnectionLost`."""
+        """Carry out one attempt of the request `guest`. Raises only `ConnectionLost`.
+
+        A request without a valid reply is queued again while attempts are left.
+        """
         guest.attempts -= 1
         request = Forwarded(guest.unit, guest.pdu, guest.asked, on_line=on_line)
         sent_before = client.counters.requests

@@ -1,6 +1,6 @@
 """The order of polls on a Modbus bus: the state of its devices, and the choice of the next poll.
 
-Pure: times are monotonic nanoseconds, passed in. This module must not know a connection or what a poll does.
+This module does no I/O. Times are monotonic nanoseconds, which the caller passes.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ FOREVER_NS = 2**62
 class DeviceState:
     """The bus's record of one of its devices.
 
-    `tried` says that the device was asked since the connection was opened. `polls` counts the groups that were read, and the
-    attempts while the device did not answer.
+    `tried` says that a request was sent to the device since the connection was opened. `polls` counts the groups that were read,
+    and the attempts while the device did not answer.
     """
 
     driver: RegisterDriver
@@ -37,9 +37,9 @@ class DeviceState:
     poll_errors: int = 0
     next_try_ns: int = 0
     busy_until_ns: int = 0
-    """The device answered "busy" and is given time until then."""
+    """The end (ns) of the pause for groups to which the device answered "busy" (06) or "acknowledge" (05)."""
     reading: GroupReading | None = None
-    """The group that is being read, with some transactions left; it has been due since `reading_due_ns`."""
+    """The group whose read is not complete (more transactions follow), or None; it has been due since `reading_due_ns`."""
     reading_due_ns: int = 0
     triggered: set[str] = field(default_factory=set)
     alone: bool = False
@@ -61,12 +61,12 @@ class DeviceState:
 
     @property
     def retries_left(self) -> bool:
-        """Return whether to repeat a request without a reply: not while the device may be absent and other devices wait."""
+        """Return whether to repeat a request without a reply. False if the device may be absent and others need the bus."""
         return self.online or (self.alone and not self.backoff.failures)
 
 
 def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
-    """Return the states of a bus's devices, with the phases of their groups; `offset` keeps several buses apart."""
+    """Return the states of a bus's devices, with the phases of their groups; `offset` is that of `poll_schedule.spread`."""
     rates = rates_of([driver.config for driver in drivers], offset)
     alone = len(drivers) == 1
     return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
@@ -166,7 +166,7 @@ class Turns:
         """Return the next device to probe of those that are away, the time of the probe, and the time since when the device
         waits.
 
-        Devices that were never asked come first, then the device that was asked least recently.
+        Devices to which no request was sent yet come first, then the device whose last request is the oldest.
         """
         untried = [entry for entry in away if not entry[1].tried]
         best: tuple[tuple[int, int, int, int], DeviceState] | None = None

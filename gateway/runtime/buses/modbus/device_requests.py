@@ -1,4 +1,4 @@
-"""The requests of one turn of a device on a Modbus bus: first contact, triggers and reads, each repeated as configured."""
+"""The requests that a Modbus bus sends to a device: first contact, triggers and reads, each repeated as configured."""
 
 from __future__ import annotations
 
@@ -67,9 +67,10 @@ class DeviceRequests:
             driver.finish(reading)
 
     async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
-        """Trigger a device that measures on request. Return True if its values have to be read later.
+        """Start a measurement of a device that measures on request. Return True if the values have to be read later.
 
-        The bus serves other devices meanwhile."""
+        The bus serves other devices until then. Without permission to trigger, the values become bad.
+        """
         driver = device.driver
         wait_ms = driver.trigger_wait_ms(group)
         if not wait_ms or group in device.triggered:
@@ -92,8 +93,8 @@ class DeviceRequests:
     async def attempts(self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False) -> T:
         """Send a request up to `1 + retries` times, as long as it fails with a communication error.
 
-        A request that the device refuses is not repeated, and a device that was away is asked only once. With `later`, a timeout
-        is raised without a repetition if other devices wait for the bus.
+        A request that the device refuses is not repeated, and a device that was away gets only one request. With `later`, a
+        timeout is raised without a repetition if other devices wait for the bus.
         """
         retries = self._config.retries
         if device is not None:

@@ -1,8 +1,10 @@
-"""The gaps that were learnt about devices. They are kept between runs, and reported so that users can add them to profiles.
+"""The gaps of devices, found while polling: registers at which a device refuses reads, so that no read may cover them.
+
+They are kept between runs, and reported so that users can add them to profiles.
 
 They are in one JSON file in the run directory. An entry is used only for the device from which it was learnt: same
 profile (by its hash), same endpoint, same unit ID. A file that cannot be read, or that has any other content, is
-ignored: the gaps are learnt again. This module must not know a connection.
+ignored: the gaps are learnt again.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ MOST_BYTES = 4_000_000
 class LearntGapsEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file's entry for one device.
 
-    `gaps` have the form of a profile. `borders`, which have no registers, are given by the address of the first register after
-    them.
+    `gaps` are written as in a profile. `borders` holds the addresses at which a new read has to begin, because the device
+    accepts fewer registers per read than its profile states. `missing` are the tags that the device refuses.
     """
 
     profile: str

@@ -5,7 +5,7 @@ While one unit ID has its pause after a transaction, the bus serves other units.
 
 A device that does not answer delays the other devices by its full timeouts only once. After that it is probed with single
 requests, after growing pauses. While other devices answer, all probes together get at most a configured share of the bus's time
-(case 62 of the test-case list). This module opens connections only through the `Connector`. A lost connection is opened again
+(case MB-062). This module opens connections only through the `Connector`. A lost connection is opened again
 without limit, with back-off; until then the devices' tags are bad and carry the reason.
 """
 

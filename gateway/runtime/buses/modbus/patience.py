@@ -1,6 +1,6 @@
-"""How long a Modbus bus waits for the replies of its devices, while other devices also need it.
+"""The time for which a Modbus bus waits for the reply of one device while other devices also need the bus.
 
-Pure: times are monotonic nanoseconds, passed in.
+This module does no I/O. Times are monotonic nanoseconds, which the caller passes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Patience:
         return self._config.timeout_s if stated_s is None else stated_s
 
     def fell_silent(self, device: DeviceState, begun_ns: int, now_ns: int) -> bool:
-        """Note that a device that was online did not answer a request of `begun_ns`; return whether its timeout was shortened.
+        """Note that a device that was online did not answer a request sent at `begun_ns`; return whether its timeout was
+        shortened.
 
         Several devices often stop answering together, because of a cut cable. So for `ALARM_NS` the other devices are also polled
         with shortened timeouts. Otherwise each absent device would cost its whole timeout, while the devices that still answer
@@ -57,7 +58,8 @@ class Patience:
     def heard_late(self, devices: list[DeviceState], units: UnitTiming, now_ns: int) -> None:
         """Handle devices that answered after their shortened timeout but within their own.
 
-        These devices are present, so they are asked again at once, with more time."""
+        These devices are present, so their next requests are sent at once, with a longer timeout.
+        """
         for device in devices:
             late_ns = units.late_ns.get(device.driver.config.address)
             if late_ns is not None and late_ns <= self.own_s(device) * NS_PER_S:

@@ -11,8 +11,8 @@ A *probe* is one request to a device that is away or was never contacted. While 
   three that were shortened.
 
 While no device answers, the timeout doubles with each failure until it is the device's own, so that devices that can answer are
-found soon. A device that is alone on its bus is always asked with its own timeout. Pure: times are monotonic nanoseconds, passed
-in.
+found soon. A device that is alone on its bus always gets its own timeout. This module does no I/O. Times are monotonic
+nanoseconds, which the caller passes.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Probing:
         return min(own_ns, self.short_ns(own_ns, seen_ns, late_ns) << min(failures, 20))
 
     def long_may_go(self, failures: int, now_ns: int) -> bool:
-        """Return whether a device with this number of failures should be asked with its own, long timeout."""
+        """Return whether a device with this number of failures should now be probed with its own, long timeout."""
         return failures >= SHORT_TRIES and now_ns >= self._long_ns
 
     def fits(self, cost_ns: int, now_ns: int, free_until_ns: int) -> bool:

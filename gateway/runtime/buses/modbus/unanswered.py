@@ -1,7 +1,7 @@
 """Counts the requests of a connection that stay unanswered, to decide when the connection is useless.
 
 A firewall or a crash can leave a TCP connection half open: everything that is sent on it is lost without an error (TG
-4.2.2). Pure: this module reads the counters of a `ModbusClient`, and never uses the connection.
+4.2.2). This module only reads the counters of a `ModbusClient`; it does not use the connection.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class Unanswered:
     """The timeouts of `client` since its latest reply.
 
     Timeouts of requests with a shortened timeout (`UnitTiming.shorten_timeout`) count only while no device is online: devices
-    that are away may be asked often while an online device is rarely polled, and their silence shows nothing about the
+    that are away may be probed often while an online device is rarely polled, and their silence shows nothing about the
     connection. A shortened timeout counts as the fraction that it is of the unit's own timeout.
     """
 

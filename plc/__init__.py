@@ -1,1 +1,1 @@
-"""The soft PLC: scan cycle, tasks, programs in Python and Structured Text. It knows no bus, driver, emulator or twin."""
+"""The soft PLC: scan cycle, tasks, programs in Python and Structured Text. It depends on no bus, driver, emulator or twin."""

@@ -31,8 +31,8 @@ class InputBinding:
     """The source of an input (a tag of the plant, or another program's ``program.variable``), and its policy for bad values.
 
     `if_bad` decides what the program sees while the source is BAD. ``"pass"``: the value as it is, BAD. ``"hold"``: the last
-    value that was not BAD, as UNCERTAIN. A number: this number, as SUBSTITUTED. ``"trip"``: the task stops with its outputs safe
-    when a value that was good becomes bad.
+    value that was not BAD, as UNCERTAIN. A number: this number, as SUBSTITUTED. ``"trip"``: the task stops, with its outputs at
+    their safe values, when a value that was good becomes bad.
     """
 
     tag: str
@@ -63,8 +63,8 @@ class BoundProgram:
 def load_program(source: str, python_path: Sequence[str] = (), together: dict[Any, Any] | None = None) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
-    Programs that run together are created with one `together`, empty at first: programs of one file of Structured Text
-    share its VAR_GLOBAL there.
+    All programs of one PLC are created with the same dictionary `together`, which is empty at first. Through it, the programs
+    of one Structured Text file share their VAR_GLOBAL.
 
     `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export
     (``plant.xml``), followed by ``:NAME`` if it holds several programs.

@@ -1,7 +1,7 @@
 """Draws a state table as SVG, without a network, a font or a layout program.
 
-States are placed on an ellipse in the order of their codes, with the initial state on top and a dot before it; each transition is
-an arrow with its guard. Transitions from any state are drawn from each state. Pure: text in, text out.
+States are placed on an ellipse in the order of their codes, with the initial state on top and a dot before it; each transition
+is an arrow with its guard. Transitions from any state are drawn from each state. This module reads and writes no file.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _Box:
 
 
 class _Labels:
-    """The placement of texts, so that they hide neither a state nor each other, as far as there is room."""
+    """The placement of texts, so that, if there is enough room, they hide neither a state nor each other."""
 
     def __init__(self, boxes: Iterable[_Box]) -> None:
         self._taken = [(b.x - b.width / 2, b.y - _BOX_H / 2, b.x + b.width / 2, b.y + _BOX_H / 2) for b in boxes]
@@ -78,7 +78,7 @@ def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def svg(table: StateTable, title: str = "", current: str = "") -> str:
-    """Return the drawing; the state `current` is highlighted."""
+    """Return the diagram of `table` as SVG text, with the state `current` highlighted."""
     arrows = _arrows(table)
     longest = max((len(line) for *_, lines in arrows for line in lines), default=0)
     boxes = _places(table, longest)

@@ -8,9 +8,9 @@
         def execute(self, scan: ScanInfo) -> None:
             ...
 
-Within `execute`, inputs are attributes that do not change, and outputs and locals are attributes that the program sets.
-A program must not know the plant behind a variable, the image, a clock (`scan.now_ns` is frozen for a scan) or another
-program. Nothing in this module waits.
+Within `execute`, inputs are attributes that do not change, and outputs and locals are attributes that the program sets. A
+program must not depend on the plant behind a variable, the process image, a clock (`scan.now_ns` is constant during a scan) or
+another program. No function of this module blocks.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MESSAGE_DEPTH = 16
 class ProgramFailed(FieldtwinError):
     """A program raised an error, or set a variable to a value that its tag cannot hold.
 
-    The task stops and its outputs become safe.
+    The task stops, and its outputs are set to their safe values.
 
     `program` is its name in the system file, `line` the line of its source that raised the error (0 if unknown),
     `variable` the tag concerned, if any.
@@ -50,17 +50,17 @@ class ProgramFailed(FieldtwinError):
         self.line = line
         self.variable = variable
         self.place = f"{path}:{line}" if line else path
-        """File and line of the logic that failed, as far as they are known."""
+        """File and line of the logic that failed; the file alone if the line is not known."""
         spot = ", ".join(part for part in (f"program {program}", self.place, variable) if part)
         super().__init__(message, where=spot)
 
 
 class InputTripped(ProgramFailed):
-    """An input whose policy is ``trip`` became bad: the task stops, and its outputs become safe."""
+    """An input whose policy is ``trip`` became bad: the task stops, and its outputs are set to their safe values."""
 
 
 class ProgramStuck(ProgramFailed):
-    """A program did not end its scan: the task stops, and its outputs become safe."""
+    """A program did not end its scan: the task stops, and its outputs are set to their safe values."""
 
 
 class ScanTooLong(FieldtwinError):
@@ -144,7 +144,9 @@ def message_output(max_bytes: int = MESSAGE_BYTES, depth: int = MESSAGE_DEPTH) -
 
 
 class ScanInfo(msgspec.Struct, frozen=True, gc=False):
-    """The present scan: its frozen time (monotonic, ns), its number from 1, and whether it is the first since the start."""
+    """The present scan: its time (monotonic ns, constant during the scan), its number from 1, and whether it is the first since
+    the start.
+    """
 
     now_ns: int
     number: int
@@ -161,7 +163,7 @@ class Outbox:
         self.max_bytes = max_bytes
         self.depth = depth
         self.outstanding = 0
-        """How many messages are published and not yet taken; the scan updates it."""
+        """The number of messages that are published and that the receiver has not taken yet. The scan updates it."""
         self.pending: list[tuple[int, bytes]] = []
         """Messages that were sent in this scan and are published at its end."""
         self.waits = 0
@@ -238,8 +240,7 @@ class Program(ABC):
 
     __slots__ = ("__dict__", "__weakref__", "_assigned")
     _assigned: dict[str, tuple[CodeType, int]]
-    """By output: the instruction that assigned it last. It is not a variable, because variables are the program's
-    state."""
+    """By output: the instruction that last assigned it. It is not a variable, because variables are the program's state."""
     variables: ClassVar[dict[str, Variable]] = {}
     source_path: ClassVar[str] = ""
     """The file from which the program was compiled, if it is not the file of its module."""

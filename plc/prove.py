@@ -1,9 +1,9 @@
 """Checks the invariants of a program in every state that it can reach with any inputs, breadth first.
 
 A `Proof` defines the possible inputs (a finite domain per scan: values, qualities, elapsed time), which part of the program's
-state matters, and the invariants. The program itself runs, scan by scan; there is no second model. The search is breadth first,
-so the path to the first violation has the fewest scans. The search is limited: states that were not visited are reported, and
-then there is no proof.
+state matters (the key), and the invariants. The program itself runs, scan by scan; there is no second model. The search is
+breadth first, so the path to the first violation has the fewest scans. The search is limited: states that were not visited are
+reported, and then there is no proof.
 
 A proof is only as good as its key: if the key leaves out a part of the state that matters, the search ends too soon. Structured
 Text needs no key, because all of its state is known. The timers and other blocks of a program are always part of the key. A given
@@ -59,7 +59,7 @@ def _shown(value: Any) -> Any:
 
 
 Invariant = Callable[[Any], bool]
-"""Called with the program after a scan; returns whether the invariant holds."""
+"""A function that is called with the program after each scan, and returns whether the invariant holds."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Proof:
     steps_ms: tuple[float, ...] = (10.0,)
     clogs: bool = False
     requirement: Mapping[str, str] = field(default_factory=dict)
-    """The source of each invariant."""
+    """By name of an invariant: the requirement from which it is derived, such as an identifier."""
 
     def choices(self) -> list[Given]:
         """Return all inputs that one scan can have, the simplest first."""
@@ -101,8 +101,8 @@ def machine_key(program: StateMachine) -> Hashable:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """The result of a search. `broken`: the invariant that does not hold (or the error that a scan raised), and `way`
-    to it, scan by scan.
+    """The result of a search. `broken` is the invariant that does not hold (or the error that a scan raised), and `way` the
+    inputs of each scan that lead to it.
 
     `reason`: why the program is not proved although no invariant is broken.
     """
@@ -182,7 +182,9 @@ def _key(proof: Proof, point: _Point) -> Hashable:
 
 
 def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: SearchResult) -> SearchResult:
-    """Return `whole`, unless a random path breaks an invariant or reaches a state that the search did not visit."""
+    """Test the key with random paths. Return `whole`, or a failed result if a path breaks an invariant or reaches a state that
+    is not in `seen`.
+    """
     random = Random(0)
     for _ in range(WALKS):
         point = _Point(proof.make(), 0, 0, None, None)
@@ -200,7 +202,7 @@ def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: 
 
 
 def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:
-    """Return the program's outputs and locals at the end of `way`. The last scan may have raised an error before its end."""
+    """Return the program's outputs and locals after the scans with the inputs `way`. The last scan may raise an error."""
     point = _Point(proof.make(), 0, 0, None, None)
     for given in way:
         point = point.after(given)

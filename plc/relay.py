@@ -1,11 +1,11 @@
 """The paper's ControlLogic, and `Relay`, the PLC program that runs it in a scan.
 
-`ControlLogic` implements the row literally: consumers `sensor` and `transmitter`, producers `response` and `command`, a
-period, a data log and the observatory's state machine. It does not interpret payloads, except for the period in a
-command. `Relay` connects it to tags: messages from the mailboxes go to the consumers, and what the producers emit goes
-to outputs. While the transmitter cannot keep up, these outputs wait in a queue of limited length.
+`ControlLogic` implements the schema of the paper literally: consumers `sensor` and `transmitter`, producers `response` and
+`command`, a period, a data log and the observatory's state machine. It does not interpret payloads, except for the period in a
+command. `Relay` connects it to tags: messages from the mailboxes go to the consumers, and what the producers emit goes to
+outputs. While the transmitter cannot keep up, these outputs wait in a queue of limited length.
 
-Neither class may know a protocol, a register or the time of day; `now_ns` is the scan's.
+Neither class may depend on a protocol, a register or the time of day; `now_ns` is the time of the scan.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ControlLogic:
 
     @property
     def period_s(self) -> int:
-        """Return `period` in Z: the last commanded period in seconds."""
+        """Return the last commanded period in seconds: any integer (`period` of the schema)."""
         return self.machine.period_s
 
     def set_period(self, command: COMMAND) -> None:
@@ -141,14 +141,14 @@ class Relay(Program):
     """
 
     queue_capacity: ClassVar[int] = QUEUE_CAPACITY
-    """How many responses may wait for the transmitter."""
+    """The number of responses that may wait for the transmitter."""
     table = StateTable(
         Transition(ANY, "ACTIVE", when="command > 0"),
         Transition(ANY, "STANDBY", when="command = 0"),
         Transition(ANY, "OFF", when="command < 0"),
         states=tuple(STATE_CODES),
     )
-    """The state machine for drawing; fieldtwin.gateway.core.statemachine runs it."""
+    """The state machine, only to draw it as a diagram; fieldtwin.gateway.core.statemachine runs it."""
     command: tuple[Message, ...] = message_input()
     sample: tuple[Message, ...] = message_input()
     period_s: int = var_output(TagKind.INT, initial=0, unit="s")

@@ -38,7 +38,7 @@ class RelayWithHistory(Relay):
 
     @property
     def unaccounted(self) -> int:
-        """Return how many responses were taken that are neither sent, nor waiting, nor counted as dropped."""
+        """Return the number of received responses that are neither sent, nor waiting, nor counted as dropped or as too long."""
         return self.responses - self.sent - self.waiting - self._outgoing.dropped - self._too_long
 
     @property

@@ -10,9 +10,9 @@
             Transition(ANY, "IDLE", when="not start", do="close"),
         )
 
-Each scan takes at most one transition: the first in the table's order that starts in the present state, whose guard
-holds and whose time in the state has passed. `when` is an expression over the program's variables, `do` a method.
-Diagrams (fieldtwin.plc.diagram) and proofs (fieldtwin.plc.prove) read the same table. Pure: time is the scan's.
+Each scan takes at most one transition: the first in the table's order that starts in the present state, whose guard holds and
+whose time in the state has passed. `when` is an expression over the program's variables, `do` a method. Diagrams
+(fieldtwin.plc.diagram) and proofs (fieldtwin.plc.prove) read the same table. Times are measured with the time of the scan.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Transition:
 
     @property
     def label(self) -> str:
-        """Return the text that a diagram shows at the arrow."""
+        """Return the text that a diagram shows at the arrow of this transition."""
         parts = [self.when, f"after {self.after_ms:g} ms" if self.after_ms else "", f"/ {self.do}" if self.do else ""]
         return ", ".join(p for p in parts[:2] if p) + (f" {parts[2]}" if parts[2] else "")
 
@@ -132,9 +132,9 @@ class StateMachine(Program):
     def __init__(self) -> None:
         self.state = self.table.code(self.table.initial)
         self.since_ns: int | None = None
-        """When the state was entered; None before the first scan."""
+        """The time (monotonic ns) at which the state was entered; None before the first scan."""
         self.in_state_ms = 0.0
-        """How long ago the state was entered, as of the last scan."""
+        """The time (ms) from the entry into the state to the last scan."""
 
     @property
     def state_name(self) -> str:

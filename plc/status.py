@@ -44,7 +44,7 @@ class WaitingStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A program that has not started, because inputs have not been good yet."""
 
     inputs: dict[str, str] = {}
-    """By tag: the reason why it is not good."""
+    """By tag of an input that has not been good: the reason."""
     programs: list[str] = []
     """The programs that it waits for."""
     reason: str
@@ -55,7 +55,7 @@ class WaitingStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StopsStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """The failures after which the PLC restarted its programs: their number, and the error of the last failure."""
+    """The failures after which the PLC restarted its programs: their number, and the error of the last one."""
 
     count: int = 0
     last: str = ""
@@ -97,14 +97,15 @@ class PlcStatus(ScanStatus, frozen=True, kw_only=True):
     gateway_alive: bool = False
     counters: dict[str, int] = {}
     realtime: RealtimeStatus | None = None
-    """None in virtual time, likewise `acts`."""
+    """None in virtual time. This also applies to `acts`."""
     acts: dict[str, int] | None = None
-    """The number of manual interventions, by kind."""
+    """By kind of manual intervention (force, pause and so on): how often it was carried out."""
     programs: dict[str, str] = {}
     """By program: the name of its class."""
     duration_buckets: Buckets = []
-    """The durations of the first task's scans, likewise `lateness_buckets`. A brief status has them only if the client asks with
-    ``"buckets": true``."""
+    """The durations of the first task's scans; `lateness_buckets` holds their delays. A brief status has both only if the
+    client asks with ``"buckets": true``.
+    """
     lateness_buckets: Buckets = []
 
 

@@ -1,1 +1,1 @@
-"""Where gateway, PLC and emulators meet: system files, plants, prototypes, digital models and digital threads."""
+"""Systems that combine gateway, PLC and emulators: system files, plants, prototypes, digital models and digital threads."""

@@ -2,10 +2,10 @@
 
     LL  alarm     L  warning          H  warning     HH  alarm
 
-A limit is violated when X is beyond it, and no longer violated when X is back by more than HYS. A violation that lasts
-DELAY raises its condition; a shorter violation raises none. A raised condition stays *unacknowledged* until ACK rises,
-also after the value came back. It ends when it is acknowledged and the value is back. A value that is not a number
-changes nothing.
+A limit is violated when X is beyond it, and no longer violated when X is back by more than HYS. A violation that lasts DELAY
+raises its condition; a shorter violation raises none. A raised condition stays *unacknowledged* until ACK rises, even if the
+limit is no longer violated. The condition ends when it is acknowledged and the limit is no longer violated. A value that is not
+a number changes nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ class _Limit:
         self.sign = sign
         self.violated = self.active = self.unacknowledged = False
         self._since_ns: int | None = None
-        """Since when it is violated. None also after a restart that kept the other state: then the delay starts again."""
+        """The time (ns) at which the violation began. None before the first one, and after a restart: the delay then starts
+        again.
+        """
 
     def watch(self, x: float, limit: float, hysteresis: float, delay_ns: int, now_ns: int) -> None:
         beyond = (x - limit) * self.sign
@@ -43,8 +45,8 @@ class _Limit:
 class ALARM(FunctionBlock):
     """The block that the module describes.
 
-    QLL, QL, QH and QHH are true while the condition of that limit is raised. UNACK: a condition is not acknowledged. Q: an alarm
-    is raised; WARN: a warning is raised.
+    QLL, QL, QH and QHH are true while the condition of that limit is raised. UNACK is true while a condition is not
+    acknowledged, Q while an alarm is raised, and WARN while a warning is raised.
     """
 
     __slots__ = (

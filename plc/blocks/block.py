@@ -1,12 +1,13 @@
-"""The base of all function blocks: instances that keep their state between calls, and the declaration that ST reads.
+"""The base class of all function blocks, which keep their state between calls, with the declarations that the ST compiler
+reads.
 
 A block is called once per scan, with the scan's frozen time, in one of two ways:
 
     delay(scan.now_ns, IN=level_high, PT=2 * SECOND).Q      from Python, all inputs named and typed
     delay.IN = ...; delay.execute(now_ns); ... delay.Q       as a compiled ST call does: omitted inputs keep their value
 
-Names of inputs and outputs are the standard's (IEC 61131-3). Times are integers in ns. A block must not know a clock, a
-tag or the program that it is in.
+Names of inputs and outputs are the standard's (IEC 61131-3). Times are integers in ns. A block must not depend on a clock, a
+tag or the program that contains it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Timers: TON, TOF, TP (IEC 61131-3, 6.6.3.5.5 with its timing diagrams).
 
-Blocks use the scan's time. So a period begins with the scan that saw the edge, and an output changes in the first scan at or
-after its time. ET never exceeds PT. Where the standard does not define the behaviour: a PT that changes while the timer runs
-counts from the same start; a PT that changes after the timer expired has no effect until the next start; a negative PT is 0; a
-rise of TP's IN in the same scan that ends the pulse does not start a new one.
+Blocks use the scan's time. So a period begins with the scan that detects the edge, and an output changes in the first scan at
+or after the end of the period. ET never exceeds PT. Where the standard does not define the behaviour: a PT that changes while
+the timer runs counts from the same start; a PT that changes after the timer expired has no effect until the next start; a
+negative PT is 0; a rise of TP's IN in the same scan that ends the pulse does not start a new one.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ class _Timer(FunctionBlock):
         raise NotImplementedError
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
-        """Return the state as every block does, without the start time of an expired timer, because all expired timers behave the
-        same.
-        """
+        """Return `FunctionBlock.state` without the start time of an expired timer, because all expired timers behave the same."""
         since_ns = self._since_ns if self._runs() else None
         phase_ns = None if since_ns is None else now_ns - since_ns
         return self.IN, self.Q, self.PT, self.ET, phase_ns

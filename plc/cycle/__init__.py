@@ -1,1 +1,1 @@
-"""One cycle of a task: the time when it is due, its input image, its programs, its output image."""
+"""One cycle of a task: its deadline, the input image that it reads, its programs, and the output image that it publishes."""

@@ -1,8 +1,8 @@
 """Forces: values that a user sets in place of a tag's value, until they are removed.
 
-Every program sees the forced value of an input, with quality SIMULATED. A forced output or local is set before the logic and
-again after it, and is published as SIMULATED (paper.md, ruling 15). The number of forces is limited, and they are listed in every
-status. This module does not check whether a force is safe: that is the user's decision.
+Every program sees the forced value of an input, with quality SIMULATED. A forced output or local is set before the logic runs,
+and again afterwards, and is published as SIMULATED (paper.md, ruling 15). The number of forces is limited, and they are listed
+in every status. This module does not check whether a force is safe: that is the user's decision.
 """
 
 from __future__ import annotations

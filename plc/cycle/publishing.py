@@ -1,8 +1,8 @@
 """The output image of a PLC: what all programs of all tasks publish, as one region with one writer.
 
-Each scan publishes the whole region: the present values of its own programs, and the values of the other programs after
-their last scan. It inserts forced outputs, takes messages from the outboxes, and refuses a value that its tag cannot
-hold, with the program's name. It must not know when a scan is due.
+Each scan publishes the whole region: the present values of its own programs, and the values of the other programs after their
+last scan. It inserts forced outputs, takes messages from the outboxes, and rejects a value that its tag cannot hold, with an
+error that names the program. This module must not depend on when a scan is due.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ from fieldtwin.plc.cycle.forces import Forces
 from fieldtwin.plc.program import Outbox, ProgramFailed, SourceLine, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
-"""Returns a program's inputs as it read them, by variable."""
+"""A function that returns a program's inputs, by variable, as the program read them."""
 
 _GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # local names, because looking up an Enum's members is slow
 MAX_CHANGES = 16
-"""How many changes of a tag are remembered, with what the program saw when it made them."""
+"""The number of changes that are kept for each tag, each with the inputs that the program read when it made the change."""
 
 
 class PublishedVariable:
     """One published variable, and the attribute in which the program keeps it.
 
-    `taken` is the index in INPUTS of the tag that counts how many of its messages were taken."""
+    `taken` is the index in INPUTS of the tag that counts how many of the messages of this variable the receiver has taken.
+    """
 
     def __init__(self, bound: BoundProgram, variable: Variable, spec: TagSpec, index: int) -> None:
         self.program = bound.program
@@ -72,7 +73,7 @@ class TagChange:
     inputs: dict[str, Scalar | None]
     forced: bool = False
     place: SourceLine | None = None
-    """The line of the program that assigned `after`."""
+    """The source line that assigned the new value (`after`)."""
 
     def describe(self, now_ns: int) -> dict[str, Any]:
         """Return the change as data for JSON."""
@@ -100,21 +101,23 @@ class OutputImage:
         self.consumed: list[str] = []
         self.changes: dict[str, deque[TagChange]] = {}
         self.on_change: Callable[[TagChange], None] | None = None
-        """Called with each change. It must not raise."""
+        """A function that is called with each change. It must not raise an exception."""
         self._readers: dict[str, RegionReader] = {}
         self._read: list[tuple[int, RegionReader, str]] = []
-        """Place, reader and name of each message tag that a program reads."""
+        """For each message tag that a program reads: the index of its counter of consumed messages in OUTPUTS, its reader, and
+        its name.
+        """
         self._forced = False
         """Whether the last publication had forced outputs."""
         self._bind(programs, image.reader(INPUTS).shape)
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
         self._missing: dict[int, Reason] = {}
-        """Why an output has no value, by its place, if the reason is not that no program has set it yet."""
+        """By index of an output without a value: the reason, unless it is that no program has set the output yet."""
         self._same = False
         """Whether the collected values equal those published last, apart from times."""
         self._room_for: Sequence[Scalar | None] | None = None
-        """The INPUTS from which the room in the outboxes was computed; None if messages were sent since."""
+        """The values of INPUTS from which the room in the outboxes was computed; None if messages were sent since then."""
         self._by_owner: dict[str, list[PublishedVariable]] = {}
         for output in self.outputs:
             self._by_owner.setdefault(output.owner, []).append(output)
@@ -144,7 +147,9 @@ class OutputImage:
                 self.outboxes.append((source, source.outbox))
 
     def _before(self, image: Image) -> dict[str, int]:
-        """Return the sequence up to which an earlier process had consumed messages, by message tag."""
+        """Return, by message tag, the sequence number of the last message that an earlier process consumed; 0 if there was
+        none.
+        """
         before = image.reader(OUTPUTS).snapshot()
         found = {}
         for tag in self.consumed:
@@ -153,8 +158,9 @@ class OutputImage:
         return found
 
     def reads(self, tag: str, reader: RegionReader) -> None:
-        """Register `reader` as the consumer of the messages of `tag`. Raises `FileInvalid` if another reader already
-        is."""
+        """Register `reader` as the consumer of the messages of `tag`. Raises `FileInvalid` if a different reader is already
+        registered.
+        """
         if self._readers.setdefault(tag, reader) is not reader:
             raise FileInvalid(f"messages of {tag} go to programs of two tasks", expected="programs of one task")
         reader.resume(tag, self._resumed[tag])
@@ -167,7 +173,7 @@ class OutputImage:
     # -- the cycle ----------------------------------------------------------------------------------------------------
 
     def force(self) -> None:
-        """Put forced outputs and locals into their programs, before the logic."""
+        """Set forced outputs and locals in their programs. Called before the logic runs."""
         forced = self.forces.outputs
         if forced:
             for output in self._plain:
@@ -183,7 +189,7 @@ class OutputImage:
                 self._same = False
 
     def room(self, taken: Sequence[Scalar | None]) -> None:
-        """Read from INPUTS how many of the sent messages were taken."""
+        """Compute the room in the outboxes from the counters in INPUTS of the messages that the receivers have taken."""
         if taken is self._room_for:  # a reader returns the same columns as long as nothing in them changes
             return
         self._room_for = taken
@@ -193,14 +199,14 @@ class OutputImage:
             outbox.outstanding = sent(output.tag) - (got if isinstance(got, int) else 0)
 
     def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
-        """Collect the present values of `programs`; changes are remembered with what the program saw."""
+        """Collect the present values of `programs`, and record each change with the inputs that the program read."""
         for owner, outputs in self._by_owner.items():
             seen = programs.get(owner)
             if seen is not None:
                 self._collect(outputs, now_ns, scan, seen)
 
     def _collect(self, outputs: list[PublishedVariable], now_ns: int, scan: int, seen: Seen) -> None:
-        """Collect the values of one program."""
+        """Collect the values of the `outputs` of one program, and record changes with the inputs that `seen` returns."""
         values, forced, namespace = self._values, self.forces.outputs, outputs[0].namespace
         for output in outputs:
             value = namespace[output.name]
@@ -267,7 +273,7 @@ class OutputImage:
         self._same = True
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
-        """Return (program, ``FILE:LINE``) that set `tag` to `value` (None: to NaN), from the remembered changes.
+        """Return (program, ``FILE:LINE``) that set `tag` to `value` (None: to NaN), from the recorded changes.
 
         The line is "" if none of them is that change and they come from more than one line.
         """
@@ -280,7 +286,7 @@ class OutputImage:
         return owner, places.pop() if len(places) == 1 else ""
 
     def stop(self, now_ns: int) -> None:
-        """Publish that OUTPUTS must no longer be used: flagged stopped, every tag BAD, values unchanged."""
+        """Publish OUTPUTS flagged as stopped, so that it is no longer used: every tag is BAD, and its value is unchanged."""
         self._same = False
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
 
@@ -294,7 +300,7 @@ class OutputImage:
         self.writer.release()
 
     def last(self) -> dict[str, Scalar | None]:
-        """Return every tag of OUTPUTS as last collected. The value of a message tag is its last sequence."""
+        """Return every tag of OUTPUTS as last collected. The value of a message tag is its last sequence number."""
         shown = dict(zip(self.writer.shape.index, self._values, strict=True))
         return shown | {output.tag: self.writer.last_sequence(output.tag) for output, _ in self.outboxes}
 

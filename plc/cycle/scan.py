@@ -1,15 +1,15 @@
 """The scan of one task: read the input image once, execute the task's programs, publish the output image once.
 
-Each scan uses one consistent snapshot and one frozen time. Pure: `Scan.execute(now_ns)` is given the time, and uses
-only the image and the programs. It must not know a clock, a cycle, a process or a protocol.
+Each scan uses one consistent snapshot and one time, which does not change during the scan. `Scan.execute(now_ns)` is given the
+time, and uses only the image and the programs. This module must not depend on a clock, a cycle time, a process or a protocol.
 
 When the gateway's heartbeat in the image is older than its limit, or its region is flagged stopped, every input is BAD /
 GATEWAY_DEAD, even if the image shows a better quality. For a BAD input the input's policy decides what the program sees
 (`InputBinding.if_bad`). A forced input is always SIMULATED. Messages are events, not states: they are passed on unchanged, in
 order and exactly once, independently of the quality of their tag.
 
-A program that has not started (fieldtwin.plc.cycle.start) is not executed, and nothing of it is published. Messages wait
-while a program that takes messages has not started.
+A program that has not started (fieldtwin.plc.cycle.start) is not executed, and its outputs and locals are published without a
+value. Messages wait while a program that takes messages has not started.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from fieldtwin.plc.program import (
 
 _BAD = int(Quality.BAD)
 MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
-"""How many messages of a scan, and how many bytes of each, are remembered with a change that the scan made."""
+"""How many of the messages that a scan read, and how many bytes of each, are recorded with a change that the scan made."""
 
 
 class _Input:
-    """One bound input: its place in the image and in the program, and its policy while it is BAD."""
+    """One bound input: its index in the image, its variable in the program, and its policy while it is BAD."""
 
     def __init__(
         self, owner: str, program: Program, variable: Variable, spec: TagSpec, index: int, binding: InputBinding
@@ -58,7 +58,7 @@ class _Input:
         self.hold = binding.if_bad == "hold"
         self.trip = binding.if_bad == "trip"
         self.known: Scalar | None = None
-        """The last value that was not BAD. An input can trip only after it had one."""
+        """The last value that was not BAD; None before the first one. An input can trip only after it had such a value."""
         self.substitute = substitute(spec, binding.if_bad)
         self.held: tuple[Scalar | None, int] | None = None
 
@@ -78,10 +78,11 @@ class _Input:
 class Scan:
     """The programs of one task over an attached image.
 
-    `outputs` is the output image of all tasks; without it, the scan has its own. With `outputs_first`, a scan begins by
-    publishing what the previous scan computed, so that outputs change at the start of the cycle, however long the logic runs.
-    `starts` determines by name which programs may run; without it all may run. After a restart of the process, messages continue
-    after the last message that OUTPUTS reports as consumed. Raises `FileInvalid` when a binding's tag is not in the image.
+    `outputs` is the output image of all tasks; without it, the scan creates an output image for its programs. With
+    `outputs_first`, a scan begins by publishing what the previous scan computed, so that outputs change at the start of the
+    cycle, however long the logic runs. `starts` determines by name which programs may run; without it all may run. After a
+    restart of the process, messages continue after the last message that OUTPUTS reports as consumed. Raises `FileInvalid` when
+    a binding's tag is not in the image.
     """
 
     def __init__(
@@ -221,7 +222,7 @@ class Scan:
         self.output_image.publish(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Publish that OUTPUTS must no longer be used: flagged stopped, every tag BAD, values unchanged."""
+        """Publish OUTPUTS flagged as stopped, so that it is no longer used: every tag is BAD, and its value is unchanged."""
         self.output_image.stop(now_ns)
 
     def release(self) -> None:
@@ -287,7 +288,7 @@ class Scan:
         return self._seen_at(item.index)
 
     def value(self, tag: str) -> Scalar | None:
-        """Return the value of a tag of either region as this scan last knew it; None for an input that is bad."""
+        """Return the value of a tag of INPUTS or OUTPUTS as of the last scan; None for an input that is bad."""
         index = self._reader.shape.index.get(tag)
         if index is not None:
             force = self.output_image.forces.inputs.get(tag)
@@ -320,13 +321,12 @@ class Scan:
     def outputs(self) -> dict[str, Scalar | None]:
         """Return every tag of OUTPUTS as published by the last successful scan.
 
-        The value of a message tag is its last sequence.
+        The value of a message tag is its last sequence number.
         """
         return self.output_image.last()
 
     def counters(self) -> dict[str, int]:
-        """Return the messages that were missed on input and refused on output, and the reads of the image that
-        failed."""
+        """Return the numbers of messages missed on input, of messages refused on output, and of failed reads of the image."""
         return {
             "messages_missed": sum(self._reader.missed.values()),
             "mailbox_waits": sum(outbox.waits for _, outbox in self.output_image.outboxes),
@@ -336,7 +336,7 @@ class Scan:
 
 
 def _run(bound: BoundProgram, info: ScanInfo) -> None:
-    """Execute one scan of a program. Raises `ProgramFailed`."""
+    """Execute one scan of a program. Raises `ProgramFailed` if the program raises an error."""
     try:
         bound.program.execute(info)
     except (Exception, SystemExit, ScanStuck) as e:  # the logic is the user's: any error that it raises stops the task
@@ -351,7 +351,9 @@ def _as_text(messages: tuple[Message, ...]) -> str | None:
 
 
 def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
-    """Return the error with program and line: the innermost line in the program's file, or else the innermost line at all."""
+    """Return `error` as a `ProgramFailed` with program and line: the innermost line in the program's file, else of the
+    traceback.
+    """
     made = type(bound.program)
     own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
     path, line, inside = "", 0, False

@@ -10,7 +10,7 @@ variable counts as good once that program has executed a scan. If two programs r
 inputs of both, and the program that runs first sees the initial values of the second one. A program that reads a program in a
 SINGLE task also sees initial values at first.
 
-Pure: the time is passed in. This module must not know a task's cycle or a protocol.
+The time is an argument. This module must not depend on a task's cycle or a protocol.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class StartPolicy:
 
 
 class ProgramStart:
-    """The start of one program. `started` says that it may run, `ran` that it has executed a scan.
+    """The start of one program. `started` is true when the program may run, `ran` when it has executed a scan.
 
     `missing` maps each input tag that has not been good yet to the reason. `without` holds the inputs that were missing when the
     program started.
@@ -109,7 +109,7 @@ class ProgramStart:
         return ", ".join(tags[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
     def error(self) -> InputsMissing:
-        """Return the error to report when the time is over."""
+        """Return the error to report when the time for the start has passed."""
         return InputsMissing(
             f"program {self.name} has not started: it waits for {self.reason()}",
             expected=f"every input good once within {self.policy.timeout_ms / 1000:g} s",
@@ -169,8 +169,9 @@ class Starts:
         return list(dict.fromkeys(tag.partition(".")[0] for tag in tags if tag.partition(".")[0] in self.all))
 
     def look(self, now_ns: int) -> None:
-        """Check the inputs that are missing and start the programs that can start. Raises `InputsMissing` if the policy
-        is ``stop``."""
+        """Check the missing inputs and start the programs that can start. Raises `InputsMissing` if a program whose policy is
+        ``stop`` is overdue.
+        """
         snapshot = self._reader.snapshot()
         alive = snapshot.counter > 0 and now_ns - snapshot.t_ns <= self._limit_ns and not snapshot.stopped
         index = self._reader.shape.index

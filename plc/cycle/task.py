@@ -10,9 +10,10 @@ the future: missed periods are skipped and counted, and not made up for in a bur
                         | ---a scan does not end-----------------> STOPPED (stuck; `error` has the place)
                         | ---a `trip` input becomes bad----------> STOPPED (tripped)
 
-On every path to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
-itself does not wait: its driver sleeps until `deadline_ns` and calls `run_once`. So the same object runs on the wall
-clock (fieldtwin.plc.runtime.realtime) and in a loop under virtual time (`run_on_clock`). It must not know which.
+On every path to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task itself
+does not wait: its driver sleeps until `deadline_ns` and calls `run_once`. So the same object runs on the wall clock
+(fieldtwin.plc.runtime.realtime) and in a loop under virtual time (`run_on_clock`). It must not depend on which of the two
+drives it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
 
 
 class Executable(Protocol):
-    """The object that a task runs: fieldtwin.plc.cycle.scan.Scan."""
+    """The interface of the object that a task runs. `fieldtwin.plc.cycle.scan.Scan` implements it."""
 
     def execute(self, now_ns: int) -> None: ...
 
@@ -50,7 +51,7 @@ class Guard(Protocol):
 
 
 class Driven(Protocol):
-    """The object that is driven: fieldtwin.plc.runtime.runner.TaskRunner, CyclicTask."""
+    """The interface through which a clock runs one task (`CyclicTask`) or several (`fieldtwin.plc.runtime.runner.TaskRunner`)."""
 
     @property
     def running(self) -> bool: ...
@@ -86,9 +87,10 @@ class StopReason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TaskConfig:
-    """The configuration of a task. `cycle_ms` is the time between deadlines. A scan that starts more than `late_ms`
-    after its deadline, or ends after the next one, is an overrun, and `stop_after` overruns in a row stop the task (0:
-    never). `name` is the task's, for messages."""
+    """The configuration of a task. `cycle_ms` is the time between deadlines. A scan that starts more than `late_ms` after its
+    deadline, or ends after the next one, is an overrun, and `stop_after` overruns in a row stop the task (0: never). `name` is
+    the task's name in messages.
+    """
 
     cycle_ms: float
     late_ms: float = 5.0
@@ -118,9 +120,11 @@ class CyclicTask:
         same applies while none of the task's programs has started."""
         self.steps = 0
         self.held_up_by = ""
-        """What was running when the next scan became due, set by a runner of several tasks; empty: nothing known."""
+        """A description of the task that was still running when this one became due, for messages. A runner of several tasks
+        sets it; empty if there was none.
+        """
         self.ended_ns = 0
-        """When the last scan ended."""
+        """The time (monotonic ns) at which the last scan ended."""
         self._guard = guard
         self.state = TaskState.READY
         self.stop_reason = StopReason.NONE
@@ -129,7 +133,7 @@ class CyclicTask:
         self.duration = Histogram()
         self.scans = self.missed_periods = self.overruns = 0
         self.deadline_ns = 0
-        """When the next scan is due; valid while RUNNING."""
+        """The time (monotonic ns) at which the next scan is due; valid while RUNNING."""
         self._scan = scan
         self._now_ns = now_ns
         self._cycle_ns = round(config.cycle_ms * NS_PER_MS)
@@ -148,7 +152,7 @@ class CyclicTask:
         self.deadline_ns = self._now_ns() + self._cycle_ns
 
     def run_once(self) -> None:
-        """Run the scan that is due. Afterwards `deadline_ns` is the next deadline, or the task is STOPPED."""
+        """Run the scan that is due. Afterwards `deadline_ns` is the next deadline, or the state is STOPPED."""
         if self.state is not _RUNNING:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
@@ -196,7 +200,7 @@ class CyclicTask:
             raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
 
     def stop(self) -> None:
-        """Stop on request, with outputs safe. A task that has already stopped stays unchanged."""
+        """Stop on request, and set the outputs to their safe values. A task that has already stopped is not changed."""
         if self.state is not TaskState.STOPPED:
             self._stop(StopReason.REQUESTED)
 
@@ -246,7 +250,9 @@ class CyclicTask:
 
 
 async def run_on_clock(task: Driven, clock: Clock) -> None:
-    """Run `task` in the running loop, on its clock, until it is stopped. Cancelling makes its outputs safe."""
+    """Run `task` in the running event loop, on `clock`, until the task is stopped. Cancelling sets its outputs to their safe
+    values.
+    """
     task.start()
     try:
         while task.running:

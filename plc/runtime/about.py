@@ -15,9 +15,9 @@ from fieldtwin.plc.runtime.sources import ProgramSource
 from fieldtwin.plc.states import ANY, StateTable
 
 MAX_TEXT_BYTES = 128 * 1024
-"""The size of the source text of one program."""
+"""The largest size of the source text of one program. A larger one is not shown."""
 MAX_TEXTS_BYTES = 1024 * 1024
-"""The size of all source texts together. Further programs are described without their text."""
+"""The largest size of all source texts together. Further programs are described without their text."""
 STATE = "state"
 """The variable that holds the code of a program's present state."""
 PLCOPEN = ".xml"

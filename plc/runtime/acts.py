@@ -1,7 +1,7 @@
 """The record of what users do to a PLC (force, unforce, pause, go, step, restart): one JSON line each in the audit log.
 
-The file and the format are those of the gateway's audit log, appended line by line: the user, the action, the old and
-the new value. An action that cannot be recorded is not carried out. This module must not know what an action means.
+The file and the format are those of the gateway's audit log, appended line by line: the user, the action, the old and the new
+value. An action that cannot be recorded is not carried out. This module does not interpret actions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The configuration of a PLC process: one JSON document, created by the process that starts it.
 
-This module converts frozen dataclasses to JSON and back. It must not know a system file, a device or a bus.
+This module converts frozen dataclasses to JSON and back. It must not depend on a system file, a device or a bus.
 """
 
 from __future__ import annotations

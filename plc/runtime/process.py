@@ -16,13 +16,13 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
     restart   create the programs again: {"cold": true} without retained variables
     sources   the programs whose files changed since the PLC read them
     about     of each program: variables, states with transitions, and the text of its source; this changes at a restart only
-    stop      make the outputs safe, then end the process
+    stop      set the outputs to their safe values, then end the process
 
 The actions of users (force to restart) are recorded before they are carried out; each of these commands takes "by".
 
-SIGTERM and SIGINT act like stop. The process ends within a second, with its outputs region flagged stopped. When a task
-stopped by itself for good (a program that raised an error, an input that tripped, restarts used up), the process keeps
-running with its outputs safe, so that its status can be read.
+SIGTERM and SIGINT act like stop. The process ends within a second, with its outputs region flagged stopped. When a task stopped
+by itself for good (a program that raised an error, an input that tripped, restarts used up), the process keeps running with its
+outputs at their safe values, so that its status can be read.
 """
 
 from __future__ import annotations

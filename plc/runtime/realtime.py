@@ -47,7 +47,7 @@ LEAD_NS, LEAD_SHARE = 60_000, 20
 """How long before a deadline the process is woken, so that it is awake in time: an idle processor needs some 50 us to
 wake up. The process spins meanwhile, for at most a twentieth of the time that it slept."""
 STEP_NS = 200 * NS_PER_MS
-"""The longest time without checking whether to stop."""
+"""The longest time (ns) for which the process waits without checking whether it has to stop."""
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
@@ -83,7 +83,7 @@ def sleep_until_ns(deadline_ns: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class RealtimeReport:
-    """The requests that the host granted, and those that it refused, with the reason."""
+    """The real-time measures that the host granted, and those that it refused, with the reason."""
 
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
@@ -157,8 +157,8 @@ class StuckAlarm:
     """The guard against a scan that does not end: `stuck_ms` after it was armed, a signal repeatedly raises `ScanStuck` in the
     logic.
 
-    It works in the main thread, because signals arrive there. Logic that never returns to the interpreter (a C function
-    that never ends) cannot be ended this way: then the gateway misses the heartbeat and makes the outputs safe.
+    It works in the main thread, because signals arrive there. Logic that never returns to the interpreter (a C function that
+    never ends) cannot be ended this way: then the gateway misses the heartbeat and sets the outputs to their safe values.
     """
 
     def __init__(self, stuck_ms: float) -> None:
@@ -186,13 +186,14 @@ class StuckAlarm:
 class VirtualStuckAlarm(StuckAlarm):
     """The guard for scans under virtual time: it ends a scan that takes `stuck_ms` to two times `stuck_ms` of real time.
 
-    Its timer is set once and runs on between scans. Setting and clearing it for each scan took 4.3 us of a scan's 50 us.
+    Its timer is set once, is periodic, and also runs between scans. Setting and clearing it for each scan took 4.3 us of a
+    scan's 50 us.
     """
 
     def __init__(self, stuck_ms: float) -> None:
         super().__init__(stuck_ms)
         self._expired = False
-        """Whether the timer has expired since the scan began, which it may do at any time after the beginning."""
+        """Whether the timer has expired during the present scan. The second time that it expires ends the scan."""
         signal.setitimer(signal.ITIMER_REAL, self._s, self._s)
 
     def arm(self) -> None:
@@ -217,7 +218,7 @@ VIRTUAL_STUCK_MS = 10_000.0
 
 
 def alarm_if_free(stuck_ms: float) -> StuckAlarm | None:
-    """Return an alarm, or None if it cannot be used: outside the main thread, or if other code uses SIGALRM."""
+    """Return a `StuckAlarm`, or None if it cannot be used: outside the main thread, or if other code uses SIGALRM."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         return None
     return VirtualStuckAlarm(stuck_ms) if signal.getsignal(signal.SIGALRM) is signal.SIG_DFL else None
@@ -232,7 +233,8 @@ def lead(until_due_ns: int) -> int:
 
 
 def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
-    """Run `task` on the wall clock, and `loop` between its scans, until `stop_requested()`; outputs are safe afterwards.
+    """Run `task` on the wall clock, and `loop` between its scans, until `stop_requested()`. Afterwards the outputs have their
+    safe values.
 
     When a task stops by itself, the loop keeps running, so that its status can be read. To end a wait early, stop the
     loop.

@@ -36,8 +36,9 @@ MAX_CAPACITY = 16 * 1024 * 1024
 
 
 def layout_hash(programs: Sequence[BoundProgram]) -> bytes:
-    """Return the hash of all that must be unchanged for a value to keep its meaning: programs, variables, kinds,
-    form."""
+    """Return the hash of all properties that must be unchanged for a saved value to keep its meaning: programs, variables, and
+    the types and structure of their values.
+    """
     described = [
         [
             p.name,
@@ -236,7 +237,7 @@ class Retained:
             self._file = None
 
     def status(self) -> RetainStatus:
-        """Return the kind of start and the number of saves."""
+        """Return the kind of the last start and the number of saves."""
         return RetainStatus(start=self.start, saves=self._file.saves if self._file else 0)
 
     def values(self) -> dict[str, Any]:

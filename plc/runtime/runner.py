@@ -2,9 +2,9 @@
 
 Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one thread,
 so a task is never interrupted. Of the tasks that are due, the one with the smallest PRIORITY number runs first; among equals,
-the one that has waited longest. If one task stops by itself, all tasks stop, with the outputs safe. After a stop by the
-watchdog, or a scan that did not end, the programs are created again and start warm, at most `max_restarts` times in a row. A
-program runs only after its inputs have been good once (fieldtwin.plc.cycle.start), also after a restart.
+the one that has waited longest. If one task stops by itself, all tasks stop, and the outputs are set to their safe values.
+After a stop by the watchdog, or a scan that did not end, the programs are created again and start warm, at most `max_restarts`
+times in a row. A program runs only after its inputs have been good once (fieldtwin.plc.cycle.start), also after a restart.
 
 Like a `CyclicTask`, the runner provides `deadline_ns` and `run_once`. It cannot distinguish the wall clock from virtual time.
 """
@@ -57,8 +57,9 @@ class TaskEntry:
 
 
 class TaskRunner:
-    """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, and `Unreachable` if
-    retained variables cannot be kept."""
+    """All tasks of a PLC, which use one attached process image. Raises `FileInvalid` for a configuration that cannot run, and
+    `Unreachable` if retained variables cannot be kept.
+    """
 
     def __init__(
         self,
@@ -72,7 +73,7 @@ class TaskRunner:
     ) -> None:
         """Create the runner. `on_change` is called whenever a program changes an output or a local.
 
-        `modules`: whether `sources` has the modules in the folders of programs, which takes 10 ms.
+        `modules`: whether `sources` also lists the imported modules in the folders of the programs. Finding them takes 10 ms.
         """
         self.config = config
         self.forces = Forces()
@@ -81,10 +82,10 @@ class TaskRunner:
         self._last_stop = ""
         self.entries: list[TaskEntry] = []
         self._triggered: list[TaskEntry] = []
-        """The entries of SINGLE tasks."""
+        """The SINGLE tasks."""
         self.programs: list[BoundProgram] = []
         self.sources: list[ProgramSource] = []
-        """The files from which the programs were made."""
+        """The files from which the programs were created."""
         self.outputs: OutputImage
         self.retained: Retained
         self.starts: Starts
@@ -202,7 +203,7 @@ class TaskRunner:
         return min(entry.task.deadline_ns for entry in self.entries)
 
     def run_once(self) -> None:
-        """Carry out what is due first: one scan, or a restart."""
+        """Execute the scan or the restart that is due first."""
         if self._ended is not None or not self._began:
             raise Bug("a scan of a PLC that does not run")
         now_ns = self._now_ns()
@@ -287,7 +288,8 @@ class TaskRunner:
             self._ended, self._restart_ns = StopReason.FAILED, _NEVER_NS
 
     def restart(self, *, cold: bool = False) -> None:
-        """Create new instances of the programs, with retained variables unless `cold`, and start. Forces, and a pause, stay.
+        """Create new instances of the programs, with retained variables unless `cold`, and start. Forces and a pause remain in
+        effect.
 
         Raises `FileInvalid`, without any change, if the programs cannot be created (their files may have been edited).
         """
@@ -308,7 +310,9 @@ class TaskRunner:
         self._start_all()
 
     def stop(self) -> None:
-        """Stop all tasks on request, with the outputs safe. A PLC that has already stopped keeps its stop reason."""
+        """Stop all tasks on request, and set the outputs to their safe values. A PLC that has already stopped keeps its stop
+        reason.
+        """
         for entry in self.entries:
             entry.task.stop()
         if self._ended is None:
@@ -409,7 +413,7 @@ class TaskRunner:
         return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
     def waits(self, tag: str) -> str:
-        """Return the inputs and programs that the program that writes `tag` waits for; empty if it has started."""
+        """Return in words the inputs and programs for which the program that writes `tag` waits; "" if it has started."""
         owner = next((b.name for b in self.programs if tag in (t for _, t in b.published())), "")
         return next((start.reason() for start in self.starts.waiting if start.name == owner), "")
 
@@ -436,7 +440,7 @@ class TaskRunner:
         return self._stopped is not None or self._ended is not None
 
     def _as_read(self, value: TagValue) -> TagValue:
-        """Return an input as the PLC knows it now. While no task reads inputs, its quality is bad."""
+        """Return the value of an input, with bad quality while the PLC is halted, because no task reads inputs then."""
         if not self.halted:
             return value
         return TagValue(value.value, Quality.BAD, Reason.NOT_OPERATIONAL, value.t_ns)
@@ -466,7 +470,9 @@ class TaskRunner:
         return total
 
     def status(self) -> PlcStatus:
-        """Return the status: the figures of the first task for the whole PLC, and the figures of each task."""
+        """Return the status of the PLC, with the figures of each task. Those of the whole PLC come from the task that stopped
+        it, otherwise from the first task.
+        """
         now_ns = self._now_ns()
         shown = self._stopped or self.entries[0]
         described = shown.task.describe()

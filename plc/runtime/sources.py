@@ -1,8 +1,8 @@
 """The files of a PLC's programs, and which of them changed since the PLC read them.
 
 Structured Text is read again at each restart of the programs; a Python module only when the process starts. The modules that
-were imported from the folder of a program's file, or from a folder in it, count as files of the program. This module must
-not know what a program does.
+were imported from the folder of a program's file, or from a folder in it, count as files of the program. This module does not
+interpret programs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldtwin.plc.binding import BoundProgram
 
 @dataclass(frozen=True, slots=True)
 class ProgramSource:
-    """The file of one program as it was when the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
+    """The source file of one program, as the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
 
     program: str
     path: str

@@ -2,8 +2,8 @@
 
 Each tag has value, quality, source time, age, unit, limits, force, and the value that programs see.
 
-It is read between scans, from the image itself, so that it shows what the gateway gets. This module must not know how
-requests arrive, and must not change anything.
+The values are read between scans, from the image itself, so that they are those that the gateway reads. This module must not
+depend on how requests arrive, and must not change anything.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from fieldtwin.plc.cycle.forces import Force
 from fieldtwin.plc.runtime.runner import TaskRunner
 
 MAX_AT_ONCE = 64
-"""How many tags one answer may have: a request between two scans must not delay the next one. It takes some 1 ms,
-including the encoding."""
+"""The largest number of tags in one answer: a request between two scans must not delay the next one. Such an answer takes about
+1 ms, including the encoding.
+"""
 
 
 def matches(tag: str, pattern: str) -> bool:

@@ -1,9 +1,9 @@
 """A PROGRAM in Structured Text as a `Program` of the soft PLC.
 
-Variables that can be tags (BOOL, numbers, times, enumerations) are declared under the names of the source; locals that
-cannot be tags (strings, arrays, structures, blocks) stay inside. An input that never had a value keeps its initial
-value; IS_GOOD shows this. Times are tags in ns, enumerations are tags with their numbers, and ULINT and LWORD are tags
-with their two's complement.
+Variables that can be tags (BOOL, numbers, times, enumerations) are declared under the names of the source; locals that cannot
+be tags (strings, arrays, structures, blocks) are not published. An input that never had a value keeps its initial value;
+IS_GOOD of it is then false. Times are tags in ns, enumerations are tags with their numbers, and ULINT and LWORD are tags with
+their two's complement.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """References for VAR_IN_OUTs of elementary types at run time: each object refers to a variable of the caller.
 
-Reading and writing `v` reads and writes that variable immediately. So two VAR_IN_OUTs that refer to one variable always have the
-same value, and so does the variable itself (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are passed directly. Pure.
+Reading and writing `v` reads and writes that variable immediately. So two VAR_IN_OUTs that refer to one variable always have
+the same value, and so does the variable itself (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are passed directly.
 """
 
 from __future__ import annotations

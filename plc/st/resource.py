@@ -25,13 +25,13 @@ Together = dict[Any, Any]
 
 
 class Context:
-    """The interface to the running scan for compiled code."""
+    """The interface through which compiled code uses the running scan."""
 
     __slots__ = ("first_scan", "left", "lookup", "now_ns")
 
     def __init__(self) -> None:
         self.left = MAX_STEPS
-        """How many loop iterations and calls the scan may still make."""
+        """The number of loop iterations and calls that the scan may still make."""
         self.now_ns = 0
         self.first_scan = False
         self.lookup: Callable[[str], TagValue] | None = None
@@ -66,7 +66,7 @@ class Resource:
         exec(unit.code, self.space)
         self.globals: Any = self.space["_G"]
         self.absolute = ".scan_ns" in unit.python
-        """Whether a program uses SCAN_TIME, so that its behaviour depends on the time itself."""
+        """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""
 
     @classmethod
     def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:

@@ -1,9 +1,9 @@
 """The data types of Structured Text, their implicit conversions, and the representation of their values.
 
-Representation at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to 32
-bits, LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since
-1970-01-01; strings as str (a STRING's characters are 0 to 255, one byte each); arrays as lists; structures and function
-blocks as objects. Source: IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions). Pure.
+Representation at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to 32 bits,
+LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since 1970-01-01; strings
+as str (a STRING's characters are 0 to 255, one byte each); arrays as lists; structures and function blocks as objects. Source:
+IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions).
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ def plain(kind: Type) -> Type:
 
 
 def elements(kind: Type) -> int:
-    """Return the size of a variable of this type: 1 for a number, plus 1 for each 64 characters of a string."""
+    """Return the size of a variable of this type in elements: 1 for a number, plus 1 for each 64 characters of a string."""
     if isinstance(kind, Array):
         return prod(high - low + 1 for low, high in kind.ranges) * elements(kind.of)
     if isinstance(kind, String):
@@ -216,7 +216,7 @@ def is_kind(kind: Type, *names: str) -> bool:
 
 
 def fits(source: Type, target: Type) -> bool:
-    """Return whether a value of `source` may be assigned to `target` without a named conversion."""
+    """Return whether a value of `source` may be assigned to `target` without an explicit conversion function."""
     source, sink = plain(source), plain(target)
     if isinstance(source, AnyInt):
         if isinstance(target, Subrange):
@@ -254,7 +254,7 @@ def takes_bits(target: Type | None, source: AnyInt) -> TypeGuard[Elementary]:
 
 
 def common(a: Type, b: Type) -> Type | None:
-    """Return the common type of two operands, or None."""
+    """Return the type to which both operands convert implicitly, or None if there is none."""
     a, b = plain(a), plain(b)
     if isinstance(a, AnyInt) and isinstance(b, AnyInt):
         return AnyInt(0)

@@ -1,8 +1,8 @@
 """The functions that compiled Structured Text calls at run time: arithmetic of fixed widths, checks, strings, conversions.
 
-Integers wrap around like two's complement; division truncates towards zero; REAL rounds to 32 bits after each
-operation. An operation without a result (division by zero, an index outside its array, a root of a negative number)
-raises `LogicError`, which stops the task with its outputs safe. Pure.
+Integers wrap around like two's complement; division truncates towards zero; REAL rounds to 32 bits after each operation. An
+operation without a result (division by zero, an index outside its array, a root of a negative number) raises `LogicError`,
+which stops the task with its outputs at their safe values.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ def to_bcd(x: int, bits: int) -> int:
 
 
 def of_real(name: str, x: float) -> float:
-    """Return the result of one of math's functions. Raises `LogicError` if it has none."""
+    """Return the result of function `name` of `math` for `x`; infinity if it overflows. Raises `LogicError` if it has none."""
     try:
         return float(getattr(math, name)(x))
     except OverflowError:
@@ -262,7 +262,7 @@ def right(s: str, length: int) -> str:
 
 
 def find(s: str, what: str) -> int:
-    """Return the position of one string in another, from 1; 0 if it is not found, or if it is empty."""
+    """Return the position of `what` in `s`, from 1; 0 if it is not found, or if `what` is empty."""
     return s.find(what) + 1 if what else 0
 
 

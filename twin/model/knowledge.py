@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
 
 QUEUE = 200_000
-"""Four seconds of events at the highest write rate that the project promises."""
+"""The capacity of the queue in events: four seconds at the highest write rate that the project promises."""
 BATCH = 10_000
 EVERY_MS = 100
 RETRY_MS = 1000
@@ -31,11 +31,12 @@ MakeRoom = Callable[[], Awaitable[int]]
 
 
 class KnowledgeWriter:
-    """The writer of one origin's events, in batches. `observe` never waits and never fails; `run` writes until cancelled.
+    """The writer of the log of one origin (the plant, or a twin), in batches of events. `observe` never waits and never fails;
+    `run` writes until cancelled.
 
-    The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written, and with
-    ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When the store is
-    full, `make_room` may delete events that are no longer needed.
+    The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written, and
+    with ``""`` when the trouble is over. After each batch it calls `on_written` with the number of the last event written. When
+    the store is full, `make_room` may delete events that are no longer needed.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class KnowledgeWriter:
         self._on_written = on_written
         self._make_room = make_room
         self._lost = 0
-        """Events that were dropped and whose loss is not recorded yet."""
+        """The number of dropped events whose loss is not recorded yet."""
 
     @property
     def queued(self) -> int:
@@ -136,7 +137,7 @@ class KnowledgeWriter:
         return len(batch)
 
     def _give_back(self, batch: list[Event]) -> None:
-        """Put events back at the front of the queue. If too many arrived meanwhile, drop the oldest."""
+        """Put events that were not written back at the front of the queue. If it overflows, drop the oldest events."""
         room = max(0, self._capacity - len(self._queue))
         gone = max(0, len(batch) - room)
         self.dropped += gone
@@ -168,7 +169,7 @@ class Known:
     lost: int = 0
 
     def learn(self, events: list[Event]) -> None:
-        """Add a block of events, in order."""
+        """Update the knowledge with a block of events, in their order."""
         self.events += len(events)
         for event in events:
             if event.kind in _SAYS_WHAT_IS:

@@ -52,7 +52,7 @@ class DigitalShadow:
 
     @property
     def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
-        """Return the thread processes, whose shared events are the knowledge of this side."""
+        """Return the thread processes, whose shared events are the knowledge of the digital side of the thread."""
         return (self.monitor, self.analyze)
 
     def recall(self, events: Iterable[Event]) -> None:
@@ -65,7 +65,7 @@ class DigitalShadow:
             self.analyze.recall()
 
     def step(self) -> int:
-        """Analyze the arrived events one by one, each against the model as it was then. Return the number of events."""
+        """Process the arrived events one by one: update the model with each, then analyze it. Return the number of events."""
         count = 0
         now_ms = self._clock.utc_ns() // NS_PER_MS
         while self.receiving.queue:
@@ -83,7 +83,7 @@ class DigitalShadow:
         return count
 
     def describe(self) -> dict[str, Any]:
-        """Return the model and the figures of twinning."""
+        """Return the state and variables of the model, and the twinning figures (`Analyze.figures`), as data for JSON."""
         variables = self.digital_model.variables
         return {
             "state": self.digital_model.state.name,

@@ -1,6 +1,6 @@
 """A STATUS of the observatory: both the state and the period (paper.md, ruling 7), in three bytes.
 
-They are encoded separately, so that a state that does not follow from its period can be detected. Pure.
+They are encoded separately, so that a state that does not follow from its period can be detected.
 """
 
 from __future__ import annotations

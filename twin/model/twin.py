@@ -21,7 +21,7 @@ from fieldtwin.twin.model.variables import ModelVariable
 class DigitalTwin(DigitalShadow):
     """The paper's DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived.
 
-    While a prototype is asked about a command, the shadow continues; its findings wait to be planned for.
+    While a prototype is asked about a command, the shadow continues; its findings wait in the queue of Plan.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """The declared variables of a digital model: their declarations, and the last reported value of each with quality and
 time.
 
-The system file determines the set of variables when the model is created. Only events change their values. Pure:
-no connection, no clock, no store; the time of a value comes from its event.
+The system file determines the set of variables when the model is created. Only events change their values. This module uses no
+connection, clock or store; the time of a value comes from its event.
 """
 
 from __future__ import annotations

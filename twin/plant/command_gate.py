@@ -1,10 +1,11 @@
-"""The plant's own control over commands from its digital twin: its switch, limits and rate, from its own file.
+"""The plant's own control over commands from its digital twin: a switch (remote or local), limits and a rate, which the system
+file of the plant states.
 
 A plant does not rely on the twin that commands it. For every command the gate records as knowledge that it was taken,
 or why it was refused. A command is never taken twice: a thread passes on each number once
 (`fieldtwin.twin.thread.end`), and numbers only grow.
 
-Pure, except for the clock that it is given.
+This module performs no I/O; it reads the time from the clock that it is given.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class CommandGate(PTDigitalThreadProcess):
         self._check.restate(bounds)
 
     def admit(self, origin: str, event: Event) -> COMMAND | None:
-        """Take a command of the twin's log, or refuse it. Events that are not commands are ignored."""
+        """Return the command of an event of the twin's log; None if it is refused, or if the event is not a command."""
         if event.kind != Kind.COMMAND:
             return None
         if event.sequence <= self._last.get(origin, 0):

@@ -46,20 +46,21 @@ from fieldtwin.twin.site.system import System, load_system
 FLUSH_EVERY_NS = NS_PER_S // 2
 LOOK_EVERY_NS = NS_PER_S // 20
 FLUSH_ROWS = 8
-"""Number of waiting rows that triggers an immediate flush: the PLC keeps rows until they are stored, at most 16 of each
-program.
+"""Number of waiting log entries that triggers an immediate flush: the PLC keeps its entries until they are stored, at most 16
+of each program.
 """
 MOST_COMMAND_BYTES = 64
 WRITE_WITHIN_S = 5.0
 MOST_REPORTED_CHANGES = 20
 PUBLISHED_AT_ONCE = 20_000
-"""The largest number of entries that fits into one line of the control channel."""
+"""The largest number of journal entries (published values) that fits into one line of the control channel."""
 
 
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of the process.
 
-    `mapping` is None on a plant; `capture` is a file for the recorded bus traffic, or empty.
+    `mapping` gives for each endpoint of the plant the endpoint that is opened instead; None on a plant. `capture` is the file
+    in which bus traffic is recorded; empty for none.
     """
 
     system: str
@@ -206,7 +207,9 @@ class GatewayProcess:
         )
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Return at most `PUBLISHED_AT_ONCE` entries, the oldest first. A caller that needs more repeats the request."""
+        """Return the values published after number `since`, at most `PUBLISHED_AT_ONCE`, the oldest first. A caller repeats the
+        request for more.
+        """
         since = int(args.get("since", 0))
         tags = self._gateway.tags
         newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]

@@ -1,7 +1,7 @@
 """The only difference between a prototype and its plant: below the drivers, endpoints of emulators replace those of the plant.
 
-This module does not know emulators: it is a Connector that wraps a Connector, so that drivers and gateway are the same in
-prototype and plant.
+This module does not depend on emulators: it contains a Connector that wraps a Connector, so that drivers and gateway are the
+same in prototype and plant.
 """
 
 from __future__ import annotations

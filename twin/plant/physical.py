@@ -1,8 +1,8 @@
 """The physical twin: gateway and PLC of a system, and the memory that they share.
 
 This module creates, once, everything on which both processes must agree: the process image's layout from the system file, the
-file that holds the image, and the configuration of each process. This module does not know emulators (`fieldtwin run --plant`
-works without that folder).
+file that holds the image, and the configuration of each process. This module does not depend on emulators (`fieldtwin run
+--plant` works without that folder).
 """
 
 from __future__ import annotations
@@ -109,7 +109,9 @@ def _start_policy(form: StartForm) -> StartPolicy:
 
 
 def image_layout(system: System) -> ImageLayout:
-    """Return the process image of a system: the tags to which its programs are bound, and every other number for watchers."""
+    """Return the process image of a system: the tags to which its programs are bound, and every other numeric tag, for
+    processes that only read the image.
+    """
     errors = ErrorCollector()
     bound = bound_programs(system, errors)
     errors.raise_all()
@@ -269,7 +271,7 @@ def make_image(layout: ImageLayout, path: Path) -> None:
 
 @contextmanager
 def attached(layout: ImageLayout, path: Path) -> Iterator[Image]:
-    """Map the image file and attach to it."""
+    """Map the image file and yield the attached image, which is closed at the end of the block."""
     try:
         with path.open("r+b") as file:
             mapped = mmap.mmap(file.fileno(), 0)

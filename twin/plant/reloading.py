@@ -65,7 +65,9 @@ def compare(old: System, new: System) -> list[ConfigChange]:
 
 
 def limits_changed(old: System, new: System) -> dict[str, tuple[float, float] | None]:
-    """Return the tags whose limits changed. The PLC has a copy of the limits, to check forces."""
+    """Return the new limits of each tag whose limits changed, None if it has no limits any more. The PLC has a copy of the
+    limits, to check forces.
+    """
     before, after = plant_tags(old), plant_tags(new)
     return {name: spec.limits for name, spec in after.items() if name in before and spec.limits != before[name].limits}
 

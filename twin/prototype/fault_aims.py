@@ -1,6 +1,6 @@
 """Resolves a fault's aim in a system: names of buses, devices, registers and tags become units, addresses and objects.
 
-Pure: an invalid aim is found before anything runs. The physical twin does not use this module.
+This module performs no I/O, so that an invalid aim is found before a device runs. The physical twin does not use this module.
 """
 
 from __future__ import annotations

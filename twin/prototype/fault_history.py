@@ -27,7 +27,7 @@ class FaultHistory:
         self._put_in.append((self.count, active, on))
 
     def struck(self) -> list[StruckStatus]:
-        """Return how often each fault took effect."""
+        """Return how often each injected fault took effect, in the order of injection."""
         return [
             StruckStatus(
                 number=number,

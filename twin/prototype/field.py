@@ -1,7 +1,7 @@
 """The simulated field devices: the emulators of a prototype on real connections, in one process.
 
-Each emulated bus has one listener (a pty, a TCP socket, a software CAN bus or a kernel CAN interface) that serves every
-device of that bus. This module connects the emulators to the system file; it does not know what gateway and PLC do.
+Each emulated bus has one listener (a pty, a TCP socket, a software CAN bus or a kernel CAN interface) that serves every device
+of that bus. This module connects the emulators to the system file; it does not depend on gateway and PLC.
 """
 
 from __future__ import annotations
@@ -95,10 +95,10 @@ def _advised(remark: Remark) -> str:
 class FieldSimulator:
     """Builds every emulator of a prototype and runs them on their connections.
 
-    Virtual serial ports get their links in `run_dir`. After `open`, `listening` holds the endpoint at which each
-    emulated bus listens (with the free ports that were chosen), and `far` holds the endpoints of the modems at the remote end
-    of a link. `water`: the acoustic connections of transmitters that are in a network's acoustic channel, and that therefore
-    have no separate remote modem.
+    The symbolic links of virtual serial ports are created in `run_dir`. After `open`, `listening` holds the endpoint at which
+    each emulated bus listens (with the free ports that were chosen), and `far` holds the endpoints of the modems at the remote
+    end of a link. `water`: the acoustic connections of transmitters that are in a network's acoustic channel, and that
+    therefore have no separate remote modem.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class FieldSimulator:
         self.far: dict[str, Endpoint] = {}
         self.far_units: dict[str, ModbusUnit] = {}
         self.signals: dict[str, Signals] = {}
-        """The signals that devices play, by device name."""
+        """The signals that give devices their values, by device name."""
         self.faults = FieldFaults(system, prototype.seed, clock)
         self._run_dir = run_dir
         self._clock = clock
@@ -129,7 +129,9 @@ class FieldSimulator:
         self._replays: dict[tuple[Path, str, str, EndOfRecording], tuple[ExchangeReplay, int]] = {}
 
     async def open(self) -> None:
-        """Build and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays open."""
+        """Create the emulators and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays
+        open.
+        """
         try:
             self._simulations = Simulations(
                 self.prototype.file, self.prototype.form, self.system, self._clock.monotonic_ns()
@@ -300,7 +302,7 @@ class FieldSimulator:
         return CanLog(emulated.recording, emulated.form.speed, EndOfRecording.parse(emulated.form.at_end))
 
     def _signals(self, emulated: EmulatedDevice) -> Signals:
-        """Return the signals that the device plays: of its simulation, or of its recording, starting now."""
+        """Return the signals that give the device its values: those of its simulation, or of its recording, starting now."""
         self.signals[emulated.name] = signals = self._made_signals(emulated)
         return signals
 

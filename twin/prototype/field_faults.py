@@ -148,7 +148,7 @@ class FieldFaults:
             self._buses[bus].take_away(id)
 
     def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value` for `tag` from now on; None restores the device's own value."""
+        """Set the value of `tag` in the device to `value` from now on; None restores the device's own value."""
         found = tag_of(self._system, device, tag)
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:

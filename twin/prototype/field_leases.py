@@ -7,7 +7,7 @@ injected is removed when the lease ends: faults are cleared, and each device val
 first `set`. Only one test runner at a time can hold the lease, because the faults of one test runner would change the results
 of another.
 
-Pure: the time is passed in, in ns on the clock of the field process.
+This module reads no clock. Times are arguments, in ns on the clock of the process of the field devices.
 """
 
 from __future__ import annotations

@@ -77,7 +77,8 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def resolve(config: FieldConfig, system: System | None = None) -> DigitalTwinPrototype:
-    """Read system and prototype file, apply the command line's options, and return the checked prototype of both sides.
+    """Read system and prototype file, apply the command line's options, and return the prototype, with emulators and drivers
+    checked against each other.
 
     With `system` its file is not read again.
     """
@@ -129,7 +130,7 @@ class FieldProcess:
         self._life = secrets.token_hex(8)
 
     async def run(self, on_ready: Callable[[FieldSimulator], None] | None = None) -> int:
-        """Open, call `on_ready`, and serve until stopped."""
+        """Open the devices, call `on_ready`, and serve until stopped. Return the exit code."""
         run_dir = Path(self._config.run_dir)
         async with AsyncExitStack() as stack:
             water = {}
@@ -246,7 +247,9 @@ class FieldProcess:
         return msgspec.structs.replace(self._field.status(), life=self._life, lease=lease)
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Return at most `HELD_AT_ONCE` entries per device, the oldest first; a caller that needs more asks again."""
+        """Return the values that each device held, at most `HELD_AT_ONCE` per device, the oldest first. A caller repeats the
+        request for more.
+        """
         since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
         return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
 

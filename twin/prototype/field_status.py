@@ -56,7 +56,7 @@ class StruckStatus(msgspec.Struct, frozen=True, kw_only=True):
     id: str
     name: str
     on: str
-    """The device or bus."""
+    """The device or bus into which the fault was injected."""
     struck: int
     optional: bool
     """Whether a scenario may pass although the fault never took effect."""

@@ -27,7 +27,9 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True)
 class EmulatedBus:
-    """The endpoint at which the emulators of a bus listen; None: the plant's own bus is used."""
+    """A bus of the prototype. `listen` is the endpoint at which its emulators listen; None: the plant's own bus is used.
+    `pace`: a CAN bus takes as much time for a frame as its bit rate requires.
+    """
 
     name: str
     listen: Endpoint | None
@@ -55,7 +57,7 @@ class EmulatedDevice:
 
 @dataclass(frozen=True)
 class Prototype:
-    """A prototype file, resolved against its system."""
+    """A prototype file, in which each name of a bus, device or tag is resolved in the system."""
 
     path: Path
     seed: int
@@ -75,7 +77,7 @@ class Prototype:
         return replace(self, buses=buses)
 
     def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
-        """Return a copy in which `device` plays another recording."""
+        """Return a copy in which `device` replays the recording in `path`, `speed` times as fast if given."""
         old = self.devices[device]
         form = old.form.model_copy(
             update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})}
@@ -83,7 +85,7 @@ class Prototype:
         return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
 
     def with_speed(self, speed: float) -> Prototype:
-        """Return a copy in which every recording is played `speed` times as fast."""
+        """Return a copy in which every recording is replayed `speed` times as fast."""
         devices = {
             n: replace(d, form=d.form.model_copy(update={"speed": speed})) if d.recording else d
             for n, d in self.devices.items()

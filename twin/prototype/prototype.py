@@ -1,8 +1,8 @@
 """The digital twin prototype: the physical twin's own software and configuration, with every device emulated.
 
 This is the only module that combines the two sides of the connection: it checks that each emulator accepts its driver's
-commands, and makes the simulated field devices. The controlling side is `fieldtwin.twin.plant.physical`, which is
-unchanged and does not know about this module.
+commands, and makes the simulated field devices. The controlling side is `fieldtwin.twin.plant.physical`, which is unchanged and
+does not depend on this module.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class DigitalTwinPrototype:
     ) -> FieldSimulator:
         """Return the emulators on their connections, not opened yet.
 
-        The connections are the operating system's unless other `ports` are given. Virtual serial ports get their links
-        in `run_dir`. `water`: the acoustic connections of transmitters that are in a network.
+        The connections are the operating system's unless other `ports` are given. The symbolic links of virtual serial ports
+        are created in `run_dir`. `water`: the acoustic connections of transmitters that are in a network.
         """
         return FieldSimulator(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

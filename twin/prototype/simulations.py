@@ -1,5 +1,5 @@
-"""The simulations of a prototype: built from its file, played by its devices, and fed with the values written to these
-devices.
+"""The simulations of a prototype: they are built from its file, give its devices their values, and receive the values written
+to these devices.
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ class Simulations:
         return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
-        """Return the signals that `device` plays: those that its entry names, else every value of the simulation that has the
-        name of a tag.
+        """Return the signals that give `device` its values: those that its entry names, else every value of the simulation that
+        has the name of a tag.
         """
         assert form.simulation is not None
         simulation = self._made[form.simulation]

@@ -79,7 +79,7 @@ class VirtualPrototype(AsyncResource):
         self.gateway: Gateway
         self.plc: TaskRunner
         self.image: Image
-        """The process image, for observers."""
+        """The process image, for callers that observe it."""
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.started_ns = loop.now_ns
         self.outputs_confirmed_safe: bool | None = None

@@ -39,7 +39,7 @@ def template_of(file: Path | None) -> list[Path]:
 
 
 def search_path(extra: Iterable[Path] = ()) -> list[Path]:
-    """Return the folders that may hold `devices`, `systems` and `recordings`, best first."""
+    """Return the folders that may hold `devices`, `systems` and `recordings`, in the order in which they are searched."""
     folders = [Path(p) for p in extra]
     folders += [Path(p) for p in os.environ.get("FIELDTWIN_PROFILES", "").split(os.pathsep) if p]
     folders += [Path("profiles"), data_root() / "profiles"]

@@ -1,8 +1,9 @@
 """Warnings for the author of a system file about tags that the gateway reads only once, after it has connected.
 
-The value that the device holds in such a tag is unknown: the published value is the one read at the start, or there is
-none. It stays good while the device changes or is lost. If the device loses a written value, the gateway does not notice it
-and does not write it again; every start of the gateway writes it again. Pure: it inspects a loaded system file.
+The present value in the device is then unknown: the published value is the one read at the start, or there is none. The
+published value stays good even if the device changes the value or is lost. If the device loses a written value, the gateway
+does not notice it and does not write it again; every start of the gateway writes it again. This module only inspects a loaded
+system file.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ ONCE = ("identity", "setup")
 def read_only_once(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
     """Return a warning for each poll group of measured values that is read once, because the device's `poll` lacks it.
 
-    A tag of `writable` has its own warning (`never_read_back`), a transmitter's mailbox is read without an entry, and any
-    value of a CANopen node grows stale, so that it does not stay good.
+    A tag of `writable` has its own warning (`never_read_back`), a transmitter's mailbox is read without an entry, and every
+    value of a CANopen node becomes stale, so that it does not stay good.
     """
     found = []
     for name, device in devices.items():

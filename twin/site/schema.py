@@ -318,7 +318,9 @@ NONE_STATED = InvariantsForm()
 
 
 class SystemForm(SiteModel):
-    """A plant. The physical twin and its prototype read the same file, byte for byte."""
+    """The form of a system file, which describes a plant. The physical twin and its prototype read the same file, byte for
+    byte.
+    """
 
     fieldtwin: Literal[1]
     system: Name = Field(examples=["mysite"])
@@ -335,7 +337,7 @@ class SystemForm(SiteModel):
 
 
 class BusMappingForm(SiteModel):
-    """Where the emulators of a bus of the plant listen."""
+    """The endpoint at which the emulators of a bus of the plant listen."""
 
     listen: str
     pace: bool = True
@@ -344,7 +346,8 @@ class BusMappingForm(SiteModel):
 class FarLinkForm(SiteModel):
     """The acoustic link between the two modems.
 
-    The modems recover from losses by `loss`; nothing recovers from `lost`, `repeated` and `overtakes`.
+    The modems send messages again that are lost by `loss`. They do not correct the faults `lost`, `repeated` and `overtakes`,
+    which are probabilities per message.
     """
 
     bytes_per_s: float = Field(default=80.0, gt=0)
@@ -365,7 +368,7 @@ class BusyForm(SiteModel):
 
 
 def _as_text(formula: object) -> object:
-    """Accept a constant as a formula."""
+    """Convert a numeric constant to the text of a formula; return any other value unchanged."""
     return repr(formula) if isinstance(formula, int | float) and not isinstance(formula, bool) else formula
 
 
@@ -373,7 +376,7 @@ Formula = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | 
 
 
 class SimulationForm(SiteModel):
-    """Values that are computed step by step: by formulas, or by a Python class."""
+    """A simulation: values that formulas or a Python class compute step by step."""
 
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
     formulas: dict[Name, Formula] = Field(default={}, description="name -> formula of t, dt, inputs and each other")

@@ -1,8 +1,7 @@
 """Warnings for the author of a system file about programs whose start waits for a value that they must command first.
 
-A sampling sensor (`sampled:` in its profile) has no measured value before it is given a period. A program that sets the
-period, and waits before its first scan for a value of that sensor, never starts. Pure: it inspects a loaded system
-file.
+A sampling sensor (`sampled:` in its profile) has no measured value before it is given a period. A program that sets the period,
+and waits before its first scan for a value of that sensor, never starts. This module only inspects a loaded system file.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from fieldtwin.twin.site.schema import PlcForm
 def waits_for_its_command(file: YamlFile, plc: PlcForm, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
     """Return one warning for each program that waits for a measured value of a sensor whose period it commands.
 
-    An input that a number replaces (`if_bad: 0`) does not hold a program back after the timeout, so it causes no warning.
+    An input that a number replaces (`if_bad: 0`) does not delay a program after the timeout, so it causes no warning.
     """
     found = []
     for name, program in plc.programs.items():

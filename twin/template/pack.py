@@ -1,4 +1,5 @@
-"""Packs a template: all files that a system names, found where a run would find them, under paths that work anywhere.
+"""Packs a template: all files that a system names, found where a run would find them, under paths that are independent of this
+computer.
 
 A package has ``systems/``, ``devices/``, ``recordings/``, ``documents/`` and ``software/``. A file that the system file
 names by a relative path keeps its position relative to it. A file that it names by a bare name is packed into the folder in
@@ -168,7 +169,7 @@ def _program(got: Collected, system: Path, source: str) -> None:
 def _python(got: Collected, folder: Path, module: str) -> bool:
     """Add a module from the system file's folder, and the modules of that folder that it imports.
 
-    Return False if it is not there. Nothing is run.
+    Return False if `folder` does not contain it. No code is run.
     """
     top = module.partition(".")[0]
     package, single = folder / top, folder / f"{top}.py"
@@ -213,8 +214,8 @@ class TemplateExtras:
 def pack(system: System, collected: Collected, extras: TemplateExtras, version: str, target: Path) -> Manifest:
     """Write the template: a zip if `target` ends in ``.zip``, else a folder. `version` is that of the control software.
 
-    Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, and `Unreachable` if the disk
-    refuses.
+    Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, and `Unreachable` if the template
+    cannot be written.
     """
     local_hash = modules_hash()
     wheel = _add_wheel(collected, extras.wheel, version, local_hash) if extras.wheel else ""

@@ -65,13 +65,13 @@ class Package(ABC):
     path: Path
     manifest: Manifest
     caches: tuple[str, ...] = ()
-    """Cache files that Python writes where it imports from. They are not part of the template. In a template from an untrusted
-    source they count as code, because Python would run them.
+    """Cache files that Python writes into the folders from which it imports. They are not part of the template. In a template
+    from an untrusted source they count as code, because Python would run them.
     """
 
     @abstractmethod
     def open(self, name: str) -> IO[bytes]:
-        """Return the contents of a file of the package."""
+        """Open a file of the package for reading, as bytes."""
 
     @property
     def code(self) -> tuple[str, ...]:
@@ -172,8 +172,8 @@ class FolderPackage(Package):
 class EditedFolder(Package):
     """A template as a folder that its owner works in: files may have been edited, added or removed since it was packed.
 
-    For comparing only. Everything that runs or unpacks a template takes a `FolderPackage`, which accepts no such
-    change.
+    This class is for comparing templates only. Everything that runs or unpacks a template takes a `FolderPackage`, which
+    accepts no such change.
     """
 
     def __init__(self, path: Path) -> None:
@@ -351,7 +351,7 @@ def _compare(found: list[str], manifest: Manifest, where: str) -> None:
 def unpack(package: Package, target: Path) -> None:
     """Write the package as the folder `target`, which must be missing or empty: all files, checked, or nothing.
 
-    Raises `FileInvalid` for a wrong file, `UsageError` for a target in use, `Unreachable` if the disk refuses.
+    Raises `FileInvalid` for a wrong file, `UsageError` for a target in use, `Unreachable` if the folder cannot be written.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UsageError("the folder is not empty", got=str(target), hint="choose another with -o")

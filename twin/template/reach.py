@@ -14,7 +14,7 @@ from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.site.system import System
 
 OUR_BUS = "fieldtwin"
-"""The software CAN bus; every other interface may be a real one."""
+"""The name of the software CAN bus. Every other CAN interface may be a real one."""
 
 
 def reach(system: System, prototype: Prototype) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
 def _is_loopback(host: str) -> bool:
     """Return whether `host` is a loopback address.
 
-    No name except localhost counts as one, because names are resolved elsewhere.
+    No name except localhost counts as one, because the operating system may resolve any other name to another address.
     """
     bare = host.strip("[]")
     return bare in ("localhost", "::1") or (

@@ -1,6 +1,6 @@
-"""A thread's broker as a URL: ``mqtt://[USER@]HOST[:1883]/GROUP/NODE[?host=NAME]``, or ``mqtts://`` with TLS (port
-8883). With TLS, ``ca=FILE`` names the trusted authorities (default: the system's), and ``cert=FILE&key=FILE`` this
-side's certificate.
+"""A thread's broker as a URL: ``mqtt://[USER@]HOST[:1883]/GROUP/NODE[?host=NAME]``, where NAME is that of the host application,
+or ``mqtts://`` with TLS (port 8883). With TLS, ``ca=FILE`` names the trusted authorities (default: the system's), and
+``cert=FILE&key=FILE`` this side's certificate.
 
 The password is in FIELDTWIN_MQTT_PASSWORD, or in the file that FIELDTWIN_MQTT_PASSWORD_FILE names, never in a URL.
 """

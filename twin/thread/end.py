@@ -22,8 +22,9 @@ from fieldtwin.twin.thread.status import ReceivedLog, ThreadStatus
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S
-"""A link that lasts this long counts as good. If two followers use the same place, each displaces the other after about this
-time."""
+"""A link that lasts this long counts as good. If two digital twins connect to the same address of a thread, each displaces the
+other after about this time.
+"""
 READ_BLOCK = 1000
 STORE_PAUSE_NS = NS_PER_S
 
@@ -181,7 +182,7 @@ class ThreadEnd:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
 
     async def _wait(self, now_ns: int) -> None:
-        """Wait until a frame arrives, or until a frame has to be sent."""
+        """Wait until a frame arrives or has to be sent."""
         times = [self.into.wake_ns(now_ns), self.out.wake_ns(now_ns) if self.out is not None else None]
         due = min((t for t in times if t is not None), default=None)
         timeout_s = None if due is None else max(0.001, (due - now_ns) / NS_PER_S)

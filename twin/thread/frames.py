@@ -1,4 +1,4 @@
-"""The frames that the two ends of a thread exchange, and their encoding, small enough for an acoustic modem.
+"""The frames that the two ends of a thread exchange, and their encoding, which is compact enough for an acoustic modem.
 
 A stream is the log of one origin, as it is sent to the other twin. Frames identify it by a tag of two bytes, which a HELLO
 defines. An event takes 8 to 10 bytes: names are numbers in a schema that both ends derive from the system file, times
@@ -12,7 +12,7 @@ are differences, and a value takes only the bytes that it needs. Values are not 
     ASK      tag that the receiver does not know: requests a HELLO
     REFUSED  tag, id of a schema that the receiver does not have
 
-Pure: no time, no network.
+This module uses no clock and no network.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _F32, _F64 = struct.Struct(">f"), struct.Struct(">d")
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The names that both ends of a system's thread know, in one order. `id` identifies the list."""
+    """The names that both ends of a system's thread know, in the same order. `id` identifies the list."""
 
     names: tuple[str, ...]
     system: str = ""
@@ -246,7 +246,7 @@ def _decode_event(reader: Reader, sequence: int, before_ms: int, schema: Schema)
 class FrameCodec:
     """Converts frames to datagrams of at most `mtu` bytes, and back.
 
-    Each link needs its own, because it remembers tags and pieces.
+    Each link needs its own codec, because a codec remembers tags and pieces.
     """
 
     def __init__(self, schemas: Iterable[Schema], mtu: int) -> None:

@@ -26,7 +26,7 @@ class Link(ABC):
     trouble = ""
     """The reason why no frames are exchanged now although the link is not lost; empty if there is no problem."""
     quiet = "nothing came"
-    """Explanation for the user if nothing is ever received over this link."""
+    """The explanation that the user gets if nothing is ever received over this link."""
     ack_delay_ns = 0
     """The time (ns) by which an ACK may be delayed. On a link with seconds of latency, one ACK serves for many frames."""
 

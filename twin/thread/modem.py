@@ -96,7 +96,7 @@ class ModemLink(DatagramLink):
 
 
 class ModemCarrier(Carrier):
-    """The transmitter `device` on its bus, at either end of the modems' link."""
+    """The carrier that uses the mailboxes of the transmitter `device` on its bus, at either end of the modems' link."""
 
     def __init__(
         self, device: DeviceConfig, bus: BusConfig, connector: Connector, clock: Clock, schemas: Sequence[Schema]

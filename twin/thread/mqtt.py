@@ -57,7 +57,9 @@ class _LastMessage(logging.Handler):
 
 
 def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
-    """Return why there is no session: `Unreachable` if a later attempt may succeed, `Unwelcome` if the broker refuses."""
+    """Return the error for a session that could not be opened: `Unreachable` if a later attempt may succeed, `Unwelcome` if the
+    broker refuses.
+    """
     cause = e.__context__  # aiomqtt keeps the exception that paho raised
     if isinstance(cause, ssl.SSLCertVerificationError):
         hint = "ca= is the trusted authority; the certificate must name the host in the URL"
@@ -115,7 +117,7 @@ class MqttLink(Link):
         self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
 
     async def begin(self) -> None:
-        """Subscribe, and announce this side."""
+        """Subscribe to the topics of this side, and publish its first messages. Raises `Unwelcome` or `ConnectionLost`."""
         try:
             for topic in self.side.subscriptions:
                 granted = await self._client.subscribe(topic, qos=1)

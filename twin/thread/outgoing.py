@@ -19,14 +19,14 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.twin.thread.frames import Ack, Data, Frame, Hello, Lost, tag_of
 
 WINDOW = 2000
-"""The largest number of events in memory, which are in flight or wait to be sent. Further events wait in the store."""
+"""The largest number of events in memory: those in flight and those that wait to be sent. Further events wait in the store."""
 RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
 
 URGENT = frozenset((Kind.COMMAND, Kind.STATE))
 """Kinds of events that are sent at once, without waiting to fill a frame."""
 
 Fit = Callable[[bytes, Sequence[Event]], int]
-"""Returns how many of these events fit into one frame of the carrier (`FrameCodec.fit`)."""
+"""A function that returns how many of these events fit into one frame of the carrier (`FrameCodec.fit`)."""
 
 
 @dataclass(slots=True)
@@ -93,20 +93,22 @@ class OutgoingLog:
         self._loaded = 0
         self._to_send: deque[int] = deque()
         self._gathers_ns: int | None = None
-        """Time since which events wait for more to fill the frame."""
+        """Time (ns) since which events wait for further events that fill the frame; None if none waits."""
         self._known = False
         self._hello_ns: int | None = 0
-        """Time of the next HELLO; None while the other side knows this stream and nothing is due."""
+        """Time (ns) of the next HELLO; None while the other side knows this stream and no HELLO is due."""
         self._hello_sent_ns = -1
         self._doubt_ns: int | None = None
-        """Time at which to verify with HELLO that the other side has what it confirmed; None while there is no doubt."""
+        """Time (ns) at which to verify with HELLO that the other side has the events that it confirmed; None while there is no
+        doubt.
+        """
         self._asked_ns: int | None = None
-        """Time (ns) at which this side first asked for that with a HELLO."""
+        """Time (ns) at which this side first sent a HELLO for this verification."""
         self._rto = _Rto()
         self._lost: deque[tuple[int, int]] = deque()
         """Ranges of lost events that are yet to be reported."""
         self._told: dict[tuple[int, int], int] = {}
-        """Ranges reported as lost, with the time of the report, until they are confirmed."""
+        """Ranges reported as lost that are not confirmed yet, with the time (ns) of the report."""
 
     # -- the log ----------------------------------------------------------------------------------------------------------
 
@@ -198,7 +200,7 @@ class OutgoingLog:
     def _is_less(self, through: int, now_ns: int) -> bool:
         """Handle an ACK that confirms fewer events than an earlier one: it is late, or the other side is a different one.
 
-        A HELLO asks the other side, whose answer then counts, because the earlier confirmations may be those of a different side.
+        Schedule a HELLO; the ACK that answers it is used, because a different side may have sent the earlier confirmations.
         Return whether to use this ACK.
         """
         asked_ns = self._asked_ns

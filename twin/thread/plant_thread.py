@@ -1,9 +1,9 @@
 """The plant's side of a digital thread as a process: ``python -m fieldtwin.twin.thread.plant_thread CONFIG.json``.
 
-It reads the process image, like any watcher, and shares changes: values, states with their periods, received commands
-and sent responses. It writes them into its own store and sends from there. Commands from the digital twin pass through
-the plant's own gate (`fieldtwin.twin.plant.command_gate`) to the gateway, as if the transmitter had received them. Only
-the gateway writes the image. Commands of the control channel: ready, get, stop.
+It reads the process image, which it never writes, and shares changes: values, states with their periods, received commands and
+sent responses. It writes them into its own store and sends from there. Commands from the digital twin pass through the plant's
+own gate (`fieldtwin.twin.plant.command_gate`) to the gateway, as if the transmitter had received them. Only the gateway writes
+the image. Commands of the control channel: ready, get, stop.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ from fieldtwin.twin.thread.thread import PTtoDTConnection, schema_of
 
 LOOK_MS = 50
 REFRESH_MS = 10_000
-"""A value that does not change is shared again at this interval, so that a twin can distinguish it from silence."""
+"""A value that does not change is shared again at this interval, so that a twin can distinguish it from a value that is no
+longer reported.
+"""
 NAMES = list(STATES)
 
 
@@ -60,8 +62,8 @@ class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """The configuration of the process.
 
     `resolved` is the system as the run has read it (`fieldtwin.twin.site.resolved`). `place` is the address of the thread
-    (`fieldtwin.twin.thread.place`), `store` a file or a database. `mapping` is
-    None on a plant. `every_ms` is the shortest interval between two shared values of a tag.
+    (`fieldtwin.twin.thread.place`), `store` a file or a database. `mapping` gives for each endpoint of the plant the endpoint
+    that is opened instead; None on a plant. `every_ms` is the shortest interval between two shared values of a tag.
     """
 
     resolved: str

@@ -10,7 +10,7 @@
 A third-party host therefore sees tags with values, times and quality; three more metrics turn them into a log. Commands
 of a host that does not use threads have no number and are ignored, except for a rebirth.
 
-Pure: converts frames to messages and back, without a broker.
+This module converts frames to messages and back; it does not connect to a broker.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ class _Side:
 class EdgeNode(_Side):
     """The physical twin's side.
 
-    Each link, which began at `began_ms` (UTC), needs a new one; `bd_seq` counts its births and deaths and increases by
-    one each time.
+    Each link needs a new object. `began_ms` is the time (UTC) at which the link began; `bd_seq` numbers the birth and death
+    messages of the link and is one higher for each link.
     """
 
     def __init__(
@@ -243,8 +243,8 @@ class EdgeNode(_Side):
 class HostApplication(_Side):
     """The digital twin's side: host `host` of one edge node.
 
-    Each link, which began at `began_ms` (UTC), needs a new one. Both birth and death of a session carry that time
-    (Sparkplug 3.0.0, 6.4.27).
+    Each link needs a new object. `began_ms` is the time (UTC) at which the link began; the birth and the death message of a
+    session both carry it (Sparkplug 3.0.0, 6.4.27).
     """
 
     def __init__(self, group: str, node: str, host: str, began_ms: int = 0) -> None:

@@ -1,7 +1,7 @@
 """Payloads and topics of Sparkplug B (Eclipse Sparkplug 3.0.0, chapters 4 and 6), which third-party hosts understand.
 
-The protocol buffers of a payload are encoded and decoded here without generated code, as far as a thread uses them.
-Unknown fields are skipped. Pure: no MQTT, no time.
+The protocol buffers of a payload are encoded and decoded here without generated code, as far as a thread uses them. Unknown
+fields are skipped. This module uses no MQTT client and no clock.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ NAMESPACE = "spBv1.0"
 MAX_PAYLOAD = 1 << 20
 MAX_METRICS = 10_000
 GOOD_QUALITY, BAD_QUALITY = 192, 0
-"""Property `Quality` (6.4.18)."""
+"""Values of the property `Quality` (6.4.18)."""
 
 
 class MetricType(IntEnum):

@@ -14,7 +14,7 @@ class ReceivedLog(msgspec.Struct, frozen=True, kw_only=True):
     through: int
     """Number of the last event up to which every event is stored, or recorded as lost."""
     lost: int
-    """Events that the sender's store no longer had, since this process began."""
+    """Number of events that the sender's store no longer had, since this process began."""
 
 
 class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -28,9 +28,9 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Number of links that were opened so far."""
     origin: str
     sent_through: int | None
-    """The last event that the other end has acknowledged; None before the first link."""
+    """Number up to which the other end has acknowledged every event; None before the first link."""
     waiting: int
-    """Events that the other end has not acknowledged."""
+    """Number of events that the other end has not acknowledged."""
     resent: int
     duplicates: int
     received: dict[str, ReceivedLog]
@@ -42,14 +42,14 @@ class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlantThreadStatus(ThreadStatus, frozen=True, kw_only=True):
-    """The process at the plant's end: the answer to `get`."""
+    """The status of the process at the plant's end: its answer to `get`."""
 
     place: str
-    """The URL at which it listens."""
+    """The URL of the thread, with the port on which the process listens, if it listens."""
     written: int
     dropped: int
-    """Number of events that could not be written into its log."""
+    """Number of events that could not be written into the log of the plant."""
     store_trouble: str
-    """The reason why its log cannot be stored; empty if it is stored."""
+    """The reason why the log of the plant cannot be stored; empty if it can."""
     commands_taken: int
     commands_refused: int

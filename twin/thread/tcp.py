@@ -1,9 +1,9 @@
 """A thread over TCP: one side listens, the other connects. Each datagram is preceded by its length in two bytes.
 
-A thread has one follower. A connecting side sends an identifier that it chose, so that the listening side recognises it after
-a lost link and admits it again immediately. A different follower is admitted if the first one no longer answers; otherwise the
-listening side answers that the place is taken. These control messages begin with F0h, which no frame of a thread does, and
-stay between the two links.
+A listening side serves one connecting side, its follower. A connecting side sends an identifier that it chose, so that the
+listening side recognises it after a lost link and admits it again immediately. A different follower is admitted if the first
+one no longer answers; otherwise the listening side answers that it already has a follower. These control messages begin with
+F0h, which no frame of a thread does, and are not passed on by a link.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class StreamLink(DatagramLink):
         self.who = b""
         """The identifier that the other side has sent, if any."""
         self.read = False
-        """Whether a thread has begun to read from this link."""
+        """Whether the thread has begun to read from this link."""
         self.over = asyncio.Event()
 
     async def send_datagram(self, data: bytes) -> None:
@@ -95,7 +95,9 @@ class StreamLink(DatagramLink):
                     self._held = data
 
     async def answers(self) -> bool:
-        """Return whether the other side still answers."""
+        """Send a PING and return whether anything arrives within `ANSWERS_WITHIN_S`. Before a thread reads, return whether the
+        link is open.
+        """
         if not self.read or self._connection.lost is not None:
             return self._connection.lost is None
         self._heard.clear()
@@ -160,7 +162,7 @@ class TcpListening(Carrier):
         self._schemas = schemas
         self._next: StreamLink | None = None
         self._there: StreamLink | None = None
-        """The follower, whether or not its link is read yet. `_where` is its address."""
+        """The link of the connected follower, whether or not a thread reads from it yet. `_where` is its address."""
         self._where = ""
         self._deciding = asyncio.Lock()
         self.refused = 0

@@ -1,8 +1,8 @@
 """The digital thread: one connection in each direction between two twins, and the processes whose knowledge it carries.
 
-A process shares events; a connection collects them from its processes into the log that its end sends. The classes here
-have the names of the paper's schemas. The protocol is in `fieldtwin.twin.thread.end`; the paper's database is the store
-in which that module keeps both logs.
+A process shares events; a connection collects these events into the log that its end sends to the other twin. The classes here
+have the names of the paper's schemas. The protocol is in `fieldtwin.twin.thread.end`; the paper's database is the store in
+which that module keeps both logs.
 """
 
 from __future__ import annotations
@@ -86,13 +86,13 @@ class ThreadConnection(Generic[P]):
 
 
 class PTtoDTConnection(ThreadConnection[PTDigitalThreadProcess]):
-    """The paper's PTtoDTConnection: measurements and statuses, to the digital twin."""
+    """The paper's PTtoDTConnection, which carries measurements and statuses to the digital twin."""
 
     collects = PTDigitalThreadProcess
 
 
 class DTtoPTConnection(ThreadConnection[DTDigitalThreadProcess]):
-    """The paper's DTtoPTConnection: commands, to the physical twin."""
+    """The paper's DTtoPTConnection, which carries commands to the physical twin."""
 
     collects = DTDigitalThreadProcess
 

@@ -1,7 +1,7 @@
 """Assigns the arguments of a call to parameters (IEC 61131-3, 6.6.1.4), for standard functions, functions and blocks.
 
-Positional arguments come first and take the parameters in their order. Named arguments follow in any order. Each
-parameter is given at most once. Pure.
+Positional arguments come first and take the parameters in their order. Named arguments follow in any order. Each parameter is
+given at most once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from fieldtwin.plc.st.compiler.scope import Environment
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_REPEATED = 1000
-"""The most inputs of an extensible function such as ADD or MUX."""
+"""The largest number of inputs of an extensible function such as ADD or MUX."""
 
 
 @dataclass(frozen=True, slots=True)

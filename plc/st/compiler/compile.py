@@ -47,8 +47,9 @@ class CompiledProgram:
 
 @dataclass(frozen=True, slots=True)
 class CompiledUnit:
-    """A compiled unit. `code` defines everything when it is executed with ``_v``, ``_c`` and ``_blocks``; `python` is
-    its text, for reading."""
+    """A compiled unit. `code` defines the classes and functions of the unit when it is executed with the names ``_v``, ``_c``
+    and ``_blocks``; `python` is the text of `code`, for inspection.
+    """
 
     path: str
     code: CodeType
@@ -74,7 +75,7 @@ class _Unit:
         self.out = CodeWriter()
         self.unit = unit
         self._outputs: dict[str, frozenset[str]] = {}
-        """By class of a PROGRAM: its outputs, as attributes."""
+        """By class of a PROGRAM: the attributes that hold its outputs."""
         self._check_names()
         self.declarations = Declarations(self.env, unit, self.out)
         self._declare_global_constants()
@@ -181,7 +182,9 @@ class _Unit:
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
     def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
-        """Return all variables of a POU. `prefix`: where they are kept; VAR_TEMP is always local to a call."""
+        """Return all variables of a POU. `prefix` comes before their names in Python, such as ``self.``; a VAR_TEMP has none,
+        because it is local to a call.
+        """
         symbols: dict[str, Symbol] = {}
         for block in pou.blocks:
             if pou.kind != "PROGRAM":

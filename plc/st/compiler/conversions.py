@@ -14,7 +14,7 @@ from fieldtwin.plc.st.compiler.scope import Compiling, Value
 from fieldtwin.plc.st.syntax import tree as t
 
 Write = Callable[[Compiling, t.Call, list[t.Expr]], Value]
-"""Writes a call. Its arguments are given in the order of the function's parameters."""
+"""A function that writes the Python code of a call. The list holds the arguments in the order of the parameters."""
 _NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
 _DIGITS = {32: 7, 64: 15}
 

@@ -53,8 +53,9 @@ class Expressions:
     # -- assignment compatibility ---------------------------------------------------------------------------------------
 
     def coerced(self, value: Value, target: ty.Type, pos: t.Pos, what: str = "") -> str:
-        """Return the Python expression of `value` as a `target`. Raises `FileInvalid` if a named conversion is
-        needed."""
+        """Return the Python expression of `value` as a `target`. Raises `FileInvalid` if this needs an explicit conversion
+        function such as REAL_TO_INT.
+        """
         source = ty.plain(value.type)
         if not ty.fits(value.type, target):
             hint = f"{source}_TO_{ty.plain(target)}" if _convertible(source) and _convertible(ty.plain(target)) else ""
@@ -93,8 +94,8 @@ class Expressions:
         return int(value.constant)
 
     def settled(self, value: Value, pos: t.Pos) -> Value:
-        """Return `value` with its computed constant, for places where only constants are allowed, such as ``N - 1`` of a constant
-        N.
+        """Return `value`, replaced by its result if it is computed from constants only, such as ``N - 1`` of a constant N. It
+        is used where only constants are allowed.
         """
         of_a_scan = "_c." in value.code or bool(self.out.lines)
         if value.constant is not None or of_a_scan or not isinstance(ty.plain(value.type), ty.Elementary):
@@ -165,7 +166,7 @@ class Expressions:
         return Value(name, value.type, value.constant)
 
     def known(self, expr: t.Expr, result: float) -> Value:
-        """Return the value for an untyped constant that the compiler computed."""
+        """Return `result`, which the compiler computed for the untyped constant `expr`, as a `Value`."""
         if isinstance(result, int) and not -(2**63) <= result < 2**64:
             self.env.fail(expr.pos, "a whole number that no type holds")
         if isinstance(result, float) and not isfinite(result):
@@ -248,7 +249,7 @@ class Expressions:
         return Value(f"{result}[0]" if more else result, signature.returns)
 
     def take(self, argument: t.Argument, value: Value) -> None:
-        """Compile ``name => target``."""
+        """Compile the output argument ``name => target``: write the assignment of `value` to the target."""
         assert argument.target is not None
         if argument.inverted:
             value = Value(f"(not {value.code})", value.type)

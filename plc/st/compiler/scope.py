@@ -34,7 +34,7 @@ class Symbol:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A compiled expression. `place` says that it is a variable or a part of one. `constant` is its value if it is known.
+    """A compiled expression. `place` is true if it is a variable or a part of one. `constant` is its value if it is known.
 
     `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
     """

@@ -73,7 +73,7 @@ def _number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
 
 
 def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
-    """Return all arguments converted to their common type, and that type."""
+    """Return the Python code of all arguments, converted to their common type, and that type."""
     wanted = ty.plain(x.wanted) if x.wanted is not None else None
     found = [x.value(e, wanted or x.declared(*exprs)) for e in exprs]
     kind = found[0].type

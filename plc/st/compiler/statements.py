@@ -114,9 +114,10 @@ class Statements(Expressions):
         more: bool,
         pos: t.Pos,
     ) -> None:
-        """Write a chain of if and elif, and `otherwise` as the else branch if there is `more`.
+        """Write a chain of if and elif, and let `otherwise` write the else branch, if there is one (`more`).
 
-        A condition that needs lines before it begins a new chain inside the else branch of the previous chain."""
+        A condition that needs lines before it begins a new chain inside the else branch of the previous chain.
+        """
         with ExitStack() as inside:
             word = "if"
             for condition, body in branches:

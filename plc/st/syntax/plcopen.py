@@ -52,7 +52,7 @@ def is_plcopen(text: str) -> bool:
 
 
 def to_st(text: str, path: str = "") -> str:
-    """Return the ST of an export. Raises `FileInvalid`."""
+    """Return the Structured Text of a PLCopen XML export. Raises `FileInvalid`."""
     return _Converter(_parsed(text, path), path, text.count("\n") + 1).text()
 
 

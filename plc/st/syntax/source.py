@@ -23,7 +23,7 @@ _NOT_A_LINE = re.compile(r"[^\n]")
 
 
 def shortened(text: str) -> str:
-    """Return `text` as an error shows it."""
+    """Return `text` as an error message shows it: if it is long, only its beginning and its length."""
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}... ({len(text)} characters)"
 
 

@@ -112,7 +112,7 @@ TypeDecl = StructDecl | EnumDecl | AliasDecl
 
 @dataclass(frozen=True, slots=True)
 class VarBlock:
-    """A block of variables. `kind` in capitals (VAR, VAR_INPUT, ..., VAR_GLOBAL), and also `qualifiers`."""
+    """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` are in capitals."""
 
     pos: Pos
     kind: str
@@ -146,7 +146,7 @@ class SourceUnit:
 
 @dataclass(frozen=True, slots=True)
 class Literal:
-    """A literal. `kind` is the token's (INTEGER, REAL, BASED, TYPED, DURATION...), `text` as written."""
+    """A literal. `kind` is the kind of its token (INTEGER, REAL, BASED, TYPED, DURATION...), `text` its text as written."""
 
     pos: Pos
     kind: str

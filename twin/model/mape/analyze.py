@@ -23,7 +23,7 @@ from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 LAGS = 10_000
-"""Number of the latest events from which the figures of the lag are computed."""
+"""The number of events, the latest ones, from which the figures of the lag are computed."""
 LATE_MS = 10_000
 """An event that is older than this when it arrives counts as backfilled history, and so does an event from before this twin
 was started. Both are counted, and left out of the lag and the rate.
@@ -49,7 +49,7 @@ class Analyze(DTDigitalThreadProcess):
         self._lags: deque[int] = deque(maxlen=LAGS)
         self._heard: dict[str, int] = {}
         self._wrong: dict[str, set[str]] = {}
-        """The findings that currently hold for each tag."""
+        """By tag: the findings that hold at present."""
         self._history: set[tuple[str, str]] = set()
         """Changes of `_wrong` (additions and removals) that are known from history only."""
         self._began_ms = clock.utc_ns() // 1_000_000

@@ -1,4 +1,4 @@
-"""The log of a shadow's or twin's findings, and of what was planned and executed because of each. Pure."""
+"""The log of a shadow's or twin's findings, and of the commands that were planned and sent or refused because of each."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DecisionLog:
         """The last state of each program on which plant and model agreed."""
 
     def newest(self, most: int) -> list[Decision]:
-        """Return the newest decisions, oldest first."""
+        """Return the newest decisions, at most `most`, the oldest first."""
         return [decision for decision, _ in self._kept][-most:]
 
     def observed(self, finding: AnalysisFinding, reason: str = "") -> None:

@@ -1,7 +1,7 @@
 """Execute: the last stage. It checks each command against the digital model, and sends only what the model accepts.
 
-If configured, it also asks a prototype. That takes time but blocks nothing: later commands stay in the queue meanwhile. No user
-is involved. A refusal becomes an event with its reason (paper.md, ruling 9).
+If configured, it also asks a prototype. The answer takes time, during which later commands wait in the queue and the twin
+continues to run. No user is involved. A refusal becomes an event with its reason (paper.md, ruling 9).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class CommandCheck:
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
     def restate(self, bounds: CommandLimits) -> None:
-        """Replace the limits. Commands that were taken before still count towards the rate."""
+        """Replace the limits. Commands that were accepted before still count towards the rate."""
         if bounds != self.bounds:
             self.bounds = bounds
             self._taken = deque(self._taken, maxlen=bounds.per_minute)

@@ -1,4 +1,4 @@
-"""Messages between the stages of a twin: statuses and measurements as they arrived, and verdicts on them. Pure."""
+"""Messages between the stages of a twin: statuses and measurements as they arrived, and verdicts on them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _REASONS = frozenset(int(reason) for reason in Reason)
 
 @dataclass(frozen=True, slots=True)
 class SeenStatus(STATUS):
-    """A STATUS of the state machine `whose`, sent by the plant at `t_ms` and received at `arrived_ms` (both UTC)."""
+    """A STATUS of the program `whose`, sent by the plant at `t_ms` and received at `arrived_ms` (both UTC)."""
 
     whose: str = ""
     t_ms: int = 0

@@ -1,5 +1,4 @@
-"""Monitor: the first stage. It takes what the plant reports, keeps the digital model up to date, and passes everything
-on.
+"""Monitor: the first stage. It takes what the plant reports, keeps the digital model up to date, and passes every report on.
 
 This module must never depend on a connection, or on code that can send a command.
 """

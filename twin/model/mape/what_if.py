@@ -1,6 +1,6 @@
-"""The question that a twin asks a prototype before it sends a command, and the interface for asking it. Pure.
+"""The question that a twin asks a prototype before it sends a command, and the interface for asking it.
 
-How a prototype is forked and run ahead is implemented elsewhere; a twin is given an object that implements `WhatIf`.
+This module does not simulate the prototype; a twin is given an object that implements `WhatIf`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.values import COMMAND
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """The requirements on a prototype that gets the command and runs `horizon_s` seconds ahead.
+    """The requirements on a prototype that receives the command and is then simulated for `horizon_s` seconds.
 
     Each expression of `require` must hold at all times from `settle_s` on, and each of `finally_` at the end. Expressions are
     written as in scenarios.
@@ -42,7 +42,7 @@ class WhatIf(Protocol):
     """
 
     def ask(self, command: COMMAND, question: Question) -> None:
-        """Start to ask a question."""
+        """Start to simulate `command` in a prototype, to answer `question`."""
         ...
 
     def answer(self) -> str | None:

@@ -1,8 +1,8 @@
 """The interface between a node (bytes by index) and a device model (numbers).
 
 A `DeviceModel` is a function of time: from the time, the recorded values and the values that clients wrote, it determines the
-values of the device's objects and the time of its next call. It must never know frames, SDO or PDOs; the node must never know
-drives.
+values of the device's objects and the time of its next call. The model must not depend on frames, SDO or PDOs, and the node must
+not depend on the kind of device.
 
 A recording holds the values that the device gave **with its factory settings**. A model converts them to the values that the
 device gives with its present settings. Objects that the model does not mention are passed through.
@@ -86,7 +86,7 @@ class ModelOutput(msgspec.Struct, frozen=True):
 
 
 class DeviceModel(ABC):
-    """A model of the device behind the objects. Pure: all inputs are in the `Situation`."""
+    """A model of the device behind the objects. All its inputs are in the `Situation`; it reads no clock and does no I/O."""
 
     @abstractmethod
     def power_on(self, situation: Situation) -> None:
@@ -108,8 +108,8 @@ class DeviceModel(ABC):
 
 
 Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
-"""A function for faults: it is called with all values that the device would hold, and now_ns, and returns the values that the
-device holds instead.
+"""A function for faults: it is called with all values that the device would hold without the faults, and now_ns, and returns the
+values that the device holds instead.
 """
 
 

@@ -1,6 +1,6 @@
 """The object dictionary as an SDO client sees it. Generic rules apply first, then those of the object's service.
 
-It must never know SDO frames.
+This module must not depend on SDO frames.
 """
 
 from __future__ import annotations

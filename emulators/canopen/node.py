@@ -1,7 +1,7 @@
 """The emulated CANopen node: NMT slave, dispatch of frames, and the object dictionary as an SDO client sees it.
 
-A pure object: it takes frames and `now_ns`, and returns frames and the time of the next call. It must never know asyncio,
-sockets, or how a driver interprets its frames. `serve.serve_node` runs it on a connection.
+`CanopenNode` does no I/O: it takes frames and `now_ns`, and returns frames and the time of the next call. It must not depend on
+asyncio, sockets, or how a driver interprets its frames. `serve.serve_node` runs it on a connection.
 
 =================  ===========================================================  =====================================
 state              answers                                                      left by
@@ -80,8 +80,9 @@ class NodeContext:
 
     `source` gives values by time and, if it is an `AnswersReads`, for each upload. `model` computes the device's behaviour
     from them and from the values that clients write; `distort` changes the model's output, for faults. `held` is called
-    with every value that the objects then have, `given` with the objects that the node has sent. `factory` replaces defaults (a
-    serial number). `refusals` are objects that SDO clients get an abort for, regardless of the data sheet.
+    with each value that an object gets from the source, a client or the device, and `given` with the objects whose values the
+    node has sent. `factory` replaces defaults (a serial number). `refusals` are objects for which SDO clients get an abort,
+    regardless of the data sheet.
 
     `tolerate_short_sdo` accepts SDO requests of fewer than 8 bytes, which old PLCs send, as if they were padded with zeros; by
     default they are ignored. `sdo_block` is the number of segments that a client may send in one sub-block, 1 to 127. A TIME
@@ -106,7 +107,7 @@ class NodeContext:
 
 
 class CanopenNode:
-    """One node. Call `start`, then `feed` for each frame and `tick` when `wake_at_ns` has come; send what they return.
+    """One node. Call `start`, then `feed` for each frame and `tick` when `wake_at_ns` has come; send the frames that they return.
 
     A node with ID 255 is unconfigured and waits silently until LSS assigns a node ID. Raises `UsageError` for any other
     ID outside 1 to 127, for 255 without LSS, and from any call when `source` gives values that do not fit.
@@ -210,7 +211,7 @@ class CanopenNode:
     # -- events ---------------------------------------------------------------------------------------------------
 
     def start(self, now_ns: int) -> list[CanFrame]:
-        """Power the node on, also repeatedly: power-on values, boot-up message, PRE-OPERATIONAL."""
+        """Power the node on, or off and on again: set power-on values, send the boot-up message, enter PRE-OPERATIONAL."""
         self._powered = True
         if self._lss:
             self._lss.power_on()
@@ -280,7 +281,7 @@ class CanopenNode:
         return self.tick(now_ns)
 
     def set_value(self, index: int, subindex: int, raw: bytes, now_ns: int) -> list[CanFrame]:
-        """Change a value (bytes as sent) from the device's side. A change is an event for the TPDOs that map the value."""
+        """Set an object to the device's own new value (bytes as sent). A change is an event for the TPDOs that map the object."""
         if self._core.data.put(index, subindex, raw):
             self._core.note(now_ns, "set", index, subindex, raw)
             self._tpdos.changed([(index, subindex)], now_ns)

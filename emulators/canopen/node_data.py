@@ -1,7 +1,7 @@
 """The live values of one emulated node: bytes by (index, subindex), with the values that reset restores and 1010h stores.
 
-This module has only generic rules (existence, access, length, limits). The services know the *meaning* of objects. This module
-must never know the bus or the time.
+This module has only generic rules (existence, access, length, limits). The services implement the *meaning* of objects. This
+module must not depend on the bus or the time.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class NodeData:
         return number
 
     def put(self, index: int, subindex: int, raw: bytes) -> bool:
-        """Set a value from the device's side, also of a read-only entry. Return whether it changed.
+        """Set a value for the device itself, not for a client, so that read-only entries are allowed. Return whether it changed.
 
         Raises `UsageError` if the entry does not exist or the length is not that of its type.
         """

@@ -1,6 +1,6 @@
-"""Run an emulated node on a CAN connection: the asynchronous shell around `CanopenNode`.
+"""Run an emulated node on a CAN connection: the asynchronous code around `CanopenNode`.
 
-It must never know the protocol: it only moves frames and waits.
+This module must not depend on the protocol: it only moves frames and waits.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SendsAtOnce(Protocol):
 async def serve_node(
     connection: CanConnection, node: CanopenNode, clock: Clock, pokes: asyncio.Queue[Poke] | None = None
 ) -> None:
-    """Power the node on and serve it until cancelled. Callables in the queue `pokes` run between events (`node.set_value`...).
+    """Power the node on and serve it until cancelled. Functions from the queue `pokes` are called between other events.
 
     Raises `ConnectionLost` if the bus is lost, and the errors of the node. The caller owns the connection, which stays
     open. Late synchronous TPDOs are withdrawn if the connection supports it (`WithdrawsFrames`).
@@ -60,7 +60,7 @@ async def serve_node(
 
 
 class _Shell:
-    """Processes the events of a node one after the other: the output of one event is sent before the next event is processed.
+    """The event processing of a node: the output of one event is sent before the next event is processed.
 
     If the connection can send immediately and no other event is in progress, the event is processed in the callback
     itself, otherwise by a task that holds the lock.
@@ -73,7 +73,7 @@ class _Shell:
         self._clock = clock
         self._turn = asyncio.Lock()
         self._left: list[CanFrame] = []
-        """Frames of an event for which there was no room; the next holder of the lock sends them first."""
+        """Frames of an event for which the transmit queue had no room; the task that takes the lock next sends them first."""
         self._overdue: Collection[int] = ()
         self._failed: Exception | None = None
         self._woken = asyncio.Event()

@@ -1,7 +1,7 @@
 """Common parts of the node's communication objects: the core that they share and the hooks that they implement.
 
-A service implements the behaviour of some indices (heartbeat of 1016h and 1017h, the TPDOs of 1800h...). A service knows the
-core, but neither the SDO server nor another service, unless it is passed to its constructor.
+A service implements the behaviour of some indices (heartbeat of 1016h and 1017h, the TPDOs of 1800h...). A service uses the core,
+but neither the SDO server nor a different service, unless its constructor receives that service.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Core:
         return out
 
     def refresh(self, now_ns: int) -> None:
-        """Put the values that the source has at `now_ns` into the objects. Raises `UsageError` if they do not fit the
+        """Set the objects to the values that the source has at `now_ns`. Raises `UsageError` if they do not fit the
         dictionary.
         """
         if self._source is not None:
@@ -173,7 +173,10 @@ class Core:
                 self.held(values, now_ns)
 
     def answer(self, key: tuple[int, int], now_ns: int) -> None:
-        """Prepare a client's upload: take the source's present values and its value for this upload. Raises as `refresh`."""
+        """Prepare a client's upload: set the source's present values, then its value for this upload.
+
+        Raises the errors of `refresh`.
+        """
         self.refresh(now_ns)
         raw = None if self.answers is None else self.answers.answer(key, now_ns)
         if raw is not None:

@@ -12,7 +12,7 @@ from fieldtwin.emulators.canopen.service import Core, NodeService
 STORE, RESTORE = 0x1010, 0x1011
 _SIGNATURES = {STORE: b"save", RESTORE: b"load"}
 _ON_COMMAND = 1
-"""The value of a read: the device stores on command, not autonomously."""
+"""The value that a client reads: the device stores parameters on command, not autonomously."""
 
 
 class Storage(NodeService):

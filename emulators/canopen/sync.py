@@ -1,6 +1,6 @@
 """SYNC: consumer, producer, counter and window (CiA 301 v4.2, 7.2.5; 1005h, 1006h, 1007h, 1019h).
 
-A node with a cycle period (1006h) that hears no SYNC for one and a half periods reports 8100h until SYNC returns; the standard
+A node with a cycle period (1006h) that receives no SYNC for one and a half periods reports 8100h until SYNC returns; the standard
 defines no specific code for that. The window (1007h) limits synchronous PDOs: an RPDO that arrives after its end is refused, and
 a TPDO that is not on the bus by its end is dropped.
 """
@@ -22,7 +22,7 @@ _SOURCE = "sync"
 
 
 class Sync(NodeService):
-    """The SYNC service. It calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, also its own.
+    """The SYNC service. It calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, also for one that it produces.
 
     `counter` is None without 1019h.
     """
@@ -99,7 +99,7 @@ class Sync(NodeService):
         return True
 
     def in_window(self, now_ns: int) -> bool:
-        """Return whether a synchronous PDO is inside the window of this cycle. The first late PDO of a cycle is reported."""
+        """Return whether `now_ns` is inside the window of this cycle. The first PDO that is late in a cycle is reported."""
         end_ns = self.window_end_ns
         if end_ns is None or now_ns <= end_ns:
             return True

@@ -1,1 +1,1 @@
-"""The simulated side's ends of serial lines, sockets and CAN buses, of the operating system or in memory."""
+"""The ends of serial lines, sockets and CAN buses that the simulated field devices use: real ones or ones in memory."""

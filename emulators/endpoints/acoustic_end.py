@@ -1,8 +1,9 @@
 """The acoustic channel between processes: one process serves it on a Unix socket, and modems in other processes connect.
 
-A frame is a kind, a length in two bytes (big endian) and that number of bytes. The kinds are: `M` the modem's name, sent first;
-`S` send this packet; `A` the packet was accepted, and there is room for another; `H` this packet was received. Without the server
-a modem accepts and receives nothing, and keeps running.
+A frame consists of a kind (one byte), a length in two bytes (big endian) and that number of bytes. A modem sends `M` (its name)
+first, and `S` to transmit a packet. The server sends `A` when it has accepted the name or a packet, so that there is room for
+one more packet, and `H` with each packet that the modem has received. Without the server a modem accepts and receives no packets,
+and keeps running.
 """
 
 from __future__ import annotations

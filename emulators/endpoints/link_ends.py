@@ -1,7 +1,7 @@
 """The ends between which an emulated connection forwards bytes: an outgoing or incoming TCP connection, and a serial device.
 
 They share no code with the gateway's ends, so that a mistake in one cannot be hidden by the same mistake in
-the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. These ends know no protocol.
+the other. Virtual serial ports are in fieldtwin.emulators.endpoints.pty. These ends do not interpret the bytes.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class TcpEnd(ByteConnection):
     """
 
     def __init__(self, endpoint: Endpoint, door: TcpAcceptor | None = None) -> None:
-        """Create an unconnected end. Use `dial`, or take an end from a `TcpAcceptor`, instead."""
+        """Create an unconnected end, for the listener `door` if given. Use `dial` or `TcpAcceptor.next_peer` instead."""
         super().__init__(TCPConnection(), endpoint, MAX_PENDING)
         self.wire = _Wire(self, door)
 
     @classmethod
     async def dial(cls, endpoint: Endpoint, timeout_s: float) -> TcpEnd:
-        """Connect; raises `Unreachable` with the reason."""
+        """Connect to `endpoint` and return the end. Raises `Unreachable` with the reason."""
         end = cls(endpoint)
         try:
             async with asyncio.timeout(timeout_s):
@@ -240,7 +240,7 @@ class TtyEnd(ByteConnection):
 
     @classmethod
     def open(cls, endpoint: Endpoint) -> TtyEnd:
-        """Open and configure; raises `Unreachable`, `EndpointBusy`, or `UsageError` for unsupported settings."""
+        """Open and configure the device. Raises `Unreachable`, `EndpointBusy`, or `UsageError` for unsupported settings."""
         where = str(endpoint)
         if not TTYS:
             raise Unreachable("this system has no serial devices as files", where=where, hint="a tcp end works")

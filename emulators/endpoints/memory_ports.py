@@ -1,6 +1,7 @@
-"""Ports in memory on one virtual loop: simulated field devices listen on them, and a gateway connects to them.
+"""Ports in memory on one event loop with virtual time: simulated field devices listen on them, and a gateway connects to them.
 
-Endpoints have the same form as those of real ports, and port 0 becomes consecutive numbers, but nothing is opened.
+Endpoints have the same form as those of real ports, and port 0 is replaced by consecutive numbers, but no port of the operating
+system is opened.
 """
 
 from __future__ import annotations
@@ -158,8 +159,9 @@ class _SerialPort:
         self.field: MemoryEnd = self._wire.far
 
     def plug_in(self) -> MemoryEnd:
-        """Return a new gateway's end. Raises an error while the previous one is open, because only one program can hold a
-        port.
+        """Return a new end for the gateway.
+
+        Raises `EndpointBusy` while the previous end is open, because only one program can hold a port.
         """
         if self._wire.near.lost is None:
             raise EndpointBusy("another program holds the port", where=str(self._plant))

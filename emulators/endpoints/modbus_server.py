@@ -1,6 +1,6 @@
-"""The asynchronous part of the Modbus server: it moves bytes between a connection and a pure server, and waits.
+"""The asynchronous part of the Modbus server: it moves bytes between a connection and a server without I/O, and waits.
 
-It knows no frame format. It decides when to read, when to write and when to call `on_frame`.
+It does not depend on the frame format. It decides when to read, when to write and when to call `on_frame`.
 """
 
 from __future__ import annotations
@@ -109,10 +109,10 @@ async def serve_udp(
     on_frame: OnFrame | None = None,
     clients: ClientCounts | None = None,
 ) -> None:
-    """Serve Modbus TCP ADUs in datagrams until cancelled or closed. All clients share one `server`, one after the other.
+    """Serve Modbus TCP ADUs in datagrams until cancelled or closed.
 
-    Each reply is sent in its own datagram to the sender of the request. A datagram that arrives twice is executed
-    twice.
+    All clients share one `server`, which handles one request at a time. Each reply is sent in its own datagram to the sender
+    of the request. A datagram that arrives twice is executed twice.
     """
     try:
         while True:

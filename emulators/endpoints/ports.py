@@ -1,7 +1,7 @@
-"""The provider of serial ports, listeners and buses, at which the emulators of a field simulator can be reached.
+"""Providers of the serial ports, listeners and buses at which the emulators of a field simulator can be reached.
 
-`OsPorts` provides those of the operating system; `fieldtwin.emulators.endpoints.memory_ports` provides ones in memory. A device
-cannot tell the difference.
+`OsPorts` provides those of the operating system; `fieldtwin.emulators.endpoints.memory_ports` provides ones in memory. An
+emulated device cannot detect the difference.
 """
 
 from __future__ import annotations
@@ -72,7 +72,10 @@ class OsPorts:
     """The operating system's ports: virtual serial ports, sockets, the software CAN bus over TCP, kernel CAN interfaces."""
 
     async def serial(self, link: Path, plant: Endpoint, pace: SerialSettings | None) -> tuple[ByteConnection, Endpoint]:
-        """Return a pty with its link in the file system, and the endpoint that names it."""
+        """Return a pty that can be opened by the path `link`, and the endpoint for that path.
+
+        `plant` is the endpoint of the port in the system file.
+        """
         end = await PtyEnd.open(link, plant, pace)
         return end, Endpoint("pty", path=str(end.link))
 
@@ -83,7 +86,7 @@ class OsPorts:
         return await UdpEnd.open(endpoint)
 
     async def can_bus(self, endpoint: Endpoint, bitrate: int, *, paced: bool) -> CanPort:
-        """Return a bus: a software bus is served here, a kernel interface is joined."""
+        """Return a bus. This process serves a software bus, but only joins a kernel interface."""
         if endpoint.interface == "fieldtwin":
             return ServedBus(await SoftBusServer.open(endpoint, bitrate, paced=paced))
         return JoinedBus(endpoint, bitrate)

@@ -1,8 +1,8 @@
 """A virtual serial port: the emulated device holds the pty's master end, the gateway opens a link to its slave end.
 
-It knows no protocol. It adds properties of a real port that a pty lacks: the port stays when no program has it open (a spare
-descriptor of the slave end stays open, because reading would fail with EIO otherwise), bytes pass unchanged (raw mode), and with
-`pace` a request and its reply take the time that the line would need. A pty has no parity.
+It does not interpret the bytes. It adds properties of a real port that a pty lacks: the port stays when no program has it open (a
+spare descriptor of the slave end stays open, because reading would fail with EIO otherwise), bytes pass unchanged (raw mode), and
+with `pace` a request and its reply take the time that the line would need. A pty has no parity.
 """
 
 from __future__ import annotations
@@ -98,14 +98,14 @@ class PtyEnd(ByteConnection):
         return end
 
     async def write(self, data: bytes) -> None:
-        """Send `data`, one writer after the other. With pacing, return when the line would have transferred the data."""
+        """Send `data` after the data of earlier writers. With pacing, return when the line would have transferred the data."""
         async with self._writing:
             await self._send(data, self._line_is_ours_ns())
 
     async def answer(self, data: bytes, after_s: float) -> None:
         """Send `data`, `after_s` seconds after the last character received.
 
-        With pacing, at least t3.5 of silence passes first, and the time is that of the line: a late wake-up of this
+        With pacing, at least t3.5 of silence passes first, and all times are computed for the line: a late wake-up of this
         process does not delay the line.
         """
         async with self._writing:
@@ -258,7 +258,7 @@ def _raise_idle_flags(descriptor: int) -> None:
 
 
 def _replace_link(link: Path, device: str, endpoint: Endpoint) -> int:
-    """Create the link and return the descriptor of its marker.
+    """Create the link and return the descriptor of its marker file. While the descriptor is open, the port counts as live.
 
     A program that opens the link meanwhile gets either the old port or the new one. The link of a program that was killed is
     removed first, because the new marker would make it look like a live one.

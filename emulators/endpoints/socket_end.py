@@ -1,6 +1,6 @@
 """The listening side of TCP and TLS: each client becomes a `ByteConnection`, served by a coroutine of its own.
 
-It knows no protocol. The numbers of clients, of chunks per client and of outgoing bytes are limited.
+It does not interpret the bytes. The numbers of clients, of chunks per client and of outgoing bytes are limited.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
         self.role = ""
         """The role in the client's certificate (MODBUS/TCP Security, 8.4); empty without TLS, certificate or role."""
         self.last_used_s = 0.0
-        """Loop time of the last byte in either direction."""
+        """The time of the event loop (s) at which the last byte was transferred in either direction."""
         self._listener = listener
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
@@ -53,7 +53,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
         self._answer: Answer | None = None
 
     async def answer_at_once(self, answer: Answer) -> None:
-        """Answer every chunk within the callback that delivers it, so that a request wakes no task, until the connection is lost.
+        """Answer every chunk within the callback that delivers it, until the connection is lost, so that a request wakes no task.
 
         `answer` returns the bytes to send, possibly none, and whether to close the connection after them. While the
         client does not read its answers, nothing more is read from it. Always ends by raising `ConnectionLost`.
@@ -284,8 +284,8 @@ class SocketListener:
 
 
 def _keep_alive(sock: socket.socket) -> None:
-    """Make the system detect within 25 s, instead of two hours, that a client vanished without closing its connection (row
-    MB-064).
+    """Make the system detect within 25 s, instead of two hours, that a client vanished without closing its connection (test
+    case MB-064).
     """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

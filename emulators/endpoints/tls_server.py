@@ -1,7 +1,7 @@
 """The parts of a TLS listener except its sockets: its certificates, and the role in a client's certificate.
 
 MODBUS/TCP Security Protocol Specification (MBTLS): TLS 1.2 or later, certificates on both sides, a role in an extension
-of the client's. It reads files; it opens no socket and knows no function codes.
+of the client's certificate. This module reads files, but opens no socket and does not interpret function codes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The listening side of UDP: it receives datagrams with their senders, and sends datagrams back.
 
-It knows no protocol. There are no clients, only senders; datagrams that cannot be queued are dropped and counted, as in
-a network.
+It does not interpret the datagrams. There are no clients, only senders; datagrams that cannot be queued are dropped and counted,
+as in a network.
 """
 
 from __future__ import annotations

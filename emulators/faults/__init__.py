@@ -1,4 +1,4 @@
-"""Faults that can be injected into a link or a device: one file per fault, one name.
+"""Faults that can be injected into a link or a device: each fault has its own file and a name.
 
 `registry.FAULTS` lists all of them.
 """

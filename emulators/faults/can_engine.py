@@ -1,4 +1,4 @@
-"""The effect of the active faults on a CAN frame to or from a node. Pure: the caller passes the time."""
+"""The effect of the active faults on a CAN frame to or from a node. The caller passes the time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def replaced_frames(
 ) -> list[CanPiece] | None:
     """Return the frames that replace `frame`, or None if no fault changes it.
 
-    Several faults are applied one after the other.
+    Several faults are applied in the order in which they were injected.
     """
     pieces: list[CanPiece] | None = None
     for active in faults.in_at(now_ns):

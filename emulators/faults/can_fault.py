@@ -1,6 +1,6 @@
 """Faults of a node on a CAN bus: their effect on the node's frames, and the frames that a fault itself sends.
 
-Pure, like all faults: the input is a frame and a random generator, the output is frames with delays.
+Like all faults, these do no I/O: the input is a frame and a random generator, the output is frames with delays.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Check whether a fault can change anything at its target.
 
-A fault that cannot is refused when its file is loaded, because it would test nothing.
+A fault that cannot change anything is refused when its file is loaded, because it would test nothing.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _aims(fault: CanFault, frames: Iterable[CanFrame], nodes: Iterable[int]) -> 
 
 
 def _payloads(cob_id: int) -> list[CanFrame]:
-    """Return frames of every form that a fault may ask for: a heartbeat, and each SDO command."""
+    """Return one frame of each kind that a fault may change: a heartbeat, and each SDO command."""
     return [CanFrame(cob_id, b"\5"), *(CanFrame(cob_id, bytes((command << 5,)) + bytes(7)) for command in range(8))]
 
 

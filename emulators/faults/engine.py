@@ -1,6 +1,6 @@
 """The active faults of a bus, and their effect on each frame.
 
-Pure: the caller passes the time and carries out the result.
+This module does no I/O and reads no clock: the caller passes the time and carries out the result.
 """
 
 from __future__ import annotations

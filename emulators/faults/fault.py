@@ -1,8 +1,8 @@
 """The classes of faults. A fault has a name, an aim (the frames or values that it changes), parameters, and an effect on each
 of these frames.
 
-Pure: a fault receives a frame and its own random generator, and returns the effect; the engine carries it out. A fault
-never opens connections, waits or reads a clock.
+A fault receives a frame and its own random generator, and returns the effect, which the connection carries out. A fault never
+opens connections, waits or reads a clock.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ConnectionEffect(Enum):
     RESET = "reset"
     """The connection is reset at once (RST)."""
     HALF_OPEN = "half_open"
-    """Nothing passes any more, and neither side is notified."""
+    """No bytes pass any more, and neither side is notified."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class DelayedBytes:
     gather: bool = False
     back: bool = False
     gone: Callable[[], bool] | None = None
-    """A function that is called when the time of the piece has come, and returns whether the piece was forwarded already."""
+    """A function that is called when the delay has ended, and returns whether the bytes were forwarded already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class FaultEffect:
 
 
 def passed(*data: bytes) -> FaultEffect:
-    """Return an outcome that forwards these bytes without delay."""
+    """Return an effect that forwards these bytes without delay."""
     return FaultEffect(tuple(DelayedBytes(d) for d in data))
 
 
@@ -65,7 +65,7 @@ LOST = FaultEffect()
 
 
 class Aim(BaseModel):
-    """The frames or values that a fault changes. A key that is not given matches everything."""
+    """The frames or values that a fault changes. A key that is not given matches all frames or values."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -99,7 +99,7 @@ class Parameters(BaseModel):
 
 
 HEX = r"^([0-9A-Fa-f]{2} ?)*$"
-"""A parameter that gives bytes in hexadecimal."""
+"""The pattern of a parameter that gives bytes in hexadecimal."""
 
 
 class Nothing(Parameters):
@@ -197,7 +197,7 @@ class Active:
     def applies_to(self, frame: FaultFrame, now_ns: int) -> bool:
         """Return whether the fault is to change this frame, and count frames that match its aim.
 
-        If the fault then changes the frame, the caller increases `struck`. A fault without an effect has tested nothing.
+        If the fault then changes the frame, the caller increases `struck`. A fault that never took effect has tested nothing.
         """
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):

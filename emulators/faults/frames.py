@@ -1,9 +1,9 @@
 """Divide the bytes of a medium into whole frames, so that a fault can aim at single frames.
 
-It supports RTU, ASCII and MBAP frames, datagrams of a digital thread and MQTT packets; other bytes are passed on in the
+The parser supports RTU, ASCII and MBAP frames, datagrams of a digital thread and MQTT packets; other bytes are passed on in the
 chunks in which they arrive.
 
-The parser is lenient on purpose: bytes that form no frame are passed on unchanged after `FLUSH_S`, and the emulators'
+It is lenient on purpose: bytes that form no frame are passed on unchanged after `FLUSH_S`, and the emulators'
 own receivers decide about them. In a stream whose frames carry their length (`Framing.streams`) it waits for the rest
 of a frame, because passing half of it on would break the stream.
 """
@@ -71,7 +71,7 @@ class FrameDirection(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FaultFrame:
-    """One frame. If it is not understood, `pdu` is empty, and `unit` and `function` are -1.
+    """One frame. If it cannot be parsed, `pdu` is empty, and `unit` and `function` are -1.
 
     `address` (the first register or bit) and `count` are those of the request, also in the frame of its reply; -1: none.
     """

@@ -61,8 +61,10 @@ def wire_faults(
     start_ns: int,
     check: Callable[[FaultSpec], None] | None = None,
 ) -> WireFaults:
-    """Return the injected faults of a link. Their times count from `start_ns`. Raises the errors of `check`, by default
-    those of `check_link`."""
+    """Return the faults `said`, given as in a fault file, as injected faults of a link. Their times count from `start_ns`.
+
+    Raises the errors of `check`, by default those of `check_link`.
+    """
     check = check or partial(check_link, framing=framing)
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):

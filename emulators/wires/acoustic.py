@@ -5,8 +5,8 @@ receives nothing (half duplex), two packets that overlap at a receiver are both 
 its next packet only when it neither transmits nor receives. There are no acknowledgements and no retransmissions; the users of
 the modems must handle losses.
 
-A function of time: events are computed in their order at the next access, and the same seed gives the same losses. It
-knows no modem registers, no sockets, and nothing of the content of packets.
+The model runs no task: at each access it computes the events up to that time in their order, and the same seed gives the same
+losses. It does not depend on modem registers or sockets, and does not interpret packets.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class AcousticProperties:
 
 @dataclass(slots=True)
 class Reception:
-    """A packet as one modem receives it, from `begins_ns` to `ends_ns`. `spoilt` is the reason of its loss, if it is lost."""
+    """A packet as one modem receives it, from `begins_ns` to `ends_ns`. `spoilt` is the reason for its loss; empty if none."""
 
     payload: bytes
     begins_ns: int

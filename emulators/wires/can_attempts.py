@@ -1,8 +1,8 @@
 """One attempt to send on a modelled CAN bus: whether it ends as a frame or as an error, and its effect on all nodes.
 
 This module holds the nodes with their transmit queues and error counters, and the time at which the bus is free again;
-`can_bus` determines when an attempt is due and which nodes take part in its arbitration. Pure; the only times are those
-of the attempts.
+`can_bus` determines when an attempt is due and which nodes take part in its arbitration. This module does no I/O and reads no
+clock; the only times are those of the attempts.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Attempts:
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
         self.faults: deque[CanErrorFrame] = deque(maxlen=MAX_NOTICES)
         self._others: dict[int, tuple[int, ...]] = {}
-        """By node: the receivers of its frames. Computed again when a node joins, leaves, or is in bus-off."""
+        """The receivers of the frames of each node. Computed again when a node joins or leaves the bus, or enters bus-off."""
         self._joined_ns = 0
         """The time at which the newest node joined."""
 

@@ -1,7 +1,7 @@
 """A model of a CAN bus: which node may send, when each frame ends, which nodes receive it, and the effects of errors.
 
-Pure: nodes submit frames and the caller passes the time; the results are deliveries and notices. It knows no sockets,
-tasks or clocks, so the same model runs behind a TCP server and in virtual time.
+Nodes submit frames and the caller passes the time; the results are deliveries and notices. The model uses no sockets, tasks or
+clocks, so the same model runs behind a TCP server and in virtual time.
 
 The model covers: bitwise arbitration among the heads of the nodes' transmit queues, the exact stuffed length of each
 frame, the interframe space, broadcast to every other node at the end of the frame; error frames and retransmission,
@@ -41,7 +41,7 @@ class CanBus:
     """The bus. `now_ns` is monotonic over all calls.
 
     `queue_frames` limits each node's transmit queue. `instant` makes frames take no time (they are still arbitrated and
-    counted), for tests and imports that should not wait for a bus. Without bits there are no collisions: of two frames
+    counted), for tests and imports that should not wait for a bus. Such frames have no bits that could collide: of two frames
     with the same arbitration field the older is sent first. `data_bitrate` is that of CAN FD frames with the bit-rate
     switch, 0 for `bitrate`. `monitored`: the bus acknowledges every frame; otherwise only other nodes do.
     """
@@ -153,7 +153,7 @@ class CanBus:
         return len(self._node(node).queue)
 
     def count_overrun(self, node: int) -> None:
-        """Count a frame that the node could not take."""
+        """Count a frame that the node lost because it had no room to receive it."""
         self.overruns += 1
         self._node(node).overruns += 1
 
@@ -202,7 +202,7 @@ class CanBus:
     def next_event_ns(self) -> int | None:
         """Return the time (ns) at which `advance` will next have a result; None if nothing will happen without a submission.
 
-        A frame that is submitted before changes this time only if the bus is idle until then; an error makes it earlier.
+        A frame that is submitted earlier changes this time only if the bus is idle until then; an error makes the event earlier.
         """
         if self._wire.done:
             return self._wire.done[0].frame.t_ns

@@ -1,4 +1,4 @@
-"""The events of a modelled CAN bus: frames that ended, state changes of controllers, errors on the bus. Values only."""
+"""The events of a modelled CAN bus, as values: frames that ended, state changes of controllers, errors on the bus."""
 
 from __future__ import annotations
 

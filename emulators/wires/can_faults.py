@@ -2,7 +2,7 @@
 
 `Confinement` holds one node's transmit and receive error counters and the state that follows from them. With
 `Disturbance` and `ErrorRule`, a test or a fault file destroys frames: a rule is called once for each attempt to send and
-returns the error. This module knows no bus and no time.
+returns the error. This module depends on neither the bus nor the time.
 """
 
 from __future__ import annotations

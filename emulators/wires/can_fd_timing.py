@@ -1,8 +1,8 @@
 """The duration of a CAN FD frame on the bus, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
 
-Pure arithmetic on one frame, like `can_timing` for classic frames. CAN FD differs in these points: a frame has up to 64 bytes;
-the checksum follows a count of the stuff bits, and has stuff bits at fixed positions instead of after five equal bits; with the
-bit-rate switch, the bits from ESI to the CRC delimiter are sent at the data bit rate.
+The functions depend on one frame only, like those of `can_timing` for classic frames. CAN FD differs in these points: a frame has
+up to 64 bytes; the checksum follows a count of the stuff bits, and has stuff bits at fixed positions instead of after five equal
+bits; with the bit-rate switch, the bits from ESI to the CRC delimiter are sent at the data bit rate.
 
 The rates change at the sample points of the bits BRS and CRC delimiter. With the same sample point in both phases, that
 takes exactly as long as a whole BRS bit at the nominal rate and a whole CRC delimiter at the data bit rate, which is

@@ -1,8 +1,8 @@
 """The traffic of a CAN bus: totals, and the load of the last second, by identifier and by node.
 
-The load counts every bit for which the bus was busy: frames with their stuff bits and interframe space, and errors. It
-is assigned to the identifier and the node that were sending. Bounded: beyond `MAX_IDS_COUNTED` identifiers the rest is
-``other``.
+The load counts every bit for which the bus was busy: frames with their stuff bits and interframe space, and errors. It is
+assigned to the identifier and the node that were sending. To limit memory, identifiers beyond the first `MAX_IDS_COUNTED` are
+counted together as ``other``.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class BusLoad:
         self._by_id: dict[int, int] = {}
         self._one_s_bits = bitrate * _SLOTS * _SLOT_NS / NS_PER_S
         self._slots: deque[tuple[int, dict[tuple[int, tuple[int, ...]], int]]] = deque(maxlen=_SLOTS)
-        """The last slots with traffic: for each, its number and its bits by identifier and senders."""
+        """The last time slots (100 ms each) with traffic: for each, its number and its bits by identifier and senders."""
         self._number = -1
         self._slot: dict[tuple[int, tuple[int, ...]], int] = {}
-        """The counts of the newest slot."""
+        """The bits of the newest time slot, by identifier and senders."""
 
     @property
     def frames(self) -> int:

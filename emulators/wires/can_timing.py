@@ -1,7 +1,7 @@
 """The duration of a CAN frame on the bus, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has the rules of
 CAN FD.
 
-Pure arithmetic on one frame: this module knows no bus, no time and no other frame.
+The functions depend on one frame only, not on the bus, the time or other frames.
 
 A data frame with an 11-bit identifier and n bytes takes 47 + 8n bits unstuffed and at most 55 + 10n; with a 29-bit
 identifier 67 + 8n to 80 + 10n. Both include the interframe space of 3 bits.

@@ -1,4 +1,4 @@
-"""The outcome of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure.
+"""The outcome of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1).
 
 In a collision, several nodes won the arbitration with one identifier and different content. All of them send until the first bit
 that differs. There the bus is dominant, and each node that sent the recessive bit has a bit error. The flag of an error-active
@@ -41,8 +41,8 @@ class CollisionOutcome:
 class FailedAttempt:
     """An attempt that ended in an error frame.
 
-    `ErrorFrame` describes `kind`. The first flag begins at bit `flag_at`, and the attempt takes `bits` of the bus. `first` are
-    receivers that sent their error flag before all others; their counters increase by more.
+    `CanErrorFrame` describes `kind`. The first flag begins at bit `flag_at`, and the attempt occupies the bus for `bits` bits.
+    `first` are the receivers that sent their error flag before all others; their counters increase by more.
     """
 
     kind: str

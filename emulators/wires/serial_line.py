@@ -1,7 +1,7 @@
 """A model of a serial line: when a character has arrived at the receiver.
 
-Pure arithmetic in integer nanoseconds. It opens nothing, waits for nothing and never sees the value of a byte. Ptys and in-memory
-connections use it, because they themselves ignore the configured baud rate.
+The model computes times in integer nanoseconds. It opens no port, never waits, and does not need the values of the bytes. Ptys
+and in-memory connections use it, because they themselves ignore the configured baud rate.
 """
 
 from __future__ import annotations

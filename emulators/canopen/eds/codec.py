@@ -1,6 +1,6 @@
 """CANopen's basic data types as bytes: the emulator's own codec (CiA 301 v4.2, 7.1.6 and table 44).
 
-It must never be shared with a driver: a mistake on both sides of a link would cancel itself out.
+The gateway's drivers must not use this codec, because the same mistake on both sides of a link would remain undetected.
 """
 
 from __future__ import annotations

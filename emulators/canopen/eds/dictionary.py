@@ -1,7 +1,7 @@
 """An electronic data sheet (EDS or DCF, CiA 306-1) as the emulated node's object dictionary: a frozen description.
 
 It has its own parser, because the gateway reads data sheets with the `canopen` package, and two independent readers reveal each
-other's mistakes. It must never know live values (`fieldtwin.emulators.canopen.node_data`) or the bus.
+other's mistakes. It must not depend on live values (`fieldtwin.emulators.canopen.node_data`) or the bus.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def parse_eds(
 ) -> Dictionary:
     """Return the dictionary in the text of an EDS or DCF. Raises `FileInvalid`.
 
-    `path` is used in messages, `notes` are earlier notes; the file in a DOMAIN's DownloadFile is searched in `folder`.
-    `parameter_values` as in `load_eds`.
+    `path` is used in messages. `notes` are corrections that were made before. A DOMAIN's DownloadFile is searched in `folder`.
+    `parameter_values` has the meaning that it has in `load_eds`.
     """
     notes = [] if notes is None else notes
     sections = parse_sections(text, path, notes)

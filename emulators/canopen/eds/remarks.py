@@ -2,8 +2,8 @@
 model.
 
 A DCF is often copied from a different node of the plant, so its ParameterValues are that node's COB-IDs. The emulated node uses
-them unchanged, and `remarks` reports them. Pure; the texts name no command, because the caller knows how to override the
-settings.
+them unchanged, and `remarks` reports them. The module does no I/O. The texts name no command, because the caller knows how to
+override the settings.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Remark:
 
 
 def remarks(dictionary: Dictionary, node_id: int, *, has_model: bool) -> list[Remark]:
-    """Return the settings that do not fit a node with this ID. `has_model` says that the node has a model of a device profile."""
+    """Return remarks on settings that do not fit a node with this ID, and on a missing model (if `has_model` is False)."""
     found = [*_of_another_node(dictionary, node_id), *_of_the_cycle(dictionary)]
     if not has_model:
         found.append(_without_model(dictionary))
@@ -66,7 +66,7 @@ def _of_another_node(dictionary: Dictionary, node_id: int) -> list[Remark]:
 def _owner(entry: SubindexEntry) -> int:
     """Return the node that owns a COB-ID in the predefined connection set.
 
-    Returns 0 for a COB-ID that follows the node ID, and for other objects.
+    Returns 0 for a COB-ID that is relative to the node ID, and for all other objects.
     """
     base = _base(entry)
     if base == 0 or entry.node_relative or entry.size != 4:

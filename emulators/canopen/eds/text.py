@@ -3,7 +3,7 @@
 It tolerates common defects of real files (indentation, empty values, case, line ends, encodings, free text in sections
 that describe no object). It is strict where a guess could be wrong: an object that is described twice, a key with two
 values, a line of an object that is not ``key=value``. The gateway's reader tolerates the same defects (decision 0001)
-but shares no code with this one. This module knows no objects.
+but shares no code with this one. This module does not interpret the objects that the sections describe.
 """
 
 from __future__ import annotations

@@ -29,7 +29,11 @@ _UNIT_NS = 100_000
 
 
 class Emergency(NodeService):
-    """Active errors by code and source (two heartbeats may be missing); the error register is the union of their bits."""
+    """The EMCY service of a node.
+
+    It keeps the active errors by code and source, because two sources can have the same error (two missing heartbeats). The error
+    register is the union of the bits of the active errors.
+    """
 
     def __init__(self, core: Core) -> None:
         self._core = core

@@ -1,7 +1,7 @@
 """Node guarding and life guarding, on the side of the guarded node (CiA 301 v4.2, 7.2.8.2.1; 100Ch, 100Dh).
 
 The answer to a guarding request carries the state and a toggle bit. After its first request a node expects the next
-within the life time; otherwise it sends EMCY 8130h and reacts by 1029h. An active heartbeat producer disables guarding.
+within the life time; otherwise it sends EMCY 8130h and reacts as 1029h demands. An active heartbeat producer disables guarding.
 """
 
 from __future__ import annotations

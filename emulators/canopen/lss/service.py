@@ -1,8 +1,9 @@
-"""The LSS service of a node: the states in which it answers, and the effect of a new node ID or bit rate (CiA 305 v3.0, 4.3
-and 6.3).
+"""The LSS service of a node: the NMT states in which the node answers, and the effect of a new node ID or bit rate (CiA 305 v3.0,
+4.3 and 6.3).
 
-A configured node takes a new node ID at the next reset; an unconfigured node boots with it as soon as LSS leaves
-configuration. The bit rate changes after the switch delay; the node is silent for one delay before and one after.
+A configured node takes a new node ID at the next reset; an unconfigured node boots with it as soon as LSS leaves the
+configuration state. The bit rate changes after the switch delay; the node is silent for one switch delay before the change and
+one after it.
 """
 
 from __future__ import annotations

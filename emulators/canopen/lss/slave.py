@@ -1,7 +1,8 @@
-"""Layer setting services on the LSS slave: node ID and bit rate by identity (CiA 305 v3.0, clause 6).
+"""Layer setting services on the LSS slave: the LSS master selects a node by its identity and sets its node ID and bit rate
+(CiA 305 v3.0, clause 6).
 
-Pure: it takes the LSS master's 8 bytes and returns the slave's 8 bytes or None. It must never know the bus or NMT: the node reads
-a new node ID or bit rate from `pending_id`, `stored_id` and `pending_rate`, and applies it.
+`LssSlave` does no I/O: it takes the LSS master's 8 bytes and returns the slave's 8 bytes or None. It must not depend on the bus
+or NMT: the node reads a new node ID or bit rate from `pending_id`, `stored_id` and `pending_rate`, and applies it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Receive PDOs: taking values from the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
 
 With transmission types 254 and 255 a PDO is applied immediately, with 0 to 240 at the next SYNC. A PDO that is too short causes
-EMCY 8210h and is not applied. Of a PDO that is too long, the first bytes are used. If a PDO does not arrive again within its
+EMCY 8210h and is not applied. If a PDO is too long, its first bytes are used. If a PDO does not arrive again within its
 event timer, EMCY 8250h is active until it arrives.
 """
 
@@ -36,7 +36,7 @@ class _Rpdo:
 class Rpdos(NodeService):
     """All RPDOs of a node.
 
-    `changed` is called with the values that a PDO changed, then `wrote` with all that it contained.
+    For each PDO, `changed` is called with the objects whose values it changed, then `wrote` with all objects that it contained.
     """
 
     due_ns: int = NEVER

@@ -55,7 +55,7 @@ class Tpdos(NodeService):
         self._overdue: frozenset[int] = frozenset()
         self._event_ns = NEVER
         self._event_of = -1
-        """The version of the values from which `_event_ns` was computed; -1 after a change in this object."""
+        """The version of the values from which `_event_ns` was computed; -1 after a change of a TPDO's state."""
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     @property

@@ -1,6 +1,7 @@
 """Block transfers of the SDO server, one object per transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.16).
 
-Pure: it takes and returns frames of 8 bytes. It must never know objects, timers or the bus, which `server` handles.
+The classes take and return the 8 data bytes of frames and do no I/O. They must not depend on objects, timers or the bus, which
+the module `server` handles.
 
 A sub-block has up to 127 segments, numbered from 1, which are acknowledged together. If a segment is missing, only the
 segments before it count; the client sends the rest again, numbered from 1.

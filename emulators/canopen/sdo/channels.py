@@ -1,6 +1,6 @@
 """The SDO servers of a node: the default server and those of 1201h to 127Fh (CiA 301 v4.2, 7.5.2.33).
 
-This module assigns identifiers to servers and counts frames. It must never know transfers (`server`).
+This module assigns identifiers to servers and counts frames. The module `server` handles the transfers.
 """
 
 from __future__ import annotations

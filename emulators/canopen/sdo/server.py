@@ -1,8 +1,8 @@
 """The server side of SDO: expedited, segmented and block transfers (CiA 301 v4.2, 7.2.4.3).
 
-A pure object: it takes one request's 8 bytes and `now`, and returns the replies' bytes (a list, because one request can
-be answered with the many frames of a sub-block). It must never know objects, NMT states or the bus: an `ObjectAccess`
-decides what may be read and written.
+`SdoServer` does no I/O: it takes one request's 8 bytes and the time, and returns the replies' bytes (a list, because one request
+can be answered with the many frames of a sub-block). It must not depend on objects, NMT states or the bus: an `ObjectAccess`
+decides which objects a client may read and write.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _Transfer = _Download | _Upload | BlockDownload | BlockUpload
 
 
 class SdoServer:
-    """One SDO channel with one transfer at a time; a new initiate replaces a running transfer.
+    """One SDO channel with one transfer at a time; a new initiate request replaces a running transfer.
 
     While a sub-block of a block download is being received, every frame except an abort is taken as one of its segments, because
     the standard offers no way to distinguish other frames. `block` is the number of segments that a client may send in one

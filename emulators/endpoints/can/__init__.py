@@ -1,1 +1,1 @@
-"""The software CAN bus as a server, its clients on the simulated side, and serial CAN adapters (slcan)."""
+"""The software CAN bus as a server, the ends by which emulated nodes join it, and serial CAN adapters (slcan)."""

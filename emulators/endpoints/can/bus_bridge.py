@@ -1,6 +1,6 @@
 """Join two CAN buses, on the software bus or kernel interfaces: each frame on one bus is also sent on the other bus.
 
-Frames are not sent back, because an end does not receive what it sent itself. Error frames are not forwarded: they
+Frames are not sent back, because an end does not receive the frames that it sent itself. Error frames are not forwarded: they
 concern one controller, not a bus. While one bus is full, the frames of the other direction wait in a bounded queue;
 further frames are lost and counted. The bridge does not interpret frames.
 """
@@ -33,7 +33,7 @@ class CanBridge:
 
     @property
     def lost(self) -> int:
-        """Return the number of frames that were lost because they came faster than the target bus accepted them."""
+        """Return the number of frames that were lost because they arrived faster than the target bus accepted them."""
         return self._refused + sum(end.overruns for end in self._ends)
 
     async def aclose(self) -> None:

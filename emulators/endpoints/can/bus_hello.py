@@ -1,7 +1,7 @@
-"""The hello of the software CAN bus, for the bus and the emulators: two records before the first frame.
+"""The hello of the software CAN bus, for the bus and the emulators: one record in each direction before the first frame.
 
-Pure bytes; no sockets. A hello is as long as a frame's record (24 bytes) and its first byte has bit 7 set, which no
-frame's record has, so a reader of fixed-size records needs no second framing. Network byte order:
+This module packs and unpacks bytes and uses no sockets. A hello is as long as a frame's record (24 bytes) and its first byte has
+bit 7 set, which no frame's record has, so a reader of fixed-size records needs no second framing. Network byte order:
 
     0  u8   80h
     1  u8   protocol version: 1, or 2 for records that carry CAN FD (80 bytes each); the answer has that of the request

@@ -1,7 +1,7 @@
 """The CAN bus model on an event loop: it advances time, delivers frames to ports and holds senders back.
 
-It knows the loop's clock (wall or virtual) and no sockets: the TCP server is one kind of port, and a connection inside the
-same process is another kind.
+It uses the loop's clock (wall or virtual time) and no sockets: the TCP server is one kind of port, and a connection inside the
+same process is a different kind.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class BusPort(Protocol):
     def on_frame(self, frame: CanFrame) -> bool:
         """Receive a frame of a different node that ended at `frame.t_ns`.
 
-        Return False if there is no room: it is lost and counted.
+        Return False if there is no room; the frame is then lost and counted.
         """
         ...
 
@@ -45,7 +45,7 @@ class BusPort(Protocol):
         ...
 
     def on_settled(self) -> None:
-        """Note that all frames of this instant have been delivered."""
+        """Note that all frames that ended at this time have been delivered."""
         ...
 
     def on_bus_closed(self, error: FieldtwinError) -> None:
@@ -64,9 +64,10 @@ class _ReportedError(NamedTuple):
 
 
 class BusRunner:
-    """The runner of a `CanBus` on the running loop. If `paced`, frames take their time on the bus; otherwise they take none.
+    """The runner of a `CanBus` on the running loop. If `paced`, frames have their real duration; otherwise none.
 
-    A late wake-up delays deliveries and never shifts the bus: frames keep their exact times (`frame.t_ns`).
+    A late wake-up of this process delays deliveries, but does not change the times on the bus: frames keep their exact
+    `frame.t_ns`.
     """
 
     def __init__(

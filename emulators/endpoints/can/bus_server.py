@@ -49,11 +49,11 @@ SDO_REPLY, SDO_REQUEST = 0x580, 0x600
 SDO_ABORT = b"\x80"
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 64 * 1024
-"""The kernel's buffer per client. By default it grows to megabytes: it would hold minutes of frames, which a slow client would
-read late.
+"""The kernel's send buffer per client, in bytes. By default it grows to megabytes: it would hold minutes of frames, which a slow
+client would read late.
 """
 RECEIVE_BUFFER_BYTES = 16 * 1024
-"""The receive buffer: a sender that waits for no confirmations is held back after some hundred frames."""
+"""The receive buffer in bytes: TCP stops a sender that does not wait for confirmations after some hundred frames."""
 
 
 class SoftBusServer:
@@ -66,7 +66,7 @@ class SoftBusServer:
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
         self.sdo_clients = ClientCounts()
-        """By client: its SDO requests, and the replies. A reply counts for the client that sent the last request."""
+        """SDO requests and replies by client. A reply counts for the client that sent the last request."""
         self._asked_by: dict[int, _Client] = {}
         self.turned_away = 0
         """The number of clients that were refused or violated the protocol."""

@@ -1,6 +1,6 @@
 """Emulated CAN ends that report to their node that received frames were lost, as a CAN controller does.
 
-The report is an error frame; this module does not know how the node reacts.
+The report is an error frame; the node decides how to react.
 """
 
 from __future__ import annotations

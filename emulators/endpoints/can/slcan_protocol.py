@@ -1,4 +1,4 @@
-"""The LAWICEL ASCII protocol ("slcan"), the adapter's side for one client. It converts bytes and frames; no sockets.
+"""The LAWICEL ASCII protocol ("slcan"), the adapter's side for one client. It converts between bytes and frames without sockets.
 
 Commands end with CR; the adapter answers CR (done), BEL (refused), or the requested data. Supported: ``O`` open, ``L``
 listen only, ``C`` close, ``S0`` to ``S8`` and ``sBBCC`` bit rate (SJA1000 at 16 MHz), ``t T r R`` send, ``V N F``
@@ -80,7 +80,7 @@ class SlcanSession:
         return answer
 
     def received(self, frame: CanFrame) -> bytes:
-        """Return a frame in the form sent to the client; nothing while the channel is closed."""
+        """Return the bytes by which the client receives a frame; empty while the channel is closed."""
         if not self.is_open:
             return b""
         letter = "tT"[frame.extended] if not frame.remote else "rR"[frame.extended]

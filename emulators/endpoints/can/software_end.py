@@ -144,7 +144,7 @@ class SoftBusEnd(ReportsOverrun):
         self._writer.write(pack_record(frame))
 
     async def aclose(self) -> None:
-        """Leave, once the bus has sent all frames (or after a second)."""
+        """Leave the bus as soon as it has sent all frames of this node, or after one second."""
         if self.lost is None:
             try:
                 await asyncio.wait_for(self._all_sent.wait(), CLOSE_TIMEOUT_S)

@@ -1,6 +1,6 @@
 """An emulator's end of a link with fault injection: the bytes in both directions pass through the faults of the bus.
 
-Neither side can detect this. The time is that of the loop. While no fault is active, bytes pass unchanged.
+Neither side can detect the wrapper. All times are those of the event loop. While no fault is active, bytes pass unchanged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 MOST_WAITING = 10_000
-"""The number of pieces that may wait for the end of their delay. Further pieces are lost and counted."""
+"""The number of pieces (chunks of bytes) that may wait for the end of their delay. Further pieces are lost and counted."""
 
 
 class FaultyEnd(ByteConnection):

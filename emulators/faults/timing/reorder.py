@@ -33,8 +33,9 @@ class Reorder(WireFault):
         )
 
     def _went(self, frame: FaultFrame) -> bool:
-        """Return whether the delayed frame has already been sent after a later frame. If not, its time is over and it is sent
-        now.
+        """Return whether the delayed frame has already been sent after a later frame.
+
+        If not, the caller sends it now, because its delay has ended.
         """
         if self._held is not frame:
             return True

@@ -1,6 +1,6 @@
 """The numbers that the registers or object of a tag can hold, and which of them lie outside of its declared range.
 
-Values are in engineering units. Pure. A tag whose scale factor is in a separate register (`scale_by`) has no fixed
+Values are in engineering units. A tag whose scale factor is in a separate register (`scale_by`) has no fixed
 limits: the factor is known only while the device runs.
 """
 

@@ -1,4 +1,4 @@
-"""Selects the model for a data sheet: by the device profile in the low word of 1000h (CiA 301, 7.5.2.1), or by the user."""
+"""Select the model for a data sheet: by the device profile in the low word of 1000h (CiA 301, 7.5.2.1), or by the user."""
 
 from __future__ import annotations
 

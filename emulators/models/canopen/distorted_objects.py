@@ -1,7 +1,7 @@
 """Value faults of a CANopen node whose values come from a log, from a model, or only from its data sheet and clients.
 
 If no source provides an object, its undistorted value is the value that it held when the fault began, or that a client has
-written since then. This value is restored when the fault is over. Pure; it must never know frames or SDO.
+written since then. This value is restored when the fault is over. This module does no I/O and must not depend on frames or SDO.
 """
 
 from __future__ import annotations
@@ -100,7 +100,10 @@ class DistortedObjects:
         return out
 
     def _beneath(self, key: Key) -> bytes | None:
-        """Return the undistorted value of an object that no source provides. A value that was written later replaces it."""
+        """Return the undistorted value of an object that no source provides; None if the node has no such object.
+
+        It is the value that a client last wrote, or the value before the fault.
+        """
         if self.data is None or not self.data.has(*key):
             return None
         live = self.data.get(*key)

@@ -1,6 +1,6 @@
-"""Builds a CANopen node from a profile: data sheet, model, recording and journal.
+"""Build a CANopen node from a profile: data sheet, model, recording and journal.
 
-It must never know buses or clocks: the signal player that it is given has its own start time.
+This module must not depend on buses or clocks: recorded signals have their own start time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class NodeOptions:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedNode:
-    """The node and the journal of its values, by tag.
+    """The node, and the journal of its object values by tag.
 
     `distortions` are the value faults of its objects. `remarks` list settings that do not fit the node.
     """
@@ -60,7 +60,7 @@ def emulated_node(
     identity: Mapping[str, str] | None = None,
     options: NodeOptions | None = None,
 ) -> EmulatedNode:
-    """Return the node of a CANopen profile, which plays signals or a log of its bus.
+    """Return the node of a CANopen profile. It plays recorded signals, or a log of the bus on which the node was recorded.
 
     Without a `recording` it holds the values of the data sheet and those of its model. `identity` maps tags to values that
     replace those of the data sheet for this device. Raises `FileInvalid` for a data sheet or log that cannot be read and for a

@@ -1,8 +1,8 @@
 """A CiA 401 I/O module: polarity, input masks, interrupts of inputs, and output values for errors.
 
 Objects follow CiA 401-1 v3, as printed in makers' manuals: digital inputs 6000h to 6008h, digital outputs 6200h to
-6207h, analogue inputs 6401h and 6421h to 6426h, analogue outputs 6411h, 6443h and 6444h. The recording plays 6000h and
-6401h.
+6207h, analogue inputs 6401h and 6421h to 6426h, analogue outputs 6411h, 6443h and 6444h. The recording contains 6000h
+and 6401h.
 """
 
 from __future__ import annotations

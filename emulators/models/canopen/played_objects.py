@@ -1,4 +1,4 @@
-"""Recorded signals as CANopen objects, read by a node's TPDOs and SDO uploads at the emulator's clock."""
+"""Recorded signals as CANopen objects: TPDOs and SDO uploads send the signals' values at the present time of the emulator."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PlayedObjects:
 
 
 def whole(number: float, data_type: int) -> int:
-    """Return the nearest number that the type can hold, because a device's converters saturate."""
+    """Return the nearest integer that the type can hold, because a device's converters saturate."""
     bounds = integer_range(data_type)
     if bounds is None:
         return round(number)

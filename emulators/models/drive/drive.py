@@ -36,11 +36,11 @@ _REACTIONS = {1: TransitionCause.ERROR, 2: TransitionCause.DISABLE_VOLTAGE, 3: T
 
 _SPAN = 1 << 32
 _USUAL, _UNLIMITED = 10_000.0, 10_000_000.0
-"""Accelerations for a node without the object that states them: the usual one of a profile, and that of a motor without
-limits.
+"""Accelerations in increments per second squared for a node without the object that states them: the usual one of a profile, and
+that of a motor without limits.
 """
 _FASTEST = 10_000_000.0
-"""The final speed of a motor that a torque accelerates without limit."""
+"""The final speed, in increments per second, of a motor that a torque accelerates without limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,9 @@ class _SetPoint:
 class Drive(DeviceModel):
     """One axis.
 
-    `self_test_s` is the time for which the drive is not ready to switch on; `coasting` is the deceleration of an
-    unpowered motor by its friction; `rated` is the acceleration that the rated torque gives without friction; `axis`
-    holds the positions of the switches.
+    `self_test_s` is the time in seconds after power-on for which the drive is not ready to switch on; `coasting` is the
+    deceleration of an unpowered motor by its friction; `rated` is the acceleration that the rated torque gives without
+    friction; both are in increments per second squared. `axis` holds the positions of the switches.
     """
 
     def __init__(

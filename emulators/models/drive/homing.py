@@ -3,7 +3,7 @@
 Methods 1 to 14 search for a switch and then for an index pulse, 17 to 30 do the same without the index pulse, 33 and 34
 use the next index pulse, 35 and 37 the present position. The whole path is computed when homing begins, so that the
 drive stays a function of time. A search brakes after the edge of the switch, like a real drive, which cannot know where
-the edge is. This module knows no objects.
+the edge is. This module does not depend on CANopen objects.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ METHODS = (*range(1, 15), *range(17, 31), 33, 34, 35, 37)
 
 _LEFT, _RIGHT = -1, 1
 _LIMIT = {1: _LEFT, 2: _RIGHT}
-"""Methods that use a limit switch, by the side of the switch. Home is on the other side of its edge."""
+"""For each method that uses a limit switch: the side of the switch. The index pulse is on the opposite side of its edge."""
 _POSITIVE_HOME = {3: _LEFT, 4: _RIGHT}
-"""Methods that use the lower edge of the home switch, as if it were active from there on; by the side of the index pulse.
+"""For each method that uses the lower edge of the home switch, as if it were active from there on: the side of the index pulse.
 """
 _NEGATIVE_HOME = {5: _RIGHT, 6: _LEFT}
-"""Methods that use the upper edge of the home switch, as if it were active up to there; by the side of the index pulse."""
+"""For each method that uses the upper edge of the home switch, as if it were active up to there: the side of the index pulse.
+"""
 _BETWEEN = {
     7: (_RIGHT, "lower", _LEFT), 8: (_RIGHT, "lower", _RIGHT), 9: (_RIGHT, "upper", _LEFT), 10: (_RIGHT, "upper", _RIGHT),
     11: (_LEFT, "upper", _RIGHT), 12: (_LEFT, "upper", _LEFT), 13: (_LEFT, "lower", _RIGHT), 14: (_LEFT, "lower", _LEFT),
 }  # fmt: skip
-"""Methods between two limit switches: side where the search begins, edge of the home switch, side of the index pulse."""
+"""For each method between two limit switches: the side where the search begins, the edge of the home switch, and the side of the
+index pulse.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +77,7 @@ class Speeds:
 
 @dataclass(frozen=True, slots=True)
 class HomingPath:
-    """The motion of the drive and the home position; None if the search ended at a limit switch (a homing error)."""
+    """The motion of the drive, and the home position, which is None if the search ended at a limit switch (a homing error)."""
 
     motion: Motion
     home: float | None

@@ -1,7 +1,7 @@
 """A point that moves with piecewise constant acceleration: its position, and the ramps to a given speed or position.
 
 The position is a closed formula of time, so it can be computed for any time and never drifts. The caller chooses the units of
-length; time is in seconds. This module knows no drive and no clock.
+length; time is in seconds. This module depends on no drive and reads no clock.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class ControlBit(IntEnum):
 class DriveTransition:
     """One transition, with the standard's `number`.
 
-    The drive takes 1, 12, 13 and 14 by itself; a command can also cause 12.
+    The drive takes the transitions 1, 12, 13 and 14 by itself; a command can also cause 12.
     """
 
     number: int

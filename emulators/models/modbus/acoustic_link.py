@@ -1,4 +1,4 @@
-"""A modem's connection to the acoustic channel: it sends the messages from the registers, and receives for the mailbox."""
+"""A modem's connection to the acoustic channel: it sends messages from the outbox registers and receives those for the inbox."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fieldtwin.emulators.wires.acoustic import AcousticMedium
 
 
 class AcousticLink:
-    """Both directions of the modem `name` in `medium` (`packet_link.PacketSource` and `Incoming`).
+    """The link of the modem `name` to `medium`, in both directions (`packet_link.PacketSource` and `packet_link.PacketSink`).
 
     Each packet is sent `times` times, `every_ns` apart, because the modem gets no acknowledgements and the channel may lose any
     of these copies. `resent` counts the additional copies.

@@ -1,7 +1,7 @@
 """Value faults of a Modbus device with a model: its registers hold different values while a fault is active.
 
 The undistorted values continue to change: clients write them, effects change them, and they are read again after the
-fault is over. Pure; it changes only with requests.
+fault is over. This module does no I/O, and values change only when the device handles a request.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Builds an emulated Modbus device from a profile and the source of its values.
+"""Build an emulated Modbus device from a profile and the source of its values.
 
-The source is a recording of exchanges, signals, initial values or a modem. It must never know buses, files or clocks: the time at
-which its values begin is passed in.
+The source is a recording of exchanges, signals, initial values or a modem. This module must not depend on buses, files or clocks:
+the caller passes the time at which the values begin.
 """
 
 from __future__ import annotations

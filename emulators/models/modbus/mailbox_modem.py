@@ -2,7 +2,8 @@
 
 Each modem has its own register bank on its own socket: one for the plant, one for the remote side. A message that one side writes
 into its outbox travels over the link and appears in the inbox of the opposite side when that inbox is free. A repeated sequence
-number is treated as the same message and not sent twice. Functions of time: a link is advanced when it is read or written.
+number is treated as the same message and not sent twice. A modem runs no task: it is brought up to the present time whenever
+its registers are read or written.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class MailboxModem(RegisterBank):
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
         self._written_counters = (-1, -1, -1, -1)
-        """The link's counters as last written to its registers (`_LINK`); none at first."""
+        """The link's counters as last written to its registers (`_LINK`); -1 before the first write."""
         self._received: deque[bytes] = deque(maxlen=RECEIVED)
         self._sequence = 0
         self._accepted = 0
@@ -64,7 +65,7 @@ class MailboxModem(RegisterBank):
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
     def _state(self, name: str, text: str) -> None:
-        """Write the value of a tag that never changes into its registers."""
+        """Write the value `text` of a tag that never changes into the registers of the tag."""
         tag = self._tags[name]
         try:
             words = encode(text if tag.is_text else float(text), tag.type, tag.order, registers=tag.registers.count)

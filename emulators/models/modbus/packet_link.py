@@ -2,8 +2,8 @@
 
 Packets are sent one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with probability
 `loss`. The sender detects a loss by the missing acknowledgement and resends. Packets are therefore late but never lost, unless
-the link is configured with `LinkImpairments`. The link uses a seeded random generator and is a function of time: the arrival of a
-packet is known when it is sent.
+the link is configured with `LinkImpairments`. The link uses a seeded random generator and runs no task: it computes the arrival
+time of a packet when the packet is sent.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_RESENDS = 50
 
 
 class PacketSource(Protocol):
-    """The interface that takes packets from a modem."""
+    """An object to which a modem gives packets for transmission."""
 
     sent: int
     resent: int
@@ -32,7 +32,7 @@ class PacketSource(Protocol):
 
 
 class PacketSink(Protocol):
-    """The interface that delivers packets to a modem."""
+    """An object from which a modem takes received packets."""
 
     delivered: int
 
@@ -49,7 +49,7 @@ class ModemEnd(PacketSource, PacketSink, Protocol):
 class LinkImpairments:
     """Faults of the link that the modems do not correct.
 
-    Each is a probability per packet: it never arrives, it arrives twice, or it arrives before its predecessor.
+    Each field is a probability per packet: that it never arrives, arrives twice, or arrives before its predecessor.
     """
 
     lost: float = 0.0

@@ -1,7 +1,7 @@
 """A device emulated from a recording of exchanges, with data from its profile: counters, identity, device-specific functions.
 
-Like every emulator, it uses the device's own connection and keeps a journal, here of every value that it returned to a read. It
-never knows its driver, or the medium of its connection.
+Like every emulator, it is reached through a connection of the device's own type and keeps a journal, here of every value that it
+returned to a read. It must not depend on the gateway's driver or on the medium of the connection.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def load_replay(
 ) -> tuple[ExchangeReplay, int]:
     """Return a recording of exchanges with a device of `profile`, and its unit ID in the recording.
 
-    The unit ID is the factory's if it was recorded, else the lowest one. Raises `FileInvalid`.
+    The unit ID is the profile's factory setting if the recording contains it, else the lowest recorded one. Raises `FileInvalid`.
     """
     with RecordingReader(path) as reader:
         exchanges = list(reader.exchanges())
@@ -52,7 +52,7 @@ def load_replay(
 
 
 class RecordedDevice(ProfiledReplay):
-    """One unit of an emulated line. `kind` is the connection type of the emulated device.
+    """One unit that replays a recording. `kind` is the connection type of the emulated device.
 
     `identity` maps tags to values that replace the recorded ones. A request that is not in the profile's command list is also
     answered, and counted in `unlisted`.

@@ -1,9 +1,9 @@
 """A Modbus device without a recording: its profile defines its registers and functions.
 
 The cells are those of the tags; addresses between them do not exist (exception 02). Cells hold the values of the prototype file
-until a client writes them; by default 0, or where the tag's range excludes 0, the nearest value in that range. Effects,
-device-specific functions, identification, files and queues are as the profile states. The device changes only with requests:
-nothing here waits.
+until a client writes them; by default 0, or where the tag's range excludes 0, the nearest value in that range. The effects of
+accesses, device-specific functions, identification, files and queues are as the profile states. The device changes only when it
+handles a request, so this module runs no task and never waits.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ class ProfileRegisters(RegisterBank):
         self.set(self._effects.of(table, addresses, values), now_ns)
 
     def set(self, sets: Sequence[tuple[Tag, float]], now_ns: int) -> None:
-        """Change tags from the device's side, one after the other."""
+        """Set tags to new values that the device itself determines, in order."""
         for tag, value in sets:
             self._put(tag, value)
             at = tag.registers
             self._note_all(at.table, range(at.address, at.end), now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """Return the value of a cell without the effects of a read."""
+        """Return the value of a cell without the effects that the profile declares for a read."""
         return self._cells.peek(table, address)
 
     def _put(self, tag: Tag, value: float | str) -> None:
@@ -123,7 +123,10 @@ def _exponent(tag: Tag, values: Mapping[str, float | str]) -> int:
 
 
 def _number(tag: Tag, text: float | str) -> float:
-    """Return the number for a value that the prototype file gives as one of the profile's names."""
+    """Return the number for a value that is given as text: a name that the profile defines, true or false, or an integer.
+
+    Raises `FileInvalid` for any other value.
+    """
     for number, word in tag.values:
         if word == text:
             return number * tag.scale + tag.offset

@@ -1,10 +1,10 @@
 """A sensor that takes samples: its registers come from a profile, its values from recorded signals.
 
 The sensor takes a sample every period, the first one immediately. The period in seconds is the one that a client has written into
-the tag that the profile names, or the sensor has it from the beginning. A period of 0 is standby, a negative one is off. A sample
+the tag that the profile names, or before that the initial one. A period of 0 is standby, a negative one is off. A sample
 holds the values of all signals of the recording at one instant of the emulator's clock; the `instrument_time` register holds this
-instant in milliseconds if the profile has such a register. The sensor is a function of time: nothing here waits, and samples that
-are due are taken at the next access.
+instant in milliseconds if the profile has such a register. The sensor runs no task and never waits: samples that are due are
+taken at the next access.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ OWN = ("status", "instrument_time")
 
 
 def sampled_tags(profile: DeviceProfile, identity: Iterable[str]) -> list[Tag]:
-    """Return the tags whose values a sampling sensor takes from signals: its numbers, except those that it fills itself."""
+    """Return the tags whose values a sampling sensor takes from signals: numeric tags, except those that it fills itself."""
     assert profile.sampled is not None
     own = {*OWN, profile.sampled.period, profile.sampled.count, *identity}
     return [t for t in profile.tags.values() if t.name not in own and not t.is_text]
@@ -85,7 +85,7 @@ class SampledSensor(RegisterBank):
 
     @property
     def period_s(self) -> int:
-        """Return the sampling period as last written."""
+        """Return the sampling period in seconds, as last written."""
         return self._period_s
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
@@ -99,7 +99,7 @@ class SampledSensor(RegisterBank):
 
     @property
     def own_tags(self) -> list[Tag]:
-        """Return the numeric tags that the model fills itself. They are not signals, so their distortions are not sampled."""
+        """Return the numeric tags that the model fills itself. Faults change them when a client reads them, not earlier."""
         signals = {tag.name for tag in self._signals}
         return [tag for tag in self._tags.values() if tag.name not in signals and not tag.is_text]
 
@@ -162,7 +162,7 @@ class SampledSensor(RegisterBank):
         self._put(self._count_tag, self.samples & 0xFFFFFFFF, t_ns)
 
     def _put(self, tag: Tag, value: float | int | str, now_ns: int) -> None:
-        """Set one of the device's own tags."""
+        """Set a tag to a raw value (without scale and offset) or a text, and add it to the journal."""
         at = tag.registers
         words = encode(value, tag.type, tag.order, registers=at.count)
         self._cells.poke(at.table, at.address, *words)

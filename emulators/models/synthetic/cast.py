@@ -1,7 +1,7 @@
 """A synthetic CTD cast: a stratified ocean, a probe on a winch, a heaving ship, and imperfect sensors.
 
-It generates the shipped recording `cast.jsonl`. Deterministic: the caller passes the random generator. It knows no
-files and no registers.
+This module generates the shipped recording `cast.jsonl`. It is deterministic, because the caller passes the random generator. It
+accesses no files and no registers.
 """
 
 from __future__ import annotations

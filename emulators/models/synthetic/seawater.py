@@ -3,7 +3,7 @@ of 1978.
 
 Source: Fofonoff and Millard, "Algorithms for computation of fundamental properties of seawater", UNESCO technical papers in
 marine science 44 (1983), section 1; the tests contain its check values. Valid for salinities of 2 to 42. Temperatures are in
-ITS-90 and are converted to IPTS-68, in which the scale is defined (t68 = 1.00024 t90). Pure.
+ITS-90 and are converted to IPTS-68, in which the scale is defined (t68 = 1.00024 t90).
 """
 
 from __future__ import annotations

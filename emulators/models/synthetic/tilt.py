@@ -1,7 +1,7 @@
 """A synthetic inclinometer on a moored buoy: the mooring's steady tilt, and swell that repeats exactly every minute.
 
-It generates the shipped recording `incl.jsonl`. The recording contains whole periods of every wave, and its last row equals its
-first, so that it can be played in a loop without a jump. It knows no files and no objects.
+This module generates the shipped recording `incl.jsonl`. The recording contains whole periods of every wave, and its last row
+equals its first, so that it can be played in a loop without a jump. The module accesses no files and no CANopen objects.
 """
 
 from __future__ import annotations

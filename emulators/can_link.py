@@ -1,8 +1,8 @@
 """Join two CAN buses with faults between them: third-party controllers on the near bus, third-party nodes on the far bus.
 
 A frame from the near bus counts as a request and a frame from the far bus as a reply; the predefined connection set (CiA 301,
-7.3.3) gives the node from the identifier. Frames keep their order, except those that a fault delays. Frames are not
-interpreted.
+7.3.3) gives the node ID from the CAN identifier. Frames keep their order, except those that a fault delays. The data of
+frames is not interpreted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NMT, NO_NODE = 0x000, 0
 class CanLink:
     """A running link, from `start` to `aclose` or until one of the buses is lost; `ended` then holds the reason.
 
-    It closes both ends.
+    `aclose` closes both buses.
     """
 
     def __init__(self, near: CanConnection, far: CanConnection, faults: WireFaults) -> None:
@@ -93,7 +93,7 @@ class CanLink:
             self.passed[way] += 1
 
     def _appear(self, active: Active) -> None:
-        """Schedule the frames that faults send by themselves, in the name of the node that is the target of the fault."""
+        """Schedule the additional frames that faults send, with the identifiers of the node that is the target of the fault."""
         if not isinstance(active.fault, CanFault) or active.aim.unit is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)

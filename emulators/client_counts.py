@@ -1,8 +1,9 @@
 """Counts the requests of each client of an emulated bus, and their replies.
 
-A prototype run compares the requests that its gateway sent with those that its emulators received. A third-party
-program that reads an emulator must not disturb this comparison, so its traffic is counted separately, by the address
-that it connects from. This module knows no protocol.
+A prototype run (the gateway with emulated devices) compares the requests that its gateway
+sent with those that its emulators received. A third-party program that reads an emulator must not disturb this comparison.
+The requests of each client are therefore counted separately, by the address from which the client connects. This module does
+not depend on a protocol.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class ClientCounts:
         return found
 
     def add(self, client: str, requests: int, replies: int) -> None:
-        """Add to the counts of a client."""
+        """Add numbers of requests and replies to the counts of a client."""
         counts = self.of(client)
         counts.requests += requests
         counts.replies += replies
@@ -62,10 +63,10 @@ class ClientCounts:
 
 
 class CountDifference:
-    """Assigns the traffic of a line to its clients, of which only one is connected at a time.
+    """Assigns the traffic of a serial line to its clients, of which only one is connected at a time.
 
-    `totals` returns the requests and replies of all devices on the line so far. Their increase since the last call belongs to
-    the present client.
+    `totals` returns the numbers of requests and replies of all devices on the line so far. The increase since the last call is
+    added to the counts of the present client.
     """
 
     def __init__(self, clients: ClientCounts, totals: Callable[[], tuple[int, int]]) -> None:
@@ -75,12 +76,12 @@ class CountDifference:
         self._client = ""
 
     def change(self, client: str) -> None:
-        """Assign the traffic of the line to `client` from now on; empty for no client."""
+        """Assign the traffic of the line to `client` from now on. An empty name means that no client is connected."""
         self.settle()
         self._client = client
 
     def settle(self) -> None:
-        """Count the traffic since the last call."""
+        """Add the traffic since the last call to the counts of the present client."""
         requests, replies = self._totals()
         if self._client and (requests, replies) != self._last:
             self._clients.add(self._client, requests - self._last[0], replies - self._last[1])

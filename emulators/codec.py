@@ -1,7 +1,7 @@
 """The encoding of an emulated device's values in registers: the emulators' own codec.
 
 It shares no code with the codec of the drivers. A bug in a shared codec would cancel itself out and stay undetected until
-the first real device. Pure; it knows neither tables nor addresses.
+the first real device. This module performs no I/O and does not depend on tables or addresses.
 
 A register is 16 bits, sent high byte first (MODBUS Application Protocol V1.1b3, 4.2). The vendor chooses how several
 registers form one value. `order` names the choice by the positions of the bytes of the big-endian value:

@@ -1,6 +1,7 @@
 """Determine the profile's command for a Modbus request, from the registers that the request reads or writes.
 
-The names are those of the command list (paper.md, ruling 12). Pure; like all emulator code, it has its own decoder.
+The names are those of the command list (docs/explanation/paper.md, ruling 12). This module performs no I/O. Like all emulator
+code, it has its own decoder, which shares nothing with the drivers.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class CommandNames:
             self._writes += [(profile.inbox.ack, "acknowledge"), (profile.outbox.at, "send")]
 
     def of(self, pdu: bytes) -> str:
-        """Return the name of the command. If there are several, return the one with the lowest address; if there is none, ""."""
+        """Return the name of the command in a request PDU: of several, the one with the lowest address; "" if there is none."""
         request = parse_request(pdu)
         if request is None:
             return ""

@@ -1,8 +1,8 @@
-"""The paper's virtual context: a collection of recordings from which an emulator answers (the paper's Emulator).
+"""The virtual context of an emulator: the collection of recordings from which it answers (docs/explanation/paper.md).
 
 The collection is ordered, time-stamped and bounded, and keeps duplicates (rulings 2 and 3): the oldest recording of a command
-is returned first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` uses it with one
-command for each register that a request reads.
+is returned first and removed. This module performs no I/O and does not depend on protocols. `fieldtwin.emulators.replay` uses
+it with one command for each register that a request reads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class EndOfRecording(Enum):
 
     @classmethod
     def parse(cls, text: str) -> EndOfRecording:
-        """Return the policy of that name; raises `UsageError`."""
+        """Return the policy named `text`, as a prototype file writes it; raises `UsageError` for an unknown name."""
         try:
             return cls(text)
         except ValueError:
@@ -60,7 +60,7 @@ list would take as many steps as there are recordings after it.
 
 class _Series:
     """The recordings of one command, the number of recordings that were taken, and the one that was taken last. The list may
-    be shared.
+    be shared with copies of the context.
 
     `whole` says that the series was added as a whole, so nothing is added to it or dropped from it.
     """
@@ -100,7 +100,7 @@ def _own(series: _Series) -> list[Recorded]:
 
 
 class VirtualContext:
-    """The recordings by command. `taken` counts the recordings that were returned, `dropped` those for which there was no room.
+    """The recordings by command. `taken` counts the recordings that were returned, `dropped` those that did not fit.
 
     If `commands` is given, `take` accepts exactly these commands, even those without recordings. Otherwise the list of commands
     is derived from the added recordings (paper.md, ruling 12). A full context drops its oldest entry.
@@ -213,7 +213,7 @@ class VirtualContext:
         return series.last or (series.recorded[series.at] if series.left else None)
 
     def take(self, command: COMMAND) -> RECORDING:
-        """Return and remove a recording of the context; the command must be in the list, as in the paper.
+        """Remove the next recording of `command` from the context and return it.
 
         At the end, `HOLD` returns the last recording again, `LOOP` starts over, and `ERROR` raises `UsedUp`. If nothing was ever
         recorded, all of them raise `UsedUp`. Raises `UnknownCommand` if the command is not in the list.

@@ -1,7 +1,7 @@
 """The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
 
-Such a fault may not name a bus or device as its target; it may name a register if the device has a profile. Value faults need a
-profile.
+Such a fault may not name a bus or device as its target. It may name a register if the device has a profile. Faults that change
+values need a profile.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 
 class DeviceFaults:
-    """The faults of a file, which `check_device` has checked. Their times count from `start_ns`, in the loop's time."""
+    """The faults of a file, which `check_device` has checked. Their times count from `start_ns`, in the event
+    loop's time.
+    """
 
     def __init__(
         self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
@@ -36,7 +38,7 @@ class DeviceFaults:
         self._start_ns = start_ns
 
     def on_wire(self, framing: Framing) -> WireFaults:
-        """Return the faults of one wire of the device."""
+        """Return the faults that act on the bytes of one connection of the device."""
         faults = WireFaults(framing)
         for spec in self._specs:
             if spec.kind.kind is InjectionPoint.BYTES:
@@ -73,7 +75,7 @@ class DeviceFaults:
 
 
 def check_device(spec: FaultSpec, profile: DeviceProfile | None, framings: Iterable[Framing] = ()) -> None:
-    """Raise `WrongAim` for a fault that a single device cannot have, or that changes nothing on any of its connections."""
+    """Raise `WrongAim` for a fault that does not apply to a single device, or that changes nothing on any of its connections."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:

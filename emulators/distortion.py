@@ -20,7 +20,7 @@ class _Put:
 
 @dataclass
 class Distortions:
-    """The value faults of one device. The device calls `apply` with every number before it holds the number."""
+    """The value faults of one device. Before the device stores a number, it passes the number to `apply`."""
 
     _puts: dict[str, _Put] = field(default_factory=dict)
     counts_given: bool = False
@@ -47,7 +47,7 @@ class Distortions:
         )
 
     def apply(self, tag: str, value: float, now_ns: int, *, named: bool = False) -> float:
-        """Return the number that the device holds instead of `value`, in engineering units. `of` describes `named`."""
+        """Return the number that the device stores instead of `value`, in engineering units. `named` as in `of`."""
         for put in self._puts.values():
             if (put.tag != tag and (put.tag != "" or named)) or not in_time(put.active, now_ns):
                 continue
@@ -63,7 +63,7 @@ class Distortions:
     def gave(self, tag: str, now_ns: int, *, named: bool = False) -> None:
         """Count that each fault that distorts `tag` took effect, because the device has sent the value.
 
-        `of` describes `named`.
+        `named` as in `of`.
         """
         for put in self._puts.values():
             aimed = put.tag == tag or (put.tag == "" and not named)

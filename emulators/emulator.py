@@ -1,9 +1,9 @@
-"""The paper's emulators: devices that answer from their virtual context instead of the physical environment.
+"""The emulators of docs/explanation/paper.md: devices that answer from their virtual context, not from a physical environment.
 
 An emulator is a Device and not a Sensor, because the real device is a black box of which only the communication is known. This
 module lies between the frames of a line (fieldtwin.emulators.modbus.rtu.line, mbap) and the processing of a request by a unit
 (fieldtwin.emulators.modbus.unit, fieldtwin.emulators.replay). An emulator reads a command from its own end of a connection,
-checks that its command list contains it, answers from its context and sends the response. It never knows its driver.
+checks that its command list contains it, answers from its context and sends the response. It does not depend on the driver.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 Answer = Callable[[bytes, int], bytes | None]
-"""A function ``(request, now_ns) -> response`` by which a unit answers a request PDU; None for silence."""
+"""A function ``(request, now_ns) -> response`` by which a unit answers a request PDU; None if the unit sends no reply."""
 
 
 class Emulator(Device, ABC):
-    """The paper's Emulator. `virtual_context` is a collection of recordings, empty if a simulation replaces it.
+    """An emulated device (the paper's schema Emulator). `virtual_context` is a collection of recordings, empty if a simulation
+    replaces it.
 
-    Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`); recorded
-    signals are read at the emulator's clock and stay (paper.md, ruling 3).
+    Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`). Recorded
+    signals are read at the time of the emulator's clock and are not removed (docs/explanation/paper.md, ruling 3).
     """
 
     def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized) -> None:
@@ -42,7 +43,7 @@ class Emulator(Device, ABC):
 
 
 class UnitEmulator(Emulator):
-    """The emulator of a Modbus device: messages are request and response PDUs. An empty response is silence."""
+    """The emulator of a Modbus device: messages are request and response PDUs. An empty response means that no reply is sent."""
 
     wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
 
@@ -82,8 +83,9 @@ def emulator_kind(kind: PROTOCOL, profile: DeviceProfile) -> type[UnitEmulator]:
 class EmulatedUnit(ModbusUnit):
     """A unit of an emulated line whose requests pass through the device's own connection.
 
-    `kind` is the connection type of the emulated device, even if a different medium carries it now. A request that is not in the
-    command list gets the protocol's own answer (paper.md, ruling 11), and is counted in `unlisted`.
+    `kind` is the connection type of the real device, even if the emulated connection uses a different medium. A request that is
+    not in the command list gets the answer that the protocol requires (docs/explanation/paper.md, ruling 11), and is counted in
+    `unlisted`.
     """
 
     def __init__(
@@ -113,7 +115,7 @@ class EmulatedUnit(ModbusUnit):
 
 @dataclass(frozen=True)
 class EmulatedCommunication(Communication):
-    """The paper's EmulatedCommunication: the agreement of Communication, with an emulator in place of the device.
+    """A driver and an emulator whose command lists are equal (the paper's schema EmulatedCommunication).
 
     The connection between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and
     is not used here.

@@ -1,6 +1,7 @@
 """The host of emulated devices: serves Modbus units and CANopen nodes on connections, and injects the faults of each bus.
 
-The field simulator of a system and `fieldtwin emulate DEVICE` use it. It must never know profiles, recordings or system files.
+The field simulator of a system and `fieldtwin emulate DEVICE` use it. This module must never depend on profiles, recordings or
+system files.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ MAX_CLIENTS = 32
 
 @dataclass(frozen=True, slots=True)
 class ModbusWire:
-    """The connection on which Modbus units are served.
+    """The connection on which Modbus units (servers with a unit ID) are served.
 
     `listen` is the endpoint to open: ``pty:PATH``, or one of TCP, UDP or TLS. `plant` is the endpoint of the bus in the system
     file; it states the framing and the serial settings. With `pace`, bytes on a pty take as long as on the plant's line; with
@@ -83,7 +84,7 @@ class EmulatorHost:
     async def serve_units(
         self, wire: ModbusWire, units: Mapping[int, ModbusUnit], faults: WireFaults | None = None
     ) -> Endpoint:
-        """Serve `units`, by unit ID, and return the endpoint that is really open.
+        """Serve `units`, by unit ID, and return the endpoint that was opened, with its real port.
 
         Raises `EndpointBusy` or `Unreachable`.
         """
@@ -183,7 +184,7 @@ class EmulatorHost:
     # -- what others see ------------------------------------------------------------------------------------------------
 
     def clients(self) -> dict[str, dict[str, dict[str, int]]]:
-        """Return, by name of the wire and client, the requests that reached a device and their replies.
+        """Return the numbers of requests that reached a device and of their replies: by name of the connection, then by client.
 
         Kernel CAN buses and ptys are not included.
         """
@@ -233,7 +234,7 @@ class EmulatorHost:
 
 
 def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineServer:
-    """Return the units of a serial line, in the framing of the plant's endpoint."""
+    """Return the server for the units of a serial line, in the framing (RTU or ASCII) of the plant's endpoint."""
     return AsciiServer(units) if plant.scheme == "ascii" else RtuServer(units)
 
 

@@ -1,8 +1,8 @@
-"""The values that an emulated device held: every raw value of every tag, in order.
+"""The values that an emulated device held in its registers or objects: every raw value of every tag, in order.
 
-A prototype run is checked against this journal: it must contain every value that the gateway published as good (bytes as the
-device would send them). The journal is bounded: the oldest entries are dropped and counted, so a checker must fetch entries often
-enough.
+A prototype run (the gateway with emulated devices) is checked against this journal: it must contain every value that the
+gateway published as good. A raw value is stored as the bytes that the device would send. The journal is bounded: the oldest
+entries are dropped and counted, so a checker must fetch entries often enough.
 """
 
 from __future__ import annotations

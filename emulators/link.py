@@ -1,12 +1,12 @@
-"""The EmulatedConnection: a serial line carried over TCP, which belongs neither to the device nor to its driver.
+"""A serial line carried over TCP: the emulated connection between a device and its driver, independent of both.
 
 It connects a virtual serial port and a TCP stream (``fieldtwin link PTY tcp://HOST:PORT``), like ``socat
 pty,raw,echo=0,link=PTY tcp:HOST:PORT``, and interoperates with socat on either side. Bytes pass unchanged, in order and
 exactly once while the TCP connection (the carrier) exists. Without it, bytes sent on the line are lost and counted, as
-on a cable that is cut: if a request were kept and delivered later, it would be executed long after its sender gave it
-up.
+on a cable that is cut: if a request were kept and delivered later, it would be executed long after its sender had
+abandoned it.
 
-It must never know a protocol: no frame, no unit, no timeout of a request.
+This module must never depend on a protocol: it does not evaluate frames, unit IDs or the timeouts of requests.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class LinkOptions:
 
 
 class EmulatedConnection(TCPConnection):
-    """The paper's EmulatedConnection: a Connection that is always of type TCP and also stores the original PROTOCOL.
+    """A connection that is always of type TCP and also stores the original PROTOCOL (the paper's schema EmulatedConnection).
 
-    `emulate_write` and `emulate_read` are the identity: they return the bytes unchanged, and count them.
+    `emulate_write` and `emulate_read` return the bytes unchanged, and count them.
     """
 
     def __init__(self, protocol: PROTOCOL) -> None:
@@ -88,7 +88,7 @@ class _Plug(ABC):
         self.connection: ByteConnection | None = None
 
     async def prepare(self) -> None:  # noqa: B027  not abstract: most sides have nothing to prepare
-        """Do what must succeed before the link runs; raises if it fails."""
+        """Open the port or the listener of this side, before the link runs; raises `FieldtwinError` if that fails."""
 
     @abstractmethod
     async def connect(self) -> ByteConnection:
@@ -183,7 +183,7 @@ class EmulatedLink:
     """A running emulated connection between `near` and `far`.
 
     ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP,
-    unless there are `faults`: then two serial ports of this computer are permitted, with the clients at the near one.
+    unless there are `faults`: then two serial ports of this computer are permitted, with the Modbus client at the near one.
     `on_event` is called with a line for the user when the carrier connects, disconnects, or cannot be reached.
     """
 
@@ -219,7 +219,7 @@ class EmulatedLink:
         return self._near.endpoint, self._far.endpoint
 
     async def open(self) -> None:
-        """Create the virtual serial port and the listener that this link has; raises if that fails."""
+        """Create the virtual serial port and the listener, as far as the endpoints need them; raises if that fails."""
         try:
             await self._near.prepare()
             await self._far.prepare()
@@ -346,7 +346,7 @@ class EmulatedLink:
                     self._dropped(outward, len(data))
 
     def _patience_s(self, target: ByteConnection, nbytes: int) -> float | None:
-        """Return the time limit for a write: none for TCP, which holds back its sender; a serial line does not wait."""
+        """Return the time limit in seconds for a write; None for TCP, whose flow control holds the sender back."""
         if isinstance(target, FaultyEnd):
             target = target.inner
         if isinstance(target, TcpEnd):

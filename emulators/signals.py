@@ -1,8 +1,8 @@
 """Signals over time, such as a recorded cast or trajectory, read at the time of the emulator's clock.
 
 A `SignalTrack` is the recording in memory (arrays of doubles: 65,158 rows of three signals take 2 MB); a `SignalPlayer`
-plays it from a start time, at a speed, and handles its end. Both are pure: the caller passes the time, and neither
-knows the register or object of a signal.
+plays it from a start time, at a speed, and handles its end. The caller passes the time to both, and neither depends
+on the register or object that holds a signal.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class SignalTrack:
         return sum(numbers.buffer_info()[1] * numbers.itemsize for numbers in (self._times, *self._columns))
 
     def at(self, t_s: float, name: str) -> float:
-        """Return the signal `name` at `t_s`. Before the first row it has the first value, after the last row the last value."""
+        """Return the value of `name` at `t_s` (s): the first value before the first row, the last value after the last row."""
         return self._interpolate(self._columns[self._column(name)], *self._locate(t_s))
 
     def nearest_s(self, values: Mapping[str, float]) -> float | None:
@@ -138,11 +138,11 @@ class Signals(Protocol):
     def __len__(self) -> int: ...
 
     def position_s(self, now_ns: int) -> float:
-        """Return the position of `now_ns`, in the signals' own seconds."""
+        """Return the position of `now_ns` in the recording or simulation, in seconds since its start."""
         ...
 
     def values(self, now_ns: int) -> dict[str, float]:
-        """Return all signals now, of one instant."""
+        """Return the present values of all signals, all taken at the same time."""
         ...
 
     def values_at(self, position_s: float) -> dict[str, float]:
@@ -200,7 +200,7 @@ class SignalPlayer(Signals):
         return self.track.at(self.position_s(now_ns), name)
 
     def values(self, now_ns: int) -> dict[str, float]:
-        """Return all signals now, of one instant."""
+        """Return the present values of all signals, all taken at the same time."""
         return self.track.values(self.position_s(now_ns))
 
     def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:

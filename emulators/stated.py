@@ -3,7 +3,7 @@
 These are the cells (registers and bits) and the encoding of values in them, the effects of reads and writes, and the answers of
 functions without registers.
 
-Pure; like all emulator code, it has its own encoder. It knows neither banks nor recordings.
+This module performs no I/O and does not depend on banks or recordings. Like all emulator code, it has its own encoder.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Peek = Callable[[Table, int], int]
 
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
-    """Return the contents of the cells that encode an engineering value. A value out of range becomes the limit.
+    """Return the contents of the cells that encode an engineering value. A value out of range is limited to the range.
 
     `exponent` is the value of the tag's scale-factor register. For a tag that is part of a register, the other bits of
     that register are 0.
@@ -60,7 +60,7 @@ def fits(tag: Tag, value: float | str, exponent: int = 0) -> bool:
 
 
 def merged(tag: Tag, own: int, content: int) -> int:
-    """Return the register `own` with the bits of `tag` from `content`."""
+    """Return the register value `own`, in which the bits of `tag` are replaced by those of `content`."""
     if tag.bits is None:
         return content
     low, high = tag.bits
@@ -79,7 +79,7 @@ def raw_of(tag: Tag, cells: Sequence[int]) -> float:
 
 
 def cells_held(tag: Tag, peek: Peek) -> list[int]:
-    """Return the values of all cells of `tag`."""
+    """Return the values of all cells of `tag`, each read with `peek`."""
     at = tag.registers
     return [peek(at.table, address) for address in range(at.address, at.end)]
 
@@ -125,7 +125,7 @@ def parts_of(profile: DeviceProfile) -> UnitParts:
 
 
 class Effects:
-    """A profile's `effects`. `of` returns new values of tags: (tag, engineering value), in the profile's order."""
+    """A profile's `effects`: the values that tags get when a client reads or writes certain cells."""
 
     def __init__(self, effects: Iterable[Effect]) -> None:
         self._on_read = [e for e in effects if e.on_read]
@@ -135,7 +135,8 @@ class Effects:
         return bool(self._on_read or self._on_write)
 
     def of(self, table: Table, addresses: range, written: Sequence[int] | None) -> list[tuple[Tag, float]]:
-        """Return the effects of a request that reads (`written` is None) or writes cells.
+        """Return the effects of a request that reads (`written` is None) or writes cells: the new values of tags, in the
+        profile's order, as (tag, engineering value).
 
         Any cell of a tag triggers its effect. If the effect is bound to one value, that value must have been written as
         a whole.
@@ -151,7 +152,7 @@ class Effects:
 
 
 def touches(tag: Tag, table: Table, addresses: range) -> bool:
-    """Return whether any cell of `tag` is among these."""
+    """Return whether any cell of `tag` is among `addresses` of `table`."""
     at = tag.registers
     return at.table == table and at.address < addresses.stop and addresses.start < at.end
 

@@ -1,7 +1,7 @@
-"""Modbus ASCII, server side: ``:``, unit ID and PDU in hexadecimal, LRC, CR LF (SL 2.5.2). Pure.
+"""Modbus ASCII, server side: ``:``, unit ID and PDU in hexadecimal, LRC, CR LF (SL 2.5.2). No I/O.
 
-A colon always begins a frame, so a second colon restarts the frame (row MB-070). A pause of more than one second inside
-a frame ends it. Function 08/03 can replace LF with a different character (AP 6.8).
+A colon always begins a frame, so a second colon restarts the frame (conformance case MB-070). A pause of more than one second
+inside a frame ends it. Function 08/03 can replace LF with a different character (AP 6.8).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class AsciiReceiver:
 
 
 class AsciiServer(LineServer):
-    """The units of one ASCII line.
+    """The server for the units of one ASCII line.
 
     `units` maps a unit ID (1 to 247) to its unit; `gap_ns` is the longest pause in a frame.
     """

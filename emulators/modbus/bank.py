@@ -1,6 +1,6 @@
 """The data behind a Modbus unit: four tables of cells, and the errors with which a unit can refuse a request.
 
-A bank knows addresses and integers. It never knows function codes, frames or engineering units.
+A bank handles addresses and integers. It does not depend on function codes, frames or engineering units.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class CellHooks:
 _NO_HOOKS = CellHooks()
 
 MAX_PLANS = 1024
-"""The number of different reads for which a bank keeps a plan."""
+"""The number of different reads (table, address, count) for which a bank keeps a prepared `_Plan`."""
 
 
 class _Plan(NamedTuple):
@@ -229,7 +229,7 @@ class MapBank(RegisterBank):
                 hooks.written(value, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """Return the value of a cell from the device's side, also of a cell that a client may not read.
+        """Return the value of a cell for the device itself, even if a client may not read the cell.
 
         Raises `NoSuchAddress` if it does not exist.
         """
@@ -240,7 +240,7 @@ class MapBank(RegisterBank):
             raise NoSuchAddress("not a readable cell", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
-        """Set cells from the device's side, also read-only cells. Raises `NoSuchAddress` or `IllegalValue`."""
+        """Set cells for the device itself, even cells that a client may only read. Raises `NoSuchAddress` or `IllegalValue`."""
         limit = 1 if table in BIT_TABLES else 0xFFFF
         for value in values:
             if not 0 <= value <= limit:

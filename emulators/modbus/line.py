@@ -1,7 +1,8 @@
 """Several units on one serial line (MODBUS over Serial Line V1.02, SL below), for every frame format.
 
-Pure. A unit answers requests addressed to it, executes broadcasts (unit ID 0), and ignores everything else: the traffic
-of other units, damaged frames, noise. Pacing and waiting happen elsewhere; a subclass cuts and builds the frames.
+A unit answers requests addressed to it, executes broadcasts (unit ID 0), and ignores everything else: the traffic of other
+units, damaged frames, noise. This module performs no I/O and never waits; the caller delays replies. A subclass separates and
+builds the frames.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Receiver(Protocol):
 
 
 class LineServer(ABC):
-    """The units of one line. `units` maps a unit ID (1 to 247) to its unit."""
+    """The server for the units of one line. `units` maps a unit ID (1 to 247) to its unit."""
 
     check_bytes: int
     """The number of checksum bytes at the end of a received frame."""
@@ -95,7 +96,7 @@ class LineServer(ABC):
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
     def receive(self, data: bytes, now_ns: int) -> list[ServedFrame]:
-        """Handle received bytes as `feed` does, and return every received frame with its reply, for taps and journals."""
+        """Handle received bytes as `feed` does, and return every received frame with its reply, for sniffers and journals."""
         errors_before = self._receiver.crc_errors
         frames = self._receiver.feed(data, now_ns)
         errors = self._receiver.crc_errors - errors_before
@@ -109,7 +110,7 @@ class LineServer(ABC):
         """Return `frame` (unit ID and PDU) as it is sent on the line."""
 
     def as_heard(self, frame: bytes) -> bytes:
-        """Return a received frame with its delimiters, as it was sent on the line."""
+        """Return a received frame with its delimiters, exactly as it was on the line."""
         return frame
 
     def _exchange(self, frame: bytes, now_ns: int) -> ServedFrame:

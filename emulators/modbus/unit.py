@@ -1,7 +1,8 @@
 """One Modbus unit: it takes request PDUs and returns response PDUs (MODBUS Application Protocol V1.1b3, AP below).
 
-Pure. It never knows unit IDs, checksums, transaction IDs or the transport; the bank knows what the registers mean. Each
-function has its own module; this module selects, refuses, counts and logs them.
+This module performs no I/O and does not depend on unit IDs, checksums, transaction IDs or the transport. The bank defines the
+meaning of the registers. Each function has its own module; this module selects the function, refuses invalid requests, and
+counts and logs all requests.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ MAX_SERVER_DATA = 249
 """The number of bytes of the server ID, and of the data after the run indicator, that fit a reply to 11h together."""
 
 Handler = Callable[[bytes, int], bytes | None]
-"""A function that is called with the request PDU and now_ns, and returns the response PDU, or None for silence. It may raise a
-`Refusal` if it has changed nothing.
+"""A function that is called with the request PDU and now_ns, and returns the response PDU, or None if no response is sent. It may
+raise a `Refusal` if it has changed nothing.
 """
 
 
 class UnitParts(TypedDict, total=False):
-    """The optional parts of a unit besides registers, as keyword arguments of `ModbusUnit`."""
+    """The optional parts of a unit in addition to its registers, as keyword arguments of `ModbusUnit`."""
 
     server_id: bytes | None
     server_data: bytes
@@ -57,9 +58,9 @@ class ModbusUnit:
     Without `server_id` (function 11h; `server_data` follows its run indicator), `identification` (2Bh), `files` (14h,
     15h) or `fifos` (18h) the unit lacks that function. Without `limits` it has all other functions.
 
-    Use `respond` for a request to the unit, and `execute_broadcast` for a request to unit 0 of a serial line. Both
-    increase `counters`; the line reports its other traffic with `heard`. `latency_s` is the processing time of the last
-    answer. `running` is the run indicator of 11h.
+    Use `respond` for a request to the unit, and `execute_broadcast` for a request to unit 0 of a serial line. Both increase
+    `counters`; the server of the line reports the traffic of other units with `heard`. `latency_s` is the processing time of the
+    last answer. `running` is the run indicator of 11h.
     """
 
     def __init__(
@@ -87,8 +88,8 @@ class ModbusUnit:
         self.latency_s = 0.0
         self.running = True
         self.request_lengths: dict[int, int] = {}
-        """Request PDU lengths of device-specific functions, which tell a line where a request ends; otherwise its
-        checksum does.
+        """Lengths in bytes of the request PDUs of device-specific functions, by function code. A serial line uses them to find
+        the end of a request; without a length it uses the checksum.
         """
         self._server_id = server_id
         self._server_data = server_data
@@ -129,7 +130,7 @@ class ModbusUnit:
         """Answer `function` (1 to 127) with `handler` from now on. It may replace a standard function.
 
         `broadcast`: the function is also executed when it is sent to unit 0 of a serial line. `request_length`: bytes
-        of its request PDU, if they are always the same; those of standard functions are known.
+        of its request PDU, if their number is constant; the lengths of standard functions are known.
         """
         if not 1 <= function <= 0x7F:
             raise UsageError("function code", expected="1 to 127", got=str(function))

@@ -1,4 +1,4 @@
-"""A candump log as a node's recording: its path, its speed and its end. The file is read when frames are requested."""
+"""A candump log that a CANopen node replays, with the replay speed and the policy at its end. `frames` reads the file."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 A recording of a day contains the same few reads a million times. An `OutcomeColumn` holds the replies to one of these reads in
 one situation (`replay.situation`), as consecutive bytes. `Outcomes` presents a column as a sequence for a virtual context.
 `CellValues` presents the values of one cell from all columns that contain it, in recorded order. A recording therefore needs only
-its bytes in memory, and is usable as soon as it has been read. Pure.
+its bytes in memory, and is usable as soon as it has been read. This module performs no I/O.
 """
 
 from __future__ import annotations

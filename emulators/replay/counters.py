@@ -4,7 +4,7 @@ counter never decreases.
 Registers of a counter that come from different moments form a number that never existed. A counter's registers therefore advance
 together: a read gets the present value, and the counter advances to the next value only when a read contains a register that was
 already read. So reading the counter as a whole or in parts gives the same numbers. Earlier writes do not affect a counter, and at
-the end of its recording it keeps its value under every policy (paper.md, ruling 3).
+the end of its recording it keeps its value under every policy (docs/explanation/paper.md, ruling 3).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class RecordingCounters:
         return (unit, cell) in self._by_cell
 
     def learn(self, unit: int, cell: Cell, value: int, t_s: float) -> bool:
-        """Learn a recorded register. Return whether it belongs to a counter."""
+        """Learn the recorded value of a register. Return whether the register belongs to a counter."""
         found = self._by_cell.get((unit, cell))
         if found is None:
             return False

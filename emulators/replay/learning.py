@@ -1,7 +1,8 @@
 """Learn the behaviour of units from a recording: values that were read, writes and their effects, refusals, limits, latency.
 
-A `Learner` processes the exchanges once. The result is a virtual context whose commands are cells and shapes of requests, and a
-`LearntUnit` for each unit; `replay` answers from them. Pure.
+A `Learner` processes the exchanges once. The result is a virtual context and a `LearntUnit` for each unit, from which `replay`
+answers. The commands of the context are cells (single bits or registers) and shapes (function, address and count of a request).
+This module performs no I/O.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _SHAPE_CODE = 0xFF
 CELL_KEY = 4
 """The number of bytes of a cell's key. The key of a shape is longer, or has a different second byte."""
 MAX_BYTES = 512_000_000
-"""Memory limit for the replies to recorded reads; beyond it the older half is dropped and counted."""
+"""Memory limit in bytes for the replies to recorded reads. If it is exceeded, the older half is dropped and counted."""
 
 
 @dataclass(slots=True)

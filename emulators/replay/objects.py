@@ -1,10 +1,10 @@
 """Replays a recorded CANopen node: its object dictionary and its PDO stream, from a log of the bus.
 
-Values are resolved object by object (paper.md, ruling 3), so the next client may read in a different order. Uploaded values are
-returned in recorded order, one value for each upload of the object. Values that were sent in TPDOs are signals, read at the time
-of the emulator's clock, also by SDO. Values that the recorded client wrote are settings: the node starts with the first recorded
-value and then holds what is written. An object that was only ever refused with an abort is refused again. Block transfers are not
-evaluated. Pure; it knows no files.
+Values are resolved object by object (docs/explanation/paper.md, ruling 3), so the next client may read in a different order.
+Uploaded values are returned in recorded order, one value for each upload of the object. Values that were sent in TPDOs are
+signals: TPDOs and SDO uploads return the value at the time of the emulator's clock. Values that the recorded client wrote are
+settings: the node starts with the first recorded value and then holds what is written. An object that was only ever refused with
+an abort is refused again. Block transfers are not evaluated. `CanLog` reads the log file.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> Recor
 
 
 class RecordedObjects:
-    """A node's value source. `initial` are the values at the start (for `NodeContext.factory`), `refusals` are the
-    objects that it aborts (for `NodeContext.refusals`).
+    """The recorded object values of a node. `initial` are the values at the start (for `NodeContext.factory`), `refusals` are the
+    objects whose transfers the node aborts (for `NodeContext.refusals`).
 
     Time begins with the first call and runs `speed` times as fast as recorded. After the end of the log `when_used_up` determines
     whether signals hold their value, start again, or raise `UsedUp`; the same applies to each object whose uploaded values are
@@ -121,7 +121,7 @@ class RecordedObjects:
         return {key: self._values[key][max(bisect_right(times, at_s) - 1, 0)] for key, times in self._times.items()}
 
     def answer(self, key: Key, now_ns: int) -> bytes | None:
-        """Return the next uploaded value of an object; None for an object that was sent, written, or never uploaded."""
+        """Return the next uploaded value of an object; None if it was sent in a TPDO, written, or never uploaded."""
         answers = self._answers.get(key)
         if answers is None:
             return None

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, OwnFunction
 
 
 def add_own_functions(unit: ReplayUnit, profile: DeviceProfile) -> None:
-    """Let `unit` answer every function of `profile.own_functions`."""
+    """Make `unit` answer every function of `profile.own_functions`."""
     for function in profile.own_functions.values():
         unit.register(function.code, _handler(unit, function), request_length=1 + len(function.request))
 

@@ -3,8 +3,8 @@
 Recorded answers come first. For other requests the profile states the functions, the registers per request, whether
 half values are refused, what can be written and what cannot be read, and the answers of functions without registers. A
 write that it permits is accepted and can be read back. Effects are those of the profile. The diagnostics (08, 0B, 0C)
-that it names are computed by the unit, because a recorded answer would count a different line. Pure; it has its own
-decoder.
+that it names are computed by the unit, because a recorded answer would contain the counts of a different line. This module
+performs no I/O, and has its own decoder.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 
 _CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
 _COUNTING = frozenset({0x08, 0x0B, 0x0C})
-"""Functions that report on the present line. A recorded answer would report on a different one."""
+"""Functions that report counters of the serial line. A recorded answer would report those of the line of the recording."""
 
 
 class ProfiledReplay(ReplayUnit):

@@ -1,11 +1,13 @@
-"""Replays a recorded Modbus device: paper.md, ruling 3.
+"""Replays a recorded Modbus device (docs/explanation/paper.md, ruling 3).
 
-Values are resolved cell by cell (unit, table, address, earlier writes), so a client that splits or merges the recorded
-ranges gets the same numbers. Properties of a whole request (an exception, a limit, silence, latency) are kept by the
-request's shape. All answers come in recorded order from one `VirtualContext`, whose commands are the cells and shapes.
+Values are resolved cell by cell (unit, table, address, earlier writes), so a client that splits or merges the recorded ranges
+gets the same numbers. Properties of a whole request (an exception, a limit, a missing reply, latency) are kept by the request's
+shape: its function, address and count. All answers come in recorded order from one `VirtualContext`, whose commands are the cells
+and shapes.
 
 The registers of one value stay together if they were always recorded together, which is how clients read; those of a
-counter always stay together (`counters`). Pure: request PDUs in, response PDUs out. It knows neither lines nor clocks.
+counter always stay together (`counters`). Only `load` performs I/O, and no clock is read: requests and responses are
+PDUs.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ class NeverRecorded(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ReplayedReply:
-    """The device's reply, None for silence, and its latency in the recording."""
+    """The device's reply, None if it sent none, and the recorded latency in seconds."""
 
     reply: bytes | None
     latency_s: float = 0.0
@@ -135,7 +137,7 @@ class ExchangeReplay:
             return self._counted(pdu, ReplayedReply(requests.exception(pdu, requests.DEVICE_FAILURE)))
 
     def broadcast(self, pdu: bytes, unit_id: int | None = None) -> None:
-        """Process a broadcast for `unit_id`, or for all units: writes have their effect, and no unit answers."""
+        """Execute a broadcast on the unit `unit_id`, or on all units if it is None: writes take effect, and no unit answers."""
         request = requests.parse_request(pdu)
         if request is not None and request.values is not None:
             for number, unit in self._units.items():
@@ -169,7 +171,7 @@ class ExchangeReplay:
         return self._knows(unit_id, self._units[unit_id], (table, address))
 
     def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
-        """Set cells from the device's side, counters included: they keep the values until they are written or put again."""
+        """Set cells for the device itself, also those of counters. They keep these values until they are written or put again."""
         self._units[unit_id].put.update({(table, address + i): value for i, value in enumerate(values)})
 
     def _counted(self, pdu: bytes, answer: ReplayedReply) -> ReplayedReply:
@@ -243,7 +245,8 @@ class ExchangeReplay:
     def _outcome(self, unit: LearntUnit, shape: bytes) -> Recorded | None:
         """Return the outcome of a request of this shape, in recorded order; None if none was recorded.
 
-        Silence is an event and not a state: when the recordings are used up, `HOLD` repeats the last answer that was not silence.
+        When the recordings are used up, `HOLD` repeats the last reply. A missing reply, which was a
+        single event, is not repeated.
         """
         situations = unit.recorded_in.get(shape)
         if situations is None:
@@ -274,7 +277,7 @@ class ExchangeReplay:
         return all(self._knows(unit_id, unit, (request.table, address)) for address in request.addresses)
 
     def _value(self, unit_id: int, unit: LearntUnit, cell: Cell) -> int:
-        """Return the value of one cell: that of its counter, the value recorded after the same writes, or the written value."""
+        """Return the value of one cell: its counter's value, the value recorded after the same writes, or the written value."""
         if cell in unit.put:
             return unit.put[cell]
         if self.never_recorded is NeverRecorded.INTERPOLATE and not self._knows(unit_id, unit, cell):
@@ -326,7 +329,7 @@ class ExchangeReplay:
         return low + round((high - low) * (address - below) / (above - below))
 
     def _now(self, unit_id: int, unit: LearntUnit, cell: Cell) -> int:
-        """Return the last value read of a recorded cell, or its first value; the recording does not advance."""
+        """Return the value of a recorded cell that was read last, else its first value. The recording does not advance."""
         if cell in unit.put:
             return unit.put[cell]
         key, written = cell_key(unit_id, cell), unit.situations.written(cell)

@@ -1,8 +1,8 @@
 """Splits recorded Modbus PDUs into cells, and builds replies from cells.
 
 A cell is one bit or register, given by table and address. Functions 01 to 06, 0F and 10h are processed cell by cell (MODBUS
-Application Protocol V1.1b3, 6.1 to 6.12). All other requests are opaque: they are answered as a whole or not at all. Pure, and
-independent of the server's decoder in fieldtwin.emulators.modbus and of the client's decoder.
+Application Protocol V1.1b3, 6.1 to 6.12). All other requests are opaque: they are answered as a whole or not at all. This module
+performs no I/O, and is independent of the server's decoder in fieldtwin.emulators.modbus and of the client's decoder.
 """
 
 from __future__ import annotations

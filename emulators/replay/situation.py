@@ -1,8 +1,8 @@
-"""The situation of a device: its past writes, on which its recorded answers depend (paper.md, ruling 3).
+"""The situation of a device: its past writes, on which its recorded answers depend (docs/explanation/paper.md, ruling 3).
 
 A situation is the last value written to each cell of one unit since the recording began. Each situation has a number.
 Recordings are kept by situation. A read uses the present situation or, if nothing was recorded in it, the most similar
-recorded one. Pure bookkeeping; it knows no protocol.
+recorded one. This module performs no I/O and does not depend on a protocol.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Situations:
         return len(self._known) - 1 if self.now is None else self.now
 
     def rewind(self) -> None:
-        """Return to the initial state without writes; keep what is known, and stop learning."""
+        """Return to the initial state without writes. The learned situations are kept; no further ones are learned."""
         self._learning = False
         self._state = {}
         self.now = 0

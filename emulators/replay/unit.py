@@ -1,7 +1,7 @@
-"""A recorded unit on an emulated line: a replay in the form of a Modbus unit.
+"""A Modbus unit of an emulated line that answers from a recording.
 
-It replaces a unit that computes its answers, with the same counters and calls. Registered functions, and exception 06
-while it is busy, take precedence over the recording. `latency_s` is the recorded latency of the last answer, which the
+It has the same counters and methods as a unit that computes its answers. Functions added with `register`, and exception 06
+while the unit is busy, take precedence over the recording. `latency_s` is the recorded latency of the last answer, which the
 sender of the reply may use as a delay.
 """
 
@@ -46,7 +46,10 @@ class ReplayUnit(ModbusUnit):
         self._registered.add(function)
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
-        """Return the recorded answer, None for silence. Exchanges are ordered by sequence, not by time."""
+        """Return the response PDU, usually the next recorded one; None if the unit sends no response.
+
+        Recorded responses are selected by their order, not by `now_ns`.
+        """
         busy = now_ns < self._busy_until_ns
         if pdu and (self.computes(pdu) or (busy and pdu[0] not in WHILE_BUSY) or self.diagnostics.listen_only):
             self.latency_s = 0.0
@@ -77,11 +80,11 @@ class ReplayUnit(ModbusUnit):
         return pdu[0] in self._registered
 
     def recall(self, pdu: bytes) -> ReplayedReply:
-        """Return the answer of the recorded unit."""
+        """Return the next answer of the recorded unit to `pdu`."""
         return self.replay.respond(self.unit_id, pdu)
 
     def execute_broadcast(self, pdu: bytes, now_ns: int) -> None:
-        """Execute a write to all units on this unit."""
+        """Execute a broadcast write on this unit."""
         self.counters.broadcasts += 1
         self.counters.unanswered += 1
         self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, broadcast=True)

@@ -1,1 +1,3 @@
-"""A simulation as virtual context: values from formulas or a Python model, in steps of the emulator's clock."""
+"""Simulated values for emulated devices, instead of recordings: from formulas or a Python model, in steps of the emulator's
+clock.
+"""

@@ -1,7 +1,7 @@
 """Formulas of a simulation: ``speed + (demand - speed) * dt / 0.8``, ``sine(11.5, 0.4, 600) + noise(0.01)``.
 
-`fieldtwin.gateway.core.expressions` is their grammar. They are converted to functions of named values. All values are floats;
-a comparison gives 1.0 or 0.0. Times are in seconds. A result that cannot be computed (a division by zero, the root of a
+`fieldtwin.gateway.core.expressions` defines the grammar. A formula is converted to a function of named values. All values are
+floats; a comparison gives 1.0 or 0.0. Times are in seconds. A result that cannot be computed (a division by zero, the root of a
 negative number) is NaN, which means "no value".
 """
 

@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 class Model(Protocol):
-    """The interface of a simulation class."""
+    """The interface of a user's simulation class."""
 
     def step(self, t_s: float, dt_s: float, inputs: Mapping[str, float]) -> Mapping[str, float]:
         """Return the values at `t_s`, `dt_s` after the previous step; at the first step `dt_s` is 0."""

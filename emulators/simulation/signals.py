@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 class SimulatedSignals(Signals):
     """The simulated signals of a device. `plays` maps each signal to a name in the simulation.
 
-    Other signals do not exist. `path` is used in messages.
+    Other signals do not exist. `path` is the file that error messages name.
     """
 
     def __init__(self, simulation: Simulation, plays: Mapping[str, str], path: str) -> None:

@@ -1,7 +1,8 @@
 """A simulation: named values that change in fixed steps of the emulator's clock, and inputs that were written to devices.
 
-A function of time and of the times of writes: nothing here waits. Steps that are due are taken at the next access, each
-with the inputs that were valid at its own time. The same run therefore gives the same values, in virtual time too.
+The values depend only on the time and on the times of writes; nothing in this module waits. Steps that are due are computed at
+the next access, each with the inputs that were valid at its own time. The same run therefore gives the same values, also in
+virtual time.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Simulation:
         self._t_s = 0.0
 
     def put(self, name: str, value: float, now_ns: int) -> None:
-        """Set an input to `value` from now on; earlier steps are computed with its earlier value."""
+        """Set the input `name` to `value` from `now_ns` on. Steps that were due before are computed with the earlier value."""
         if name not in self._inputs:
             raise UsageError(f"no input {name!r}", expected=", ".join(sorted(self._inputs)))
         self._advance(now_ns - 1)
@@ -110,7 +111,7 @@ def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, dict[str,
     """Return a step of a Python model, and NaN as the initial value of each of its names.
 
     The names are those of a step of length 0 at time 0, taken here with all inputs 0. The step raises `FileInvalid` if
-    it returns different names, because a device that plays one of them would have no value.
+    it returns different names, because a device that uses a missing name would have no value.
     """
     names = tuple(model.step(0.0, 0.0, dict.fromkeys(inputs, 0.0)))
     for name in names:

@@ -1,1 +1,1 @@
-"""Virtual time: an event loop that jumps to its next timer, its clock, and a lock on the computer's clocks."""
+"""Virtual time: an event loop that jumps to its next timer, its clock, and guards that prevent the use of real clocks."""

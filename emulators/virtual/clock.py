@@ -1,4 +1,4 @@
-"""The clock of a virtual loop (`fieldtwin.gateway.core.clock.Clock`)."""
+"""The clock of a virtual loop; it implements `fieldtwin.gateway.core.clock.Clock`."""
 
 from __future__ import annotations
 

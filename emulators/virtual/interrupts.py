@@ -1,8 +1,8 @@
 """Deliver signals between two callbacks of a virtual loop, and never during a callback.
 
-A signal handler raises its exception in the line that happens to run. If that line was to wake a task, the task is never woken
-and can no longer be ended in order. SIGINT and SIGTERM therefore wait until the callback is over, but at most `PATIENCE_S` of
-computing time. A second signal does not wait, because the callback may never end.
+The exception of a signal handler is raised in the line that is being executed. If that line was to wake a task, the task is never
+woken and can no longer be ended in order. SIGINT and SIGTERM therefore wait until the callback is over, but at most `PATIENCE_S`
+of computing time. A second signal does not wait, because the callback may never end.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from typing import Any, Self
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 PATIENCE_S = 1.0
-"""The processor time in seconds that a callback may still take after a signal came. An endless loop takes more."""
+"""The processor time in seconds that a callback may still take after a signal has arrived. After that the signal is
+delivered, because the callback may be an endless loop.
+"""
 
 Handler = Callable[[int, FrameType | None], object]
 

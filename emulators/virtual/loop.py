@@ -1,7 +1,7 @@
 """An event loop with simulated time: it does not wait, but advances its time to the next timer.
 
-The unmodified gateway, PLC and emulators run on it. Every operation that would leave it (a socket, a thread, a process,
-a signal) raises `Escape` with the place of the call, because a run that depends on the outside could not be repeated.
+The unmodified gateway, PLC and emulators run on it. Every operation that needs the operating system (a socket, a thread, a
+process, a signal) raises `Escape` with the place of the call, because a run that depends on it could not be repeated.
 Callbacks of one instant run in the order in which they were scheduled, timers by (when, sequence); no set of tasks is
 ever iterated.
 """
@@ -161,7 +161,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     """A function that returns False without a call of Python code, because each new future and handle calls it."""
 
     def set_debug(self, enabled: bool) -> None:
-        """Do nothing: asyncio's debug mode measures with the wall clock."""
+        """Do nothing: debug mode is not supported, because asyncio's debug mode measures with the wall clock."""
 
     # -- running ------------------------------------------------------------------------------------------------------
 
@@ -181,7 +181,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.stop()
 
     def run_forever(self) -> None:
-        """Run until `stop`. Raises `Deadlock` if nothing can happen any more."""
+        """Run until `stop` is called. Raises `Deadlock` if no callback is ready and no timer is set."""
         if self._running or events._get_running_loop() is not None:
             raise Bug("a virtual loop inside another loop")
         self._running = True
@@ -246,7 +246,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._stopping = self._stopped = True
 
     def _pause(self) -> None:
-        """Stop after this callback, to deliver a signal."""
+        """Stop after the current callback, so that a signal can be delivered."""
         self._stopping = True
 
     def is_running(self) -> bool:
@@ -380,7 +380,7 @@ def _is_plumbing(frame: FrameType) -> bool:
 
 
 def escape(what: str) -> Escape:
-    """Return the error for a use of `what`, with the place of the call."""
+    """Return the error for the use of `what` (a socket, a thread, a clock...) in virtual time, with the place of the call."""
     return Escape(
         f"{what} under virtual time", where=culprit(), hint="time and wires come from the clock and the connector"
     )

@@ -1,6 +1,6 @@
 """A callback that a virtual loop will call, as a struct that is created without a Python call.
 
-It knows neither the loop nor its time.
+It does not depend on the loop or its time.
 """
 
 from __future__ import annotations

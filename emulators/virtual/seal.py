@@ -2,8 +2,8 @@
 
 The loop itself refuses asyncio's operations; this module covers the operations that bypass the loop. Clocks are
 attributes of ``time`` and ``datetime``, which are replaced, also in modules that imported them by name
-(`taken_clocks`). The rest is detected by audit events of the interpreter (PEP 578), which cannot be evaded. Only the
-sealed thread is checked.
+(`taken_clocks`). The rest is detected by audit events of the interpreter (PEP 578), which cannot be evaded. Only
+threads inside `sealed` are checked.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NOW_BY_DEFAULT = {"localtime": 1, "gmtime": 1, "ctime": 1, "asctime": 1, "strft
 given.
 """
 _LOGGING = "logging"
-"""A log record is stamped with the wall clock; nothing in a run depends on it."""
+"""The module that may read clocks: it stamps log records with the wall clock, and nothing in a run depends on these times."""
 _EVENTS = {
     "socket.__new__": "a socket",
     "socket.connect": "a connection",
@@ -88,7 +88,11 @@ def _unstartable(real: Callable[[threading.Thread], None]) -> Callable[[threadin
 
 @contextmanager
 def sealed() -> Iterator[None]:
-    """Seal this thread until the end of the context: any escape raises `Escape`. May not be nested."""
+    """Make any use of a real clock, sleep, socket, thread or process raise `Escape`, in this thread, until the end of the
+    context.
+
+    Contexts may not be nested.
+    """
     global _hooked
     if not _hooked:  # an audit hook cannot be removed: it stays and checks a set
         sys.addaudithook(_audit)

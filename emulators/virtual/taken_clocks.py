@@ -21,7 +21,7 @@ _newest: list[tuple[int, str]] = [(0, "")]
 _seen: dict[str, int] = {}
 """Modules that were searched, with the identity of their globals, because a reloaded module must be searched again."""
 _taken: dict[str, tuple[str, ...]] = {}
-"""The modules that imported a clock: the names in them."""
+"""By module that imported a clock: the names under which the module has it."""
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def replaced(guards: Guards) -> Iterator[None]:
 
 
 def _look_through(guards: Guards) -> None:
-    """Search new modules. Runs are sealed many times per second, so nothing is done while no module was loaded."""
+    """Search new modules for clocks. It runs many times per second, so it does nothing if no module was loaded since then."""
     newest = (len(sys.modules), next(reversed(sys.modules)))
     if newest == _newest[0]:
         return

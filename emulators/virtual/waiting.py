@@ -1,6 +1,6 @@
 """Describe where a task waits and for what, for the message of a deadlock.
 
-It knows nothing about the tasks themselves.
+It does not depend on what the tasks do.
 """
 
 from __future__ import annotations

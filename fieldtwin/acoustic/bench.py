@@ -1,7 +1,8 @@
 """A scenario's bench for several running systems and the acoustic channel between them. Names are ``SYSTEM.DEVICE.TAG``.
 
-Each system has its own bench, which does not know the other systems; this bench passes each query on by name and merges
-their events into one trace. The code that creates this bench also starts and stops the systems.
+Each system has its own bench, which is independent of the other systems; this bench forwards each query to the system that the
+name begins with, and merges the events of all systems into one trace. The code that creates this bench also starts and stops the
+systems.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from fieldtwin.scenarios.bench import Bench, Can, Stopped, TagReading
 
 
 class MemberTrace(Trace):
-    """The events of one system's bench, under its name in the common trace.
+    """The events of one system's bench, which are prefixed with the system's name and added to the common trace.
 
-    `later_ns`: the time by which this system started later than the first one.
+    `later_ns` returns the time by which this system started later than the first one.
     """
 
     def __init__(self, whole: Trace, member: str, later_ns: Callable[[], int]) -> None:
@@ -58,9 +59,10 @@ class Part:
 
 
 class NetworkBench:
-    """A `fieldtwin.scenarios.bench.Bench`.
+    """A bench for a network of systems; it implements `fieldtwin.scenarios.bench.Bench`.
 
-    `parts` maps the name of each member of the network to its part; `topside` sends from the topside modem.
+    `parts` maps the name of each member of the network to its part; `topside` sends commands
+    through the topside modem.
     """
 
     def __init__(self, network: Network, trace: Trace, target: str, faults: AcousticFaults) -> None:
@@ -76,7 +78,7 @@ class NetworkBench:
 
     @property
     def can(self) -> frozenset[Can]:
-        """Return the abilities that all parts have. The topside modem of the network sends commands."""
+        """Return the abilities that all parts have, except probes; sending commands only if the network has a topside modem."""
         can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
         return can | ({Can.SEND_COMMAND} if self.topside is not None else frozenset())
 
@@ -85,7 +87,7 @@ class NetworkBench:
         return self.parts[member], local
 
     def now_ns(self) -> int:
-        """Return the time since the start."""
+        """Return the time in ns since the start of the first system."""
         return round(self.now_s() * NS_PER_S)
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
@@ -126,8 +128,9 @@ class NetworkBench:
         return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
 
     def host_late_total_s(self, since_s: float) -> tuple[float, float]:
-        """Return the lateness of the first system's bench (see `Bench.host_late_total_s`), because only that bench waits, for
-        all systems."""
+        """Return the lateness of the first system's bench (see `Bench.host_late_total_s`), because only that bench waits.
+        It waits for all systems.
+        """
         told = [p.bench.host_late_total_s(since_s - p.trace.offset_ns / NS_PER_S) for p in self.parts.values()]
         return told[0][0], max(any_s for _, any_s in told)
 

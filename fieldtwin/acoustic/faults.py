@@ -1,6 +1,6 @@
 """The faults of a network's acoustic channel: packets that are sent and do not arrive.
 
-They name modems of the network file as their target, and are written like the faults of a bus.
+Their targets are the modems of the network file. They have the same form as the faults of a bus.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probabili
 
 
 class AcousticFaults:
-    """The active faults. `start_ns` is when the run began; `from` and `until` count from then."""
+    """The active faults of the acoustic channel. Times `from` and `until` of a fault count from `start_ns`, the run's start."""
 
     def __init__(self, places: Collection[str], seed: int) -> None:
         """Create the faults of a channel. `places` are the names of the modems in it."""
@@ -44,7 +44,7 @@ class AcousticFaults:
         self._numbers = {name: number for number, name in enumerate(places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
-        """Return whether a fault removes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
+        """Return whether a fault removes this packet for `listener` (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
         return self._wire.decide(FaultFrame(FrameDirection.REPLY, Framing.RAW, payload, listener), t_ns) is not None
 
     def inject(self, said: Mapping[str, Any]) -> str:
@@ -99,7 +99,8 @@ def check_water_fault(places: Collection[str], spec: FaultSpec) -> None:
 def random_losses(places: Collection[str], random: Random, mean_s: float, last_s: float) -> list[dict[str, Any]]:
     """Return random losses of packets, at all modems or at one, in the form of a fault file.
 
-    `mean_s`: mean seconds between two faults of a system; `last_s`: the time in seconds at which all are over.
+    `mean_s`: mean seconds between two faults of a system; `last_s`: the time in seconds, from the run's start, at which all
+    losses are over.
     """
     found: list[dict[str, Any]] = []
     mean_s *= RARER

@@ -1,4 +1,5 @@
-"""The kind of file that begins with `network:`, as `fieldtwin.run.virtual.group_kinds.GroupKind` describes it.
+"""The file kind `network`, for files that begin with `network:` (an implementation of the protocol
+`fieldtwin.run.virtual.group_kinds.GroupKind`).
 
 Every other part of fieldtwin reaches the acoustic network through this module (`fieldtwin.twin.site.groups`).
 """

@@ -53,7 +53,7 @@ async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> Sce
 
 
 class _Tidy:
-    """The folders of a run, removed with it; if a part ended early they are kept, because its logs contain the reason."""
+    """Removes the folders of a run at its end. If a part has failed, they are kept, because their logs contain the reason."""
 
     def __init__(self) -> None:
         self.folders: list[Path] = []
@@ -68,7 +68,7 @@ class _Tidy:
 
 
 def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
-    """Return a function that returns the time by which the bench of a system began later than the first one."""
+    """Return a function that returns the time in ns by which the bench of system `name` began later than the first one."""
     known: list[int] = []
 
     def later_ns() -> int:

@@ -1,6 +1,6 @@
 """A network as a map: the positions of its systems, with distance and delay between those that hear each other.
 
-Takes a loaded network, returns text and SVG; opens nothing.
+This module converts a loaded network to text and SVG; it opens no files or connections.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ AROUND = 110.0
 
 @dataclass(frozen=True, slots=True)
 class MemberPosition:
-    """A member: a system with its file and devices, or the topside controller. `at_m` as in the file."""
+    """A member: a system with its file and devices, or the topside controller. `at_m` is its
+    position in m, as in the network file.
+    """
 
     name: str
     system: str
@@ -77,7 +79,7 @@ def network_map(network: Network) -> Map:
 
 
 def text(drawn: Map) -> str:
-    """Return a line for each position: the member that is there, and the members that it hears."""
+    """Return one line of text for each member: its position, and the members that it hears."""
     names = max(len(place.name) for place in drawn.places)
     systems = max(len(place.system) for place in drawn.places)
     lines = [f"{drawn.network} (network of prototypes)", f"water: {drawn.water}"]
@@ -92,7 +94,7 @@ def text(drawn: Map) -> str:
 
 
 def svg(drawn: Map) -> str:
-    """Return the map as SVG: x to the right, y up, depth as text."""
+    """Return the map as SVG, with x to the right, y up, and the depth as text."""
     spots, height = _spots(drawn)
     width = WIDE + 2 * AROUND
     parts = [_way(way, spots) for way in drawn.ways]
@@ -107,7 +109,7 @@ def svg(drawn: Map) -> str:
 
 
 def _spots(drawn: Map) -> tuple[dict[str, tuple[float, float]], float]:
-    """Return the drawn position of each place, all in one scale, and the drawing's height."""
+    """Return the drawn position of each member in px, all in one scale, and the drawing's height in px."""
     xs, ys = [p.at_m[0] for p in drawn.places], [p.at_m[1] for p in drawn.places]
     across, up = max(xs) - min(xs), max(ys) - min(ys)
     scale = min(WIDE / across if across else 1e9, HIGH / up if up else 1e9) if across or up else 1.0
@@ -132,7 +134,7 @@ def _way(way: AcousticPath, spots: dict[str, tuple[float, float]]) -> list[Marku
 def _place(
     place: MemberPosition, spot: tuple[float, float], taken: list[tuple[float, float, float, float]]
 ) -> list[Markup]:
-    """Draw a dot, with its texts below it, or above if another label is there."""
+    """Draw a member as a dot, with its texts below the dot, or above it if there is already a label below."""
     metres = ", ".join(f"{m:g}" for m in place.at_m) + " m"
     rows = [(place.name, "name"), (place.system, ""), (", ".join(place.devices), "soft"), (metres, "soft")]
     rows = [row for row in rows if row[0]]

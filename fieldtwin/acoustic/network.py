@@ -1,7 +1,8 @@
-"""A network: systems whose modems share one acoustic channel. A network file, resolved and checked as a whole.
+"""A network: systems whose modems share one acoustic channel. This module reads and checks network files.
 
-Each system is a separate plant with its own file, and does not know about the network. `Network.whole` is one view of
-all systems, for scenarios and reports: every name is prefixed with its system's, as in `west.ctd.pressure`.
+Each system is a separate plant with its own file, and does not depend on the network. `Network.whole` combines
+all systems into one, for scenarios and reports: every name is prefixed with the name of its system, as in
+`west.ctd.pressure`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from fieldtwin.twin.site.system import System, load_system
 
 @dataclass(frozen=True)
 class AcousticMember(GroupMember):
-    """A system of a network. `modem` is the device in the acoustic channel, at position `at_m`."""
+    """A system of a network. `modem` is the device in the acoustic channel, at position `at_m` in m."""
 
     modem: str
     at_m: tuple[float, ...]
@@ -44,7 +45,7 @@ class AcousticMember(GroupMember):
 
 @dataclass(frozen=True)
 class Network(SystemGroup):
-    """A network file, resolved."""
+    """A network: the content of a network file, with the systems that the file names."""
 
     members: Mapping[str, AcousticMember]
     water: AcousticProperties
@@ -59,7 +60,7 @@ class Network(SystemGroup):
 
     @property
     def places(self) -> dict[str, tuple[float, ...]]:
-        """Return the positions of all modems in the acoustic channel."""
+        """Return the positions (m) of all modems in the acoustic channel: by system name, and by `SHIP` for the topside modem."""
         places = {name: member.at_m for name, member in self.members.items()}
         return places | ({SHIP: tuple(self.ship.at_m)} if self.ship is not None else {})
 
@@ -91,7 +92,7 @@ class Network(SystemGroup):
         return found
 
     def place_of(self, fault: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-        """Return the system of a fault, or `WATER`, and the fault with that system's own names.
+        """Return the system of a fault, or `WATER`, and the fault with the names that this system itself uses.
 
         Raises `UsageError` for an unknown system.
         """
@@ -198,7 +199,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _check(file: YamlFile, form: NetworkForm, members: dict[str, AcousticMember]) -> None:
-    """Check what concerns several systems: coordinates, names, mailbox sizes and modem addresses."""
+    """Check the properties that depend on several systems: coordinates, names, mailbox sizes and modem addresses."""
     first = next(iter(form.systems.values()))
     places: list[tuple[tuple[Key, ...], list[float]]] = [(("systems", n), m.at_m) for n, m in form.systems.items()]
     if form.ship is not None:

@@ -1,6 +1,6 @@
 """The pydantic models of a network file: systems, and the acoustic channel between their modems.
 
-Only the prototype uses it; no plant opens it.
+Only prototypes (systems with emulated devices) use network files; a run of a real plant never reads one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field
 from fieldtwin.twin.site.schema import Name, SiteModel
 
 WATER = "water"
-"""The name of the acoustic channel in faults, used like the name of a bus."""
+"""The name of the acoustic channel in faults, where it takes the place of a bus name."""
 SHIP = "ship"
 """The name of the topside modem among the modems of the acoustic channel."""
 

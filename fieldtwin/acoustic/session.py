@@ -1,4 +1,4 @@
-"""A network on this host: each system runs separately, as processes on ptys and sockets; the acoustic channel runs here.
+"""A network on this host: each system runs as its own processes on ptys and sockets, the acoustic channel in this process.
 
 Start order: the acoustic channel, the topside modem, then all systems at the same time. The end of one system does not
 end the others.
@@ -34,7 +34,8 @@ from fieldtwin.twin.plant.instance import Instance
 class NetworkOptions:
     """The options of a network run.
 
-    `instance` is the network's; its systems' instances are INSTANCE-SYSTEM. `duration_s` 0: until stopped.
+    `instance` is the name of the run; the run of each system is named INSTANCE-SYSTEM. With `duration_s` 0 the network runs until
+    it is stopped.
     """
 
     instance: str = ""
@@ -48,12 +49,13 @@ class NetworkOptions:
     faults: tuple[dict[str, Any], ...] = ()
     """The faults of the systems and of the acoustic channel. Their targets are names of the network, such as SYSTEM.DEVICE."""
     thread: str = ""
-    """The address on which each system's thread listens, at a free port. Empty for none."""
+    """The address on which each system's digital thread listens, at a free port. Empty if there is to be no digital thread."""
 
 
 class NetworkSession(AsyncResource):
-    """A run of a network. Use it as ``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` maps the
-    name of each member to its run."""
+    """A run of a network. Use it as ``async with NetworkSession(network, options) as session: await session.wait()``. `sessions`
+    maps the name of each member to its run.
+    """
 
     def __init__(self, network: Network, options: NetworkOptions) -> None:
         super().__init__()

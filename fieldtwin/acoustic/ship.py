@@ -19,14 +19,16 @@ from fieldtwin.run.processes.topside import Scripted, script
 MOST_CLIENTS = 4
 FIRST_S = 1.0
 BASE_S = 10
-"""The default command of the topside modem: a period of 10 s, commanded 1 s after the start."""
+"""The default command of the topside modem: a sample period of 10 s, sent `FIRST_S` after the start."""
 ENDLESS_S = 20.0
 """The time in seconds over which the commands of a run without an end are spread."""
 
 
 def scripted_commands(network: Network, commands: tuple[int, ...] | None, duration_s: float) -> list[Scripted]:
-    """Return the commands of the topside modem in a run; None stands for the usual command. A network without
-    a topside modem has no commands.
+    """Return the commands of the topside modem in a run, spread over `duration_s` seconds (0: `ENDLESS_S`).
+
+    `commands` are sample periods in seconds; None stands for the default command. A network without a topside modem has no
+    commands.
     """
     if network.ship is None:
         return []
@@ -36,9 +38,9 @@ def scripted_commands(network: Network, commands: tuple[int, ...] | None, durati
 
 
 class TopsideModem:
-    """Serves the modem at the endpoint that ``await ship.open(ports)`` returns.
+    """The topside modem, served over Modbus TCP at the endpoint that ``await modem.open(ports)`` returns.
 
-    The modem is of the same kind as that of the first system.
+    It has the same device profile and unit ID as the modem of the first system.
     """
 
     def __init__(self, network: Network, medium: AcousticMedium, clock: Clock) -> None:

@@ -15,7 +15,8 @@ def summarise_network(
     errors: Sequence[str],
     elapsed_s: float,
 ) -> dict[str, Any]:
-    """Return plain data for `--json` and for printing. `ok` if all systems are, and nothing else failed.
+    """Return the summary as plain data, for `--json` and for printing. `ok` is true if all systems are ok and nothing else
+    failed.
 
     `systems`: each system's own summary. `channel`: ``water`` (the counters of each modem), ``faults`` (of the channel)
     and ``ship`` (the commands and responses of the topside modem; None without one).

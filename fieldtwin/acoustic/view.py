@@ -118,7 +118,7 @@ async def _on_this_host(network: Network, request: LiveRequest, as_json: bool) -
 
 
 async def _show(session: NetworkSession, quiet: bool) -> None:
-    """Show a table on a terminal; elsewhere print a line for each system at intervals."""
+    """Show a table on a terminal; if the output is not a terminal, print a line for each system at intervals."""
     if quiet:
         return
     if stderr.is_terminal:
@@ -160,7 +160,7 @@ def _states(session: RunSession) -> str:
 
 
 def _outputs(session: RunSession) -> str:
-    """Return the values that the control logic commands."""
+    """Return the output values that the control logic commands, as text ``NAME VALUE``."""
     outputs = session.gateway_status.outputs if session.gateway_status is not None else []
     return " ".join(f"{o.tag.partition('.')[2]} {o.wanted:g}" for o in outputs if o.wanted is not None)
 

@@ -27,14 +27,14 @@ from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.processes.topside import Scripted, TopsideController
 
 SEEDS_APART = 1_000_003
-"""Distance between the seeds of a run's systems, so that none repeats the random numbers of another."""
+"""The difference between the seeds of two systems of a run, so that no system repeats the random numbers of another one."""
 
 
 class VirtualNetwork(AsyncResource):
-    """A network: ``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`.
+    """A network in virtual time: ``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`.
 
-    `it.bench` is a scenario's bench. `folder` takes each system's audit log. `commands` are those that the topside
-    modem sends by itself; a scenario uses `send` instead.
+    `it.bench` is a scenario's bench. The audit log of each system is written to `folder`. `commands` are those that the topside
+    modem sends without a scenario; a scenario sends commands with `send` instead.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class VirtualNetwork(AsyncResource):
         }
 
     def _later(self, name: str) -> Callable[[], int]:
-        """Return the time by which a system began later than the first one."""
+        """Return a function that returns the time in ns by which the system `name` began later than the first one."""
         return lambda: self.systems[name].run.started_ns - next(iter(self.systems.values())).run.started_ns
 
     async def _board(self) -> None:

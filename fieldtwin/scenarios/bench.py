@@ -1,8 +1,9 @@
-"""The interface to a running system that a scenario drives, wherever it runs. Targets declare what they can do.
+"""The interface through which a scenario controls and observes a running system. A target (a way to run the system) declares its
+capabilities in `can`.
 
-`virtual` is a prototype in virtual time, in this process; `local` is one as processes on this host; `compose` is one in
-containers; `real` is a plant. A step that needs a capability that is not in `can` is skipped, with the reason; it never
-passes.
+The target `virtual` is a prototype (the system with emulated devices) in virtual time, in this process; `local` is a prototype as
+processes on this host; `compose` is a prototype in containers; `real` is a plant. A step that needs a capability that is not in
+`can` is skipped, with the reason; it never passes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Can(Enum):
     SET_VALUE = "set_value"
     SEE_WIRE = "see_wire"
     SEE_HELD = "see_held"
-    """Read the values that the devices held, with which published values are compared."""
+    """Read the values in the emulated devices' registers and objects, with which published values are compared."""
     EXACT_TIME = "exact_time"
     """Time is exact: load of the host never affects the run."""
     PROBE = "probe"
@@ -63,8 +64,8 @@ def variable(value: Any, *, runs: bool) -> TagReading:
 class Stopped:
     """A part of the system under test that does not run: the PLC, the gateway or the simulated field devices.
 
-    `what` is the error, `where` the file and line of the logic that failed, if logic did. `bound_s`: a host that was
-    late by a part of this time may have caused it; 0 if the host's lateness cannot be the cause.
+    `what` is the error, `where` the file and line of the logic that failed, if logic did. `bound_s`: the stop
+    may have been caused by a host that was late by a part of this time; 0 if lateness cannot be the cause.
     """
 
     part: Part
@@ -80,7 +81,7 @@ class NothingKnown(FieldtwinError):
 
 
 class Bench(Protocol):
-    """A running system. Raises `FieldtwinError` if the system is gone."""
+    """A running system. The methods raise `FieldtwinError` if the system has ended."""
 
     @property
     def target(self) -> str:
@@ -113,9 +114,9 @@ class Bench(Protocol):
         ...
 
     def reading(self, name: str) -> TagReading | None:
-        """Return the reading as of the last return of `sleep_until_s`.
+        """Return the value of a tag or variable as it was when `sleep_until_s` last returned; None if it was never published.
 
-        None: never published. Raises `UsageError` for an unknown name.
+        Raises `UsageError` for an unknown name.
         """
         ...
 
@@ -128,7 +129,7 @@ class Bench(Protocol):
         ...
 
     def not_started(self) -> str:
-        """Return which programs wait for their inputs and have not started, with what is missing; empty if all run."""
+        """Return as text which programs have not started, and which inputs they wait for; empty if all programs run."""
         ...
 
     def late_ms(self) -> float:
@@ -148,7 +149,7 @@ class Bench(Protocol):
         ...
 
     async def send(self, period_s: int) -> None:
-        """Send a period as a command of the remote client."""
+        """Send a command with a sample period in seconds, as the remote client."""
         ...
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
@@ -158,11 +159,11 @@ class Bench(Protocol):
         ...
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        """Inject a fault: `id`, `name`, its aim and its parameters, as in a fault file."""
+        """Inject a fault, which is described as in a fault file: `id`, `name`, its target and its parameters."""
         ...
 
     async def clear(self, id: str) -> None:
-        """Clear the fault."""
+        """End the fault with this id."""
         ...
 
     async def struck(self) -> list[Struck]:

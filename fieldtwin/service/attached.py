@@ -1,4 +1,5 @@
-"""A run as a service: its metrics page, systemd notifications and event log, all from statuses that the run polls anyway.
+"""A run as a system service: its metrics page, systemd notifications and event log. All use the statuses of gateway and PLC
+that the run polls in any case.
 
 The watchdog is fed only while both the gateway and the PLC have answered within the last half of its interval: if one of them
 hangs or has ended, systemd stops all processes of the service in order and starts them again.
@@ -59,7 +60,7 @@ def snapshot(session: RunSession) -> RunState:
 
 
 def short(seen: RunState) -> str:
-    """Return one line for `systemctl status`."""
+    """Return one line for `systemctl status`: the system, the PLC's state, and how many devices answer."""
     if seen.gateway is None or seen.plc is None:
         return f"{seen.system}: the {'gateway' if seen.gateway is None else 'PLC'} does not answer"
     devices = seen.gateway.devices
@@ -139,7 +140,7 @@ class RunService:
             self._notifier.ready(event.message if event is not None else "read again")
 
     async def _reloaded(self) -> ServiceEvent | None:
-        """Return the result of a failed reload. Return None if a change was applied, because the statuses show that."""
+        """Reload the files and return the event to log. None if `_tell` will log it from the statuses."""
         try:
             done = await self._session.reload("SIGHUP")
         except FieldtwinError as e:
@@ -160,7 +161,7 @@ class RunService:
         return ServiceEvent(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
 
     def healthy(self, seen: RunState, patience_s: float) -> bool:
-        """Return whether gateway and PLC both answered within `patience_s` seconds."""
+        """Return whether gateway and PLC both answered within the last `patience_s` seconds before the snapshot `seen`."""
         return seen.gateway is not None and seen.plc is not None and seen.asked_ago_s <= patience_s
 
     def _started(self) -> ServiceEvent:

@@ -1,6 +1,6 @@
 """Events between two snapshots of a run, for a log that programs read.
 
-Pure: it writes nothing and sends no requests. Events never contain values of tags, like all texts of the service.
+This module performs no I/O. Events never contain values of tags, like all texts of the service.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ServiceEvent:
 
 
 def changes(before: RunState | None, now: RunState) -> list[ServiceEvent]:
-    """Yield the events between two snapshots. Without an earlier snapshot, every fault that is present is an event."""
+    """Return the events between two snapshots. Without an earlier snapshot, every fault that is present is an event."""
     return [
         *_children(before, now),
         *_buses(_buses_of(before), _buses_of(now)),
@@ -108,7 +108,7 @@ def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[ServiceEvent]:
 
 
 def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[ServiceEvent]:
-    """Return the event of a reload, regardless of its origin."""
+    """Return the event of a reload of the files, regardless of the user or program that requested it."""
     if before is None or now is None or not before.config or not now.config:
         return []
     if before.config.reloads == now.config.reloads:
@@ -118,7 +118,7 @@ def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[S
 
 
 def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> list[ServiceEvent]:
-    """Yield the events of the digital thread: trouble of its carrier and of its log's store, and the end of the trouble."""
+    """Return the events of the digital thread: the beginning and end of problems with its carrier or its log's storage."""
     if now is None:
         return []
     found = []
@@ -133,7 +133,7 @@ def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> 
 
 
 def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[ServiceEvent]:
-    """Yield writes that did not reach their device. As everywhere here, the fields contain no value."""
+    """Return events for writes that did not reach their device. The fields of the events contain no values."""
     last = max((e.number for e in (before.refusals.entries if before is not None else [])), default=0)
     found = []
     for entry in now.refusals.entries if now is not None else []:

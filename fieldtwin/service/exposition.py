@@ -1,4 +1,4 @@
-"""Prometheus exposition format 0.0.4, as text. This module does not know which values are measured.
+"""Prometheus exposition format 0.0.4, as text. This module does not depend on the values that are measured.
 
 Source: https://prometheus.io/docs/instrumenting/exposition_formats/ (text-based format).
 """
@@ -18,8 +18,8 @@ Labels = Mapping[str, str]
 
 @dataclass(slots=True)
 class Family:
-    """A metric with its samples; `samples` are the name, the labels and the value of each sample, in the form in which they
-    are written.
+    """A metric with its samples. Each of `samples` holds the name, the labels and the value, in the form in which they are
+    written.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 They contain neither values nor names of tags, because these may be confidential, and because a plant with 100,000 tags then
 has no more series than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the rest is counted as left
-out. It sends no requests: it is given statuses that were polled anyway.
+out. This module sends no requests: its caller passes statuses that the run polls in any case.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_DEVICES = 1000
 """Devices that have series; the others are only counted."""
 
 MOST_NAMED = 256
-"""Limit for each of buses, servers, bridges and tasks."""
+"""The largest number of buses that have series; the same limit applies to servers, bridges and tasks."""
 
 ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tuple(asdict(CanopenCounters()))}
 """Counters that a bus exports before they first count, because a rate needs the 0."""
@@ -38,7 +38,8 @@ ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tupl
 class RunState:
     """The latest known state of a run.
 
-    A status is None while its process does not answer. `states`: whether each child runs.
+    A status is None while its process does not answer. `children`: whether each child process runs. `asked_ago_s`: seconds since
+    the last answer of the gateway or the PLC, whichever answered earlier.
     """
 
     system: str
@@ -52,7 +53,7 @@ class RunState:
 
 
 class Page:
-    """The families in the order in which they were first used."""
+    """The metrics page: its families, in the order in which they were first used."""
 
     def __init__(self) -> None:
         self.families: dict[str, Family] = {}
@@ -71,7 +72,7 @@ class Page:
 
 
 def families(seen: RunState) -> list[Family]:
-    """Return all metrics of `seen`. Without an answering process its metrics are missing, and `fieldtwin_up` is 0."""
+    """Return all metrics of `seen`. If a process does not answer, its metrics are left out, and `fieldtwin_up` is 0."""
     page = Page()
     page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(
         1, version=__version__, system=seen.system, mode=seen.mode
@@ -185,7 +186,7 @@ def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
 
 
 def _clients(page: Page, gateway: GatewayStatus) -> None:
-    """Add the requests of clients of the servers and bridges."""
+    """Add the counters of requests that clients sent to the gateway's servers and bridges."""
     counted = page.counter("server_events", "Counters of a server or bridge, by event.")
     fronts: list[tuple[str, Mapping[str, FrontStatus]]] = [("serve", gateway.serve), ("bridge", gateway.bridge)]
     for kind, servers in fronts:

@@ -1,4 +1,5 @@
-"""A small HTTP server for one page, ``GET /metrics``. It reads no body, keeps no connection and does not know the page's content.
+"""A small HTTP server for one page, ``GET /metrics``. It reads no body, closes each connection after its response, and does not
+depend on the page's content.
 
 Limits: `MOST_CLIENTS` at a time, `MOST_HEAD` bytes of request, `PATIENCE_S` for all of it. It has no authentication and no TLS,
 since Prometheus scrapes a separate network; so it listens on loopback by default.
@@ -30,7 +31,10 @@ def parse_place(text: str) -> tuple[str, int]:
 
 
 class MetricsServer:
-    """Serves the result of `page`. `await open(host, port)`, `aclose()` in the end; `served` and `refused` are counted."""
+    """An HTTP server that returns the result of `page()`. `served` and `refused` count its requests.
+
+    Call ``await open(host, port)`` to start it and ``await aclose()`` to stop it.
+    """
 
     def __init__(self, page: Callable[[], str]) -> None:
         self._page = page

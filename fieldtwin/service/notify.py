@@ -45,7 +45,7 @@ class Notifier:
         return self._socket is not None
 
     def ready(self, status: str) -> None:
-        """Notify that the start is complete; also after a reload."""
+        """Notify systemd that the start or a reload is complete (READY=1)."""
         self._send("READY=1", _status(status))
 
     def alive(self, status: str) -> None:

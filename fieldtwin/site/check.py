@@ -207,14 +207,15 @@ class _Site:
 
 
 def _aims_in(system: System | None) -> Callable[[FaultSpec], object] | None:
-    """Return a function that checks a fault's aim. Return None without a system: the aims cannot be checked then, because a
-    fault file does not name its system.
+    """Return a function that checks whether a fault's target exists in `system`.
+
+    Return None without a system: targets cannot be checked then, because a fault file does not name its system.
     """
     return None if system is None else lambda spec: target(system, spec)
 
 
 def _case_ids() -> list[str]:
-    """Return the IDs and row numbers of all conformance cases, which waivers may name."""
+    """Return the IDs that waivers may name: those of all conformance cases, with and without their final letters."""
     cases: list[About] = [*MODBUS_DEVICE_CASES, *CANOPEN_DEVICE_CASES]
     cases += [case.about for case in MODBUS_CLIENT_CASES]
     cases += [case.about for case in CANOPEN_MASTER_CASES]

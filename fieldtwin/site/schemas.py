@@ -45,7 +45,7 @@ def _faults() -> dict[str, Any]:
 
 
 def _scenario() -> dict[str, Any]:
-    """Return the schema of scenarios; the faults of their steps are those of fault files."""
+    """Return the schema of scenario files. It uses the schema of fault files for the faults in steps."""
     from fieldtwin.emulators.faults.json_schema import fault_defs
     from fieldtwin.scenarios.language.words import ScenarioForm
 
@@ -77,7 +77,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "waivers": _waivers,
     "rules": _rules,
 }
-"""The kinds of files that users write."""
+"""By kind of file that users write: the function that returns its JSON schema."""
 
 
 def schema_text(kind: str) -> str:
@@ -87,5 +87,5 @@ def schema_text(kind: str) -> str:
 
 
 def shipped(kind: str) -> Path:
-    """Return the shipped file with the schema of a kind of file."""
+    """Return the path of the shipped file with the schema of a kind of file."""
     return SHIPPED / f"{kind}.schema.json"

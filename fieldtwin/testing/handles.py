@@ -1,6 +1,6 @@
 """The objects that fixtures return: a device, a field simulator (prototype), a stepped program.
 
-They are handles on objects in the other process. Standard library only: see `fieldtwin.testing.runner`.
+The objects themselves are in the worker process (`fieldtwin.testing.runner`). This module imports only the standard library.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class EndpointHandle:
 
 
 class DeviceHandle:
-    """One emulated device.
+    """An emulated device.
 
     `endpoint` is its address, whose parts are attributes of the device as well: `device.path`, `device.port`; `unit` is
     its unit ID or node ID.
@@ -65,8 +65,8 @@ class DeviceHandle:
         return getattr(self.endpoint, name)
 
     def set(self, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value`, in engineering units, instead of its own values; with None it returns to its own
-        values.
+        """Set `tag` in the device to `value`, in engineering units, instead of its recorded or simulated values; None restores
+        these.
         """
         __tracebackhide__ = True
         self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
@@ -74,7 +74,7 @@ class DeviceHandle:
     def held(self, tag: str) -> Any:
         """Return the device's value in engineering units, including one that a driver has written.
 
-        For a device that samples or replays a recording it is the last value shown; None: no value yet.
+        For a device that samples or replays a recording, this is its latest value. None: it has no value yet.
         """
         __tracebackhide__ = True
         return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
@@ -88,7 +88,9 @@ class DeviceHandle:
 
 
 class PrototypeHandle:
-    """The field simulator of a system. ``prototype["ctd"]`` is a `DeviceHandle`; `buses` and `far` hold the endpoints."""
+    """The field simulator of a system. ``prototype["ctd"]`` is a `DeviceHandle`; `buses` holds the
+    endpoints of the buses, `far` those of the remote ends of transmitters' links.
+    """
 
     def __init__(self, runner: WorkerProcess, description: dict[str, Any]) -> None:
         self.id: int = description["id"]
@@ -121,7 +123,7 @@ class PrototypeHandle:
 
 
 class Plc:
-    """A PLC program that is stepped. It has its own time: 10 s of it take milliseconds.
+    """A PLC program that is stepped. It has its own time: 10 s of program time take milliseconds.
 
     ``plc.set(level=10.0)`` sets inputs (None: bad), ``plc.scan()`` runs one scan, ``plc.run(2.5)`` runs scans for 2.5
     seconds; ``plc["valve"]`` is a variable after the last scan, for a message output the list of sent messages.

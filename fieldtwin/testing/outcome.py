@@ -1,6 +1,6 @@
 """The result of a scenario that `fieldtwin test` ran in a separate process: its verdict, and the reason.
 
-Standard library only: see `fieldtwin.testing.runner`.
+This module imports only the standard library, see `fieldtwin.testing.runner`.
 """
 
 from __future__ import annotations

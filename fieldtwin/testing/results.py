@@ -1,4 +1,6 @@
-"""Collect the results of a whole test run for one HTML page (`--fieldtwin-html`), from pytest's reports, also xdist's."""
+"""Collect the results of a whole test run for one HTML page (`--fieldtwin-html`), from pytest's reports, also those of
+pytest-xdist.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,11 @@ import pytest
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, WorkerProcess, command_of
 
 _WORKER = re.compile(r"\[gw\d+\] ")
-"""The line that xdist adds before the text of a failure."""
+"""The prefix ``[gwN]`` that pytest-xdist puts before the text of a failure."""
 
 
 class Results:
-    """A separate plugin, registered if the page was requested."""
+    """The pytest plugin that collects the results; registered only if the page was requested."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._config = config

@@ -1,6 +1,7 @@
-"""Start the process that serves the tests, and communicate with it: one per test session, started on first use.
+"""Start the worker process, which runs emulated devices and programs for tests, and communicate with it.
 
-Standard library only, and no other part of fieldtwin: modules imported here are imported into the user's own test run.
+There is one worker process per test session; it is started on first use. This module imports only the standard library, and no
+other part of fieldtwin, because it is imported into the user's own test run.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ class FieldtwinRefused(Exception):
 
 
 def command_of(said: str = "") -> list[str]:
-    """Return the command that runs fieldtwin: `said`, else FIELDTWIN_COMMAND, else that of this Python."""
+    """Return the command that runs fieldtwin: `said`, else FIELDTWIN_COMMAND, else this Python with ``-m fieldtwin``."""
     text = said or os.environ.get(COMMAND_VARIABLE, "")
     return shlex.split(text) if text else [sys.executable, "-P", "-m", "fieldtwin"]
 
 
 class WorkerProcess:
-    """One process ``COMMAND test-host``; starts at the first `call`. Calls may come from any thread, one at a time."""
+    """The worker process ``COMMAND test-host``. The first `call` starts it. Any thread may call; calls are executed in turn."""
 
     def __init__(self, command: Sequence[str] = (), *, trust: bool = False) -> None:
         self.command = list(command) or command_of()
         self.trust = trust
-        """Whether templates from other sources may run without a question."""
+        """Whether the code of templates from other sources may run without asking the user."""
         self._process: subprocess.Popen[str] | None = None
         self._answers: Queue[str | None] = Queue()
         self._said: IO[str] | None = None
@@ -111,7 +112,7 @@ class WorkerProcess:
         return process
 
     def _gone(self) -> FieldtwinUnavailable:
-        """Return the reason for the end of the process, with the end of its output."""
+        """Return the error for a process that has ended, with its exit status and its last output."""
         assert self._process is not None
         assert self._said is not None
         try:
@@ -129,7 +130,7 @@ class WorkerProcess:
         )
 
     def close(self) -> None:
-        """End the process, and with it everything that it runs."""
+        """End the process, with all devices and programs that it runs."""
         process, self._process = self._process, None
         if process is None:
             return

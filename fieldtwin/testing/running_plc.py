@@ -1,6 +1,6 @@
 """A running PLC, with its gateway, connected to a field simulator: its tags, states and variables; forces, single scans.
 
-Standard library only: see `fieldtwin.testing.runner`.
+This module imports only the standard library, see `fieldtwin.testing.runner`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ WITHIN_S = 10.0
 class RunningPlc:
     """A running PLC.
 
-    ``plc["relay.state"]`` is the current value of a program's variable or a device's tag, a state by its name. It runs in real
-    time; `wait` waits for a value. Commands of a test are recorded like commands of a user, under the name ``test``.
+    ``plc["relay.state"]`` is the current value of a program's variable or a device's tag; a state is given by its name. The PLC
+    runs in real time; `wait` waits for a value. Commands of a test are recorded like commands of a user, under the name ``test``.
     """
 
     def __init__(self, runner: WorkerProcess, bench: int, profiles: Sequence[str] = ()) -> None:
@@ -66,7 +66,7 @@ class RunningPlc:
             time.sleep(POLL_S)
 
     def send(self, period_s: int) -> None:
-        """Command a period at the remote end of the system's transmitter, as `fieldtwin topside` does."""
+        """Send a command with a sample period (s) at the remote end of the system's transmitter, as `fieldtwin topside` does."""
         __tracebackhide__ = True
         self._runner.call("send", id=self._bench, period_s=period_s)
 
@@ -94,7 +94,7 @@ class RunningPlc:
         self._steer("go")
 
     def restart(self, *, cold: bool = False) -> None:
-        """Create the programs again; `cold` discards retained values."""
+        """Create the PLC's programs again, with their retained values; `cold` discards these."""
         self._steer("restart", cold=cold)
 
     def why(self, tag: str) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
-"""The traffic of an emulated device for a test: requests and replies, in words and values; and faults on its connection.
+"""The traffic of an emulated device, for tests: decoded requests and replies, and faults on its connection.
 
-Standard library only: see `fieldtwin.testing.runner`.
+This module imports only the standard library, see `fieldtwin.testing.runner`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Exchange:
     the first register, bit or object (index) as sent, `count` their number. `tags` are the values carried, in
     engineering units, by the profile's names. `exception` or `abort` is the code of a refusal. `problem` is "" for a
     good exchange, else ``pending``, ``no reply``, ``exception``, ``abort``, ``check sum``, ``stray`` or ``malformed``.
-    `t_s` counts from the opening of the connection. `request` and `reply` are the bytes, `text` and `reply_text` the
-    same in words. `transaction` is the transaction ID on Modbus TCP.
+    `t_s` counts from the opening of the connection. `request` and `reply` are the bytes, `text` and `reply_text` their
+    descriptions. `transaction` is the transaction ID on Modbus TCP.
 
     A request is ``pending`` until its reply comes. It has ``no reply`` once none can follow: the next request was sent
     on a serial line, a later request was answered on Modbus TCP, or the connection was closed. A ``stray`` is a frame
@@ -90,11 +90,12 @@ class RecordedTraffic:
     def exchanges(self, *, strays: bool = False, **like: Any) -> list[Exchange]:
         """Return the exchanges since the test began, or since `clear`, by the time of the request.
 
-        The latest 20,000 are kept. A call has no side effects: a request that waits for its reply has the problem
-        ``pending``, and is complete in a later call.
+        The latest 20,000 are kept. A request that waits for its reply has the problem ``pending``; a later call returns
+        it with the reply.
 
-        `like` selects those whose fields are equal: ``exchanges(function=16)``; ``tag="period"`` those that carry that
-        tag. Frames that answer no request are omitted, unless `strays` is true or ``problem="stray"`` is given.
+        `like` selects the exchanges whose fields have the given values: ``exchanges(function=16)``. ``tag="period"`` selects
+        those that carry that tag. Frames that answer no request are omitted, unless `strays` is true or ``problem="stray"`` is
+        given.
 
         Raises `TypeError` for a selection that no exchange can match: an unknown field, problem or access.
         """
@@ -124,7 +125,7 @@ class RecordedTraffic:
         )
 
     def clear(self) -> None:
-        """Discard the exchanges so far, including requests whose reply is still to come."""
+        """Discard all exchanges until now, including requests that still wait for their reply."""
         while True:
             answer = self._runner.call("exchanges", id=self._bench, since=self._since)
             self._after_s = answer["now_s"]
@@ -133,7 +134,7 @@ class RecordedTraffic:
             self._since = answer["exchanges"][-1]["number"]
 
     def count(self, **like: Any) -> int:
-        """Return the number of `exchanges`. Stray frames are not requests and are not counted."""
+        """Return the number of exchanges that ``exchanges(**like)`` returns. Stray frames are not counted by default."""
         return len(self.exchanges(**like))
 
     def expect(
@@ -145,12 +146,12 @@ class RecordedTraffic:
         at_most: int | None = None,
         **like: Any,
     ) -> list[Exchange]:
-        """Wait until there are `times` such exchanges (by default 1), and return them.
+        """Wait until there are `times` exchanges that `like` selects (by default 1), and return them.
 
-        Instead of `times`, give bounds: `at_least` returns as soon as that number is reached, `at_most` observes for
-        all of `within_s`, because one more could come until then. A pending request is waited for; at the end of
-        `within_s` it counts, and counts as one with ``no reply``. Raises `AssertionError` with the observed traffic if
-        the number differs. Blocks; in a coroutine use `expect_async`.
+        Instead of `times`, give bounds: `at_least` returns as soon as that number is reached, `at_most` observes for all of
+        `within_s`, because one more could come until then. The method waits for the reply to a pending request; if there is none
+        at the end of `within_s`, the request counts, also as one with ``no reply``. Raises `AssertionError` with the observed
+        traffic if the number differs. The call blocks; in a coroutine use `expect_async`.
         """
         __tracebackhide__ = True
         wanted = _Wanted.of(times, at_least, at_most, like)
@@ -181,7 +182,7 @@ class RecordedTraffic:
             await asyncio.sleep(POLL_S)
 
     def _look(self, wanted: _Wanted, like: dict[str, Any], until: float) -> tuple[list[Exchange], bool]:
-        """Return the exchanges, and whether to stop waiting.
+        """Return the exchanges that `like` selects, and whether to stop waiting. `until` is the deadline on the monotonic clock.
 
         Raises `AssertionError` when the expected number can no longer be reached.
         """
@@ -213,7 +214,7 @@ class RecordedTraffic:
 
 
 def _check(like: dict[str, Any]) -> None:
-    """Refuse a selection that no exchange can match: a test that expects zero of them would always pass."""
+    """Raise `TypeError` for a selection that no exchange can match: a test that expects none would always pass."""
     __tracebackhide__ = True
     for key in like.keys() - _FIELDS - {"tag"}:
         names = sorted({*_FIELDS, "tag"})

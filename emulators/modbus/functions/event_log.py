@@ -1,6 +1,7 @@
 """The communication event log of a unit, which function 0Ch returns (AP 6.10).
 
-Pure bookkeeping: one byte per event, the newest first, at most 64. The standard requires that older events are dropped.
+The log holds one byte per event, the newest first, at most 64. The standard requires that older events are dropped. This module
+performs no I/O.
 """
 
 from __future__ import annotations

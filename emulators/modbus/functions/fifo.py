@@ -1,6 +1,7 @@
 """FIFO queues of registers, function 18h (AP 6.18).
 
-Pure. A queue is identified by its pointer address. A read does not empty the queue; only the device takes values out.
+A queue is identified by its pointer address. A read does not empty the queue; only the device takes values out. This module
+performs no I/O.
 """
 
 from __future__ import annotations

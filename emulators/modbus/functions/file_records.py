@@ -1,6 +1,6 @@
 """File records, functions 14h and 15h (AP 6.14, 6.15): numbered files of 16-bit records.
 
-Pure: it takes a request PDU and returns a response PDU. The device decides what a file means.
+This module performs no I/O: it takes a request PDU and returns a response PDU. The device defines the meaning of each file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ REFERENCE_TYPE = 6
 MAX_RECORDS = 10_000
 """The largest number of records in a file, which have the numbers 0000h to 270Fh."""
 _GROUP = 7
-"""The layout of a sub-request: reference type, file, record, count."""
+"""The number of bytes of a sub-request: reference type (1), file, record and count (2 each)."""
 _MOST_READ, _MOST_ASKED, _MOST_WRITTEN = 0xF5, 0xF5, 0xFB
 
 
@@ -45,11 +45,11 @@ class FileRecords:
         self._read_only = frozenset(read_only)
 
     def peek(self, file: int, record: int, count: int = 1) -> list[int]:
-        """Return records of a file as the device sees them. Raises `NoSuchAddress`."""
+        """Return records of a file, for the device itself. Raises `NoSuchAddress`."""
         return self._span(RecordGroup(file, record, count))[record : record + count]
 
     def poke(self, file: int, record: int, *values: int) -> None:
-        """Set records from the device's side, read-only files included. Raises `NoSuchAddress`."""
+        """Set records for the device itself, even in files that a client may only read. Raises `NoSuchAddress`."""
         self._span(RecordGroup(file, record, len(values)))[record : record + len(values)] = values
 
     def respond_read(self, pdu: bytes, now_ns: int) -> bytes:

@@ -1,6 +1,6 @@
 """Device identification, function 2Bh with MEI type 0Eh (AP 6.21): numbered texts, in several frames if necessary.
 
-Pure: it takes a request PDU and returns a response PDU.
+This module performs no I/O: it takes a request PDU and returns a response PDU.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Identification:
         """Return the answer to a 2Bh request.
 
         A different MEI type is refused with 01, an invalid code or a wrong length with 03, and an individual object that does not
-        exist with 02. A stream that is requested from an unknown object on begins at object 0 (AP 6.21).
+        exist with 02. If a stream is requested that starts at an unknown object, it starts at object 0 (AP 6.21).
         """
         if len(pdu) < 2 or pdu[1] != MEI_TYPE:
             raise IllegalFunction("MEI type", expected="0Eh", got=pdu[1:2].hex())

@@ -1,6 +1,6 @@
 """The functions that access cells: 01 to 06, 0F, 10, 16 and 17h on a bank (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
 
-Pure: a function takes a request PDU and returns a response PDU, or raises a `Refusal`. The checks follow the flow
+No I/O: a function takes a request PDU and returns a response PDU, or raises a `Refusal`. The checks follow the flow
 charts of AP 6: quantities and lengths (03), addresses (02), then execution. A refused request changes nothing.
 """
 

@@ -2,7 +2,7 @@
 
 Every byte may begin a frame, and only a correct checksum confirms it. Of several candidates, the one that is complete
 first is taken. The result therefore does not depend on how the bytes were divided, and each byte is examined a bounded
-number of times, because the candidates are kept between calls. Pure.
+number of times, because the candidates are kept between calls. No I/O.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ too much.
 """
 
 IDLE_NOISE = 4
-"""The largest number of noise bytes that a line may produce while it changes direction (row MB-008)."""
+"""The largest number of noise bytes that a line may produce while it changes direction (conformance case MB-008)."""
 
 _REQUEST, _RESPONSE = 0, 1
 

@@ -15,7 +15,7 @@ __all__ = ["RtuServer", "ServedFrame", "UnitLineCounters"]
 
 
 class RtuServer(LineServer):
-    """The units of one RTU line.
+    """The server for the units of one RTU line.
 
     `units` maps a unit ID (1 to 247) to its unit. A pause of `gap_ns` ends an unfinished frame.
 

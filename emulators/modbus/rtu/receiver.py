@@ -1,8 +1,9 @@
-"""Find the begin and the end of RTU frames in the bytes of a line, as a server on a shared line receives them.
+"""Find the beginning and the end of RTU frames in the bytes of a line, as a server on a shared line receives them.
 
 Frames are recognised by their length and checksum, never by silence alone: USB adapters, ptys and sockets do not
 preserve the pauses of the line (SL 2.5.1.1 describes what a UART sees). A long pause only decides that an unfinished
-frame stays unfinished. Pure: it takes bytes and ``now`` and returns complete frames. It does not know units or replies.
+frame is discarded. This module performs no I/O: it takes bytes and the present time and returns complete frames. It does not
+depend on the units and builds no replies.
 
 The line also carries requests to and responses from other units. To distinguish them, the receiver tries both lengths. It assumes
 that the first byte of the buffer begins a frame, so later bytes may wait until that frame is complete. If the first byte proves
@@ -90,16 +91,17 @@ class RtuReceiver:
         return frames
 
     def _is_a_request(self, data: bytes) -> bool:
-        """Return whether a chunk is exactly one request to our units, the usual case.
+        """Return whether a chunk is exactly one request to the units served here, the usual case.
 
-        `_next_frame` handles all other cases. This saves 13 % of a read of 10 registers.
+        `_next_frame` handles all other cases. This saves 13 % of the time of a read of 10 registers.
         """
         if len(data) < MIN_FRAME or data[0] not in self._own or self._hunt is not None:
             return False
         return FIXED_REQUESTS.get(data[1]) == len(data) and is_whole(data)
 
     def _is_a_whole_request_of_a_wrong_length(self) -> bool:
-        """Return whether the bytes between two pauses are one request to our units of a length that its head does not imply.
+        """Return whether the bytes between two pauses are one request to a unit served here, with a length that its first bytes
+        do not imply.
 
         The pauses and the checksum show that it is a complete frame (SL 2.5.1.1). It is therefore refused with
         exception 03 (AP 7: the implied length is incorrect) and not treated as noise.
@@ -129,7 +131,7 @@ class RtuReceiver:
         return None
 
     def _at_front(self) -> int:
-        """Return the length of the frame at the front of the buffer, `_WAIT` if a plausible one is incomplete, or `_NOISE`."""
+        """Return the length of the frame at the start of the buffer, `_WAIT` if a plausible frame is incomplete, or `_NOISE`."""
         if len(self._buffer) < MIN_FRAME:
             return _WAIT
         head = self._buffer[:MAX_FRAME]

@@ -1,8 +1,8 @@
 """RTU frames recognised only by the pauses of the line, as a directly connected UART receives them (SL 2.5.1.1).
 
-Pure. A pause of t3.5 ends a frame, and a pause of more than t1.5 inside a frame spoils it; lengths are not used. It
-suits media that deliver every byte in time. Ptys, sockets and USB adapters do not preserve the pauses: use
-`RtuReceiver` there.
+A pause of t3.5 ends a frame, and a frame with a pause of more than t1.5 inside it is discarded; lengths are not used. This
+suits media that deliver every byte in time. Ptys, sockets and USB adapters do not preserve the pauses: use `RtuReceiver`
+there. This module performs no I/O.
 """
 
 from __future__ import annotations

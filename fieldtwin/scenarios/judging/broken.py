@@ -1,4 +1,4 @@
-"""Checks that do not hold: of one step, and of the rules of the whole run."""
+"""Exceptions for failed checks: of one step, and of the rules of the whole run."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from fieldtwin.scenarios.judging.lateness import Allowance
 
 @dataclass
 class Broken(Exception):
-    """A check that does not hold: the verdict, the expected and the actual value.
+    """A check that failed: the verdict, the expected and the actual value.
 
-    `bound_s` is the time that it is about, 0 for none; `since_s` is the time from which the host's lateness counts, if
+    `bound_s` is the time limit that it checks, 0 for none; `since_s` is the time from which the host's lateness counts, if
     that is not the step's start.
     """
 
@@ -24,21 +24,21 @@ class Broken(Exception):
 
 
 class RuleBroken(Exception):
-    """A rule of the whole run does not hold, during a step or after the last."""
+    """A rule of the whole run is broken, during a step or after the last step."""
 
     def __init__(self, rule: CheckResult) -> None:
         self.rule = rule
 
 
 def wanted(what: str, within_s: float) -> str:
-    """Return the condition for which a step waits, as text: ``ctd.pressure > 3 within 2 s``, or ``... now`` if it may take no
-    time.
+    """Return the condition for which a step waits, as text: ``ctd.pressure > 3 within 2 s``, or ``... now`` if `within_s`
+    is 0.
     """
     return f"{what} within {within_s:g} s" if within_s else f"{what} now"
 
 
 def too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> Broken:
-    """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has failed."""
+    """Return the exception for a missed deadline: INCONCLUSIVE if the host was later than its budget, else FAILED."""
     if allowed.exhausted:
         return Broken(
             Verdict.INCONCLUSIVE, expected, f"{got}; this host itself was late for more than {allowed.any_s:.3f} s"

@@ -1,6 +1,6 @@
-"""Checks one expectation now: of a tag, or of the requests seen on a device's bus.
+"""Checks an expectation at the present time: of a tag, or of the requests seen on a device's bus.
 
-Returns (expected, got), or None if it holds.
+The functions return (expected, got) as text, or None if the expectation is met.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.twin.site.system import System
 
 Said = tuple[str, str] | None
 LIKE_S = 0.5
-"""How long before a value's own time, in seconds, its device may have held it: the reply takes some time on the bus."""
+"""A value may be that which its device held up to this time (s) before the value's own time, because replies take time."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ async def _check_value(expect: Expect, watched: ExpectationInput, reading: TagRe
 
 
 async def _like_held(expect: Expect, watched: ExpectationInput, value: object, reading_age_s: float) -> Said:
-    """Compare the tag with what its device holds, or held when the tag was read."""
+    """Compare the tag's value with the value that its device holds now, or held when the tag was read."""
     assert expect.tag is not None
     device, _, name = expect.tag.rpartition(".")
     tag = watched.system.devices[device].profile.tags[name]
@@ -98,7 +98,7 @@ async def _like_held(expect: Expect, watched: ExpectationInput, value: object, r
 
 
 def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[bytes]:
-    """Return what a device held at any time from `since_s` on, including the value that it had begun to hold before.
+    """Return the raw values that a device held at any time from `since_s` on. The first may have been set before `since_s`.
 
     `held` gives each value with the time from which it was held, in order.
     """
@@ -113,7 +113,7 @@ def _near(value: object, truth: object, tolerance: float) -> bool:
 
 
 def check_exchanges(expect: Expect, watched: ExpectationInput) -> Said:
-    """Check how often something was requested on a device's bus since the last stimulus, or its rate per second since
+    """Check how often an exchange occurred on a device's bus since the last stimulus, or its rate per second since
     the step began.
     """
     assert expect.wire is not None
@@ -140,7 +140,7 @@ def check_exchanges(expect: Expect, watched: ExpectationInput) -> Said:
 
 
 def wire_matches(form: Expect | WireForm, exchange: DecodedExchange) -> bool:
-    """Return whether an exchange has the form's function, access, register and value, as far as the form names them.
+    """Return whether an exchange has the form's function, access, register and value, if the form specifies them.
 
     A stray frame is not a request, so it never matches.
     """

@@ -1,4 +1,4 @@
-"""Faults and set values that took no effect: a scenario that passes with them has tested nothing."""
+"""Detects faults and set values that had no effect. A scenario that passes although its fault had no effect proves nothing."""
 
 from __future__ import annotations
 

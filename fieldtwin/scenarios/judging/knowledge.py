@@ -24,7 +24,7 @@ PENDING_S = 5.0
 class Knowledge:
     """The known values of one running system.
 
-    `known` are the names that expressions may contain. `hear` takes each event of the trace.
+    `known` are the names that expressions may contain. The caller passes each event of the trace to `hear`.
     """
 
     def __init__(self, system: System, known: Collection[str], bench: Bench) -> None:
@@ -38,14 +38,14 @@ class Knowledge:
         """Tags and variables that have had a value."""
 
     def hear(self, event: TraceEvent) -> None:
-        """Remember an event of the trace."""
+        """Process an event of the trace."""
         if event.kind in (TraceKind.TAG, TraceKind.STATE):
             self._last[event.where] = event
             if event.data.get("value") is not None:
                 self._valued.add(event.where)
 
     def commanded(self) -> None:
-        """Remember that the remote client sends a command now."""
+        """Record that the remote client sends a command now."""
         self._sent_s = self._bench.now_s()
 
     def look(self, function: str, name: str) -> Any:

@@ -18,7 +18,7 @@ MOST = 10
 
 def last_exchanges(exchanges: Iterable[DecodedExchange], check: CheckResult, devices: Collection[str]) -> list[str]:
     """Return the exchanges on the bus in the last `SECONDS` until `check` was decided, a heading first, ordered by
-    request.
+    the time of the request.
 
     If the check is about `devices`, only their exchanges are shown. If it names none of them, or those devices were
     silent, the exchanges of all devices are shown. Values of secret tags stay hidden, as in every decoded text.

@@ -15,7 +15,7 @@ from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.language.expression import Expression
 
 BUDGET = 2.0
-"""The limit for a late host: a check takes longer than its own time by at most this multiple of that time. After that it is
+"""The limit for a late host: a check may exceed its own time limit by at most this multiple of it. After that the check is
 INCONCLUSIVE.
 """
 LOOK_S = 0.03

@@ -20,8 +20,8 @@ MOST_REPORTED = 10
 
 
 class RefusedOutputs:
-    """The check of one scenario. `hear` takes the events of the trace, and `look` returns the first refusal that breaks the
-    check.
+    """The check of one scenario. The caller passes the events of the trace to `hear`, and `look` returns the first refusal that
+    breaks the check.
     """
 
     def __init__(self, scenario: Scenario) -> None:

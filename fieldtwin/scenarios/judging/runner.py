@@ -50,7 +50,7 @@ LAST_WRITE_S = 0.25
 LAST_REACTION_MOST_S = 2.0
 """The longest time in seconds for which a scenario continues after its last step, so that the PLC can react to it."""
 LATE_SHARE = 0.1
-"""If the host was late by more than this part of the time that a check is about, the check has proved nothing."""
+"""If the host was late by more than this fraction of a check's time limit, the check has proved nothing."""
 
 
 def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
@@ -61,8 +61,9 @@ def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
 
 def last_reaction_s(scenario: Scenario) -> float:
     """Return how long the rules of the whole run are checked after the last step, in seconds: two scans of the slowest
-    task and a write. Otherwise a step that is met at once would end the scenario before the PLC has reacted, and the
-    refusal of its output would never be seen."""
+    task and a write. Otherwise a step that is met immediately would end the scenario before the PLC has reacted, and a
+    refusal of the PLC's output would never be seen.
+    """
     plc = scenario.system.plc
     cycles_ms = [task.interval_ms for task in plc.tasks.values() if task.interval_ms is not None]
     return min(LAST_REACTION_MOST_S, 2 * max(cycles_ms, default=plc.cycle_ms) / 1000 + LAST_WRITE_S)
@@ -81,7 +82,7 @@ class ByChance:
 
 
 class ScenarioRunner:
-    """One scenario on one bench. ``await run()`` once."""
+    """Runs one scenario on one bench. Call ``await run()`` once."""
 
     def __init__(self, scenario: Scenario, bench: Bench, by_chance: ByChance | None = None) -> None:
         self.scenario = scenario
@@ -106,7 +107,7 @@ class ScenarioRunner:
                 self._refused.hear(event)
 
     async def run(self) -> ScenarioResult:
-        """Run all steps and return the verdict. If a part of the system is gone, the verdict is ERROR with that reason."""
+        """Run all steps and return the verdict. If a part of the system has ended, the verdict is ERROR with the reason."""
         scenario = self.scenario
         refused = refusal(scenario, self.bench.target, self.bench.can, self.bench.allowed)
         verdict, reason = Verdict.PASSED, ""
@@ -168,7 +169,7 @@ class ScenarioRunner:
             return Verdict.ERROR, str(e)
 
     async def _count_faults(self, verdict: Verdict, reason: str) -> tuple[Verdict, str]:
-        """Ask how often each fault took effect. A scenario that passed although a fault never took effect is INCONCLUSIVE."""
+        """Count the effects of each fault. A scenario that passed although a fault never took effect is INCONCLUSIVE."""
         try:
             struck = await self.bench.struck()
             self.faults = [one for one in struck if not one.is_set]
@@ -233,7 +234,7 @@ class ScenarioRunner:
     def _judged_on_time(self, broken: Broken, since_s: float) -> tuple[Verdict, str, str]:
         """Return the verdict on a broken check.
 
-        If the host was late by a large part of the time that it is about, it is INCONCLUSIVE.
+        If the host was late by more than `LATE_SHARE` of the check's time limit, the verdict is INCONCLUSIVE.
         """
         late_s = self.bench.host_late_s(since_s if broken.since_s is None else broken.since_s)
         if broken.verdict is Verdict.FAILED and broken.bound_s and late_s > LATE_SHARE * broken.bound_s:
@@ -282,7 +283,7 @@ class ScenarioRunner:
             self._met(wanted(expression.text, within_s), since_s, within_s, [expression])
 
     def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:
-        """Accept a check that was met. If it took longer than its own time, the lateness of this host must be the reason."""
+        """Accept a check that was met. Raises `Broken` if it took longer than `within_s` plus the host's lateness."""
         took_s = self.bench.now_s() - since_s
         if not within_s or took_s <= within_s:
             return
@@ -366,7 +367,7 @@ class ScenarioRunner:
 
     @staticmethod
     def _bound(expression: Expression, limit_s: float = 0.0) -> float:
-        """Return the shortest time limit of a check."""
+        """Return the shortest time in a check, in seconds: `limit_s` and the times in the expression; 0 if there is none."""
         return min([t for t in (limit_s, *expression.times_s) if t > 0], default=0.0)
 
     # -- time, and what holds all the time --------------------------------------------------------------------------------
@@ -404,8 +405,8 @@ class ScenarioRunner:
         )
 
     def _of_lateness(self, asked: bool) -> Verdict:
-        """Return the verdict on a check of the lateness of scans: a plant is responsible for it, a host that simulates
-        one is not.
+        """Return the verdict on a check of the lateness of scans: a plant is responsible for its lateness, a host that
+        simulates a plant is not.
         """
         ours = asked and Can.EXACT_TIME not in self.bench.can and self.bench.target != "real"
         return Verdict.INCONCLUSIVE if ours else Verdict.FAILED

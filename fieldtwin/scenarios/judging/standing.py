@@ -24,9 +24,9 @@ from fieldtwin.scenarios.language.words import WireForm
 
 
 class Standing:
-    """The standing rules of one scenario.
+    """The rules `always` and `never` of one scenario, and the rule that every part of the system runs.
 
-    `look` returns the first that is broken now; `results` is called once, at the end.
+    `look` returns the first rule that is broken now; `results` is called once, at the end.
     """
 
     def __init__(self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants) -> None:
@@ -66,7 +66,7 @@ class Standing:
         return None
 
     def results(self, now_ns: int, requests: Counter[str]) -> Iterator[CheckResult]:
-        """Yield a result for each rule, in the order of the file. `requests`: exchanges seen, by device."""
+        """Yield a result for each rule, in the order of the file. `requests`: the number of exchanges seen, by device."""
         if (part := self._running.result(now_ns)) is not None:
             yield part
         rules: Sequence[AlwaysRule | _NeverOnWire] = [*self._expressions, *self._wires]
@@ -76,7 +76,7 @@ class Standing:
 
 @dataclass
 class AlwaysRule:
-    """An expression that must always (`wanted` True) or never (False) be true, as soon as all its names have been read."""
+    """The rule that an expression is always (`wanted` True) or never (False) true, as soon as all its names have been read."""
 
     number: str
     expression: Expression
@@ -138,13 +138,13 @@ class AlwaysRule:
 
 
 def always_rule(stated: Stated) -> AlwaysRule:
-    """Return the rule for an invariant of the system file."""
+    """Return the rule that checks an invariant of the system file."""
     return AlwaysRule(stated.number, stated.expression, stated.wanted, stated.where)
 
 
 @dataclass
 class _NeverOnWire:
-    """An exchange that must never be seen on a device's bus, unless an expression is true at that time."""
+    """The rule that an exchange is never seen on a device's bus, unless the expression `unless` is true at that time."""
 
     number: str
     form: WireForm

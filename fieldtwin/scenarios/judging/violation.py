@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Violation:
-    """A broken rule. `since_s` is the start of the time that it checked; `where` is the rule's file and line, or that
-    of the logic that failed. `bound_s` is the time that the rule is about: if the host was late by a part of this time, the
-    violation proves nothing.
+    """A broken rule. `since_s` is the time from which it was checked; `where` is the file and line of the rule, or of the
+    logic that failed. `bound_s` is the rule's time limit in seconds: if the host was late by a part of it, the violation proves
+    nothing.
     """
 
     number: str

@@ -1,4 +1,4 @@
-"""Waivers of scenarios, in the form of `fieldtwin.conformance.core.waivers`.
+"""Waivers of scenarios (accepted failures with an expiry date), in the form of `fieldtwin.conformance.core.waivers`.
 
 The ID of a scenario is its file's name without .scenario.yaml, or the name in the scenario.
 """
@@ -18,7 +18,7 @@ _WAIVED = "waived: "
 
 
 def ids_of(path: Path, name: str) -> tuple[str, str]:
-    """Return the ids that a waiver may use for a scenario."""
+    """Return the ids that a waiver may use for a scenario: its case ID and its name."""
     return case_of(path), name
 
 
@@ -38,7 +38,7 @@ def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResu
 
 
 def all_well(results: Iterable[ScenarioResult]) -> bool:
-    """Return whether at least one scenario passed, and every other one passed or failed under a valid waiver."""
+    """Return whether at least one scenario passed, and every other scenario passed or failed under a valid waiver."""
     found = list(results)
     waived = [r.verdict is Verdict.SKIPPED and r.reason.startswith(_WAIVED) for r in found]
     passed = [r.verdict is Verdict.PASSED for r in found]

@@ -1,7 +1,7 @@
 """The rules of a scenario for the whole run: sequences in time, rates, cycles. They are checked at each check of the runner.
 
-Pure: the caller passes the time and the trace's events, and known values are read with `look`. This module reports broken
-rules; the caller decides whether a broken rule ends the run.
+This module performs no I/O: the caller passes the time, the trace's events and a function `look` that returns known values. The
+module reports broken rules; the caller decides whether a broken rule ends the run.
 """
 
 from __future__ import annotations
@@ -30,14 +30,17 @@ SAMPLES = 500
 
 
 class WholeRun:
-    """All these rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the end."""
+    """The rules `within`, `rate` and `cycle` of one scenario. `look` returns the first that is broken now.
+
+    `results` is called once, at the end.
+    """
 
     def __init__(
         self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants, *, by_chance: bool = False
     ) -> None:
         form = scenario.form
         self.requests: Counter[str] = Counter()
-        """Exchanges by device, as the runner counts them."""
+        """The number of exchanges by device; the runner increases it."""
         self.withins = [
             WithinRule(
                 f"within {n}",
@@ -74,7 +77,7 @@ class WholeRun:
 
     @property
     def pending_until_s(self) -> float:
-        """Return the time until which the run must continue so that every `within` is decided; 0 if none is open."""
+        """Return the time (s) until which the run must continue so that every `within` is decided; 0 if none is pending."""
         return max((one.due_s for one in self.withins if one.due_s is not None), default=0.0)
 
     def look(self) -> Violation | None:
@@ -124,7 +127,7 @@ def _condition(scenario: Scenario, form: Rate | Cycle, word: str, n: int) -> Exp
 
 
 def within_rule(followed: Followed) -> WithinRule:
-    """Return the rule for an invariant of the system file."""
+    """Return the rule that checks an invariant of the system file."""
     return WithinRule(followed.number, followed.where, followed.after, followed.then, followed.limit_s, invariant=True)
 
 
@@ -142,7 +145,7 @@ class WithinRule:
     then: Expression
     limit_s: float
     invariant: bool = False
-    """Whether it is an invariant of the system file."""
+    """Whether the rule is an invariant of the system file, not a rule of the scenario."""
     times: int = 0
     due_s: float | None = None
     _before: bool | None = None
@@ -158,7 +161,7 @@ class WithinRule:
 
     @property
     def known(self) -> bool:
-        """Return whether `after` was ever known."""
+        """Return whether the value of `after` was ever known."""
         return self._known
 
     @property
@@ -200,7 +203,7 @@ class WithinRule:
         return None
 
     def summary(self) -> tuple[str, bool]:
-        """Return what was seen, and whether the rule was judged."""
+        """Return what was observed, as text, and whether that was enough for a verdict."""
         seen = f"{self.times} times" if self.times else "0 times: nothing to check"
         if self._unknown_s is not None:
             return f"{seen}; whether {self.after.text} was unknown from {self._unknown_s:.3f} s on for a while", False
@@ -218,7 +221,7 @@ class _Rate:
     condition: Expression | None
     judged: int = 0
     seen: bool = False
-    """Whether the tag was ever published, or the device ever asked: otherwise a rate of 0 proves nothing."""
+    """Whether the tag was ever published, or the device ever polled: otherwise a rate of 0 proves nothing."""
     _samples: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=SAMPLES * 2))
 
     @property
@@ -255,7 +258,7 @@ class _Rate:
         return (self.form.tag or self.form.wire or "",)
 
     def summary(self) -> tuple[str, bool]:
-        """Return what was seen, and whether the rule was judged."""
+        """Return what was observed, as text, and whether that was enough for a verdict."""
         if not self.judged:
             return "0 checks: nothing to check", False
         if not self.seen:
@@ -265,7 +268,7 @@ class _Rate:
 
 
 class _Cycle:
-    """The rule on the time between changes of a name, or on the lateness of scans."""
+    """The limits for the time between changes of a tag or variable, or for the lateness of scans."""
 
     def __init__(self, number: str, where: str, form: Cycle, condition: Expression | None) -> None:
         self.number = number
@@ -344,6 +347,6 @@ class _Cycle:
         return Violation(self.number, self.text, got, self.names, bound_s, since_s, self.where, asks_lateness=late)
 
     def summary(self) -> tuple[str, bool]:
-        """Return what was seen, and whether the rule was judged."""
+        """Return what was observed, as text, and whether that was enough for a verdict."""
         unit = "looks" if self._late_s is not None else "changes"
         return f"{self.judged} {unit}{'' if self.judged else ': nothing to check'}", self.judged > 0

@@ -1,6 +1,6 @@
 """Metadata of a scenario's result: its case id, the role under test, and its impact level.
 
-This module uses no bench and runs nothing.
+This module does not run scenarios.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _danger_of(step: Step) -> Impact:
 
 
 def impact_of(scenario: Scenario) -> Impact:
-    """Return the highest impact level of all its steps and probes."""
+    """Return the highest impact level of all steps and probes of the scenario."""
     return max((impact for impact, _ in impacts(scenario)), key=lambda d: d.rank, default=Impact.OBSERVE)
 
 

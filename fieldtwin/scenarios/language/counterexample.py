@@ -1,8 +1,9 @@
-"""Write the shortest counterexample of a proof as a scenario: the inputs that can be caused from outside, in scan order.
+"""Write the shortest counterexample that a proof (`fieldtwin.plc.prove`) found for a PLC program as a scenario.
 
-A proof's scans are closer together than messages on a bus, so the scenario keeps their order and their minimum spacing.
-It ends with a check: the outputs that the broken program showed must never be seen. Inputs that cannot be caused from
-outside (a mailbox that is not emptied, a user-defined payload) appear in it as comments.
+The steps are the inputs that can be caused from outside, in scan order. A proof's scans are closer together than messages on a
+bus, so the scenario keeps only their order and their minimum spacing. It ends with a check: the outputs that the broken program
+showed must never be seen. Inputs that cannot be caused from outside (a mailbox that is not emptied, a user-defined payload)
+appear in it as comments.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ def _text(text: str) -> str:
 
 
 def _seen(system: System, program: str, proof: Proof, result: SearchResult) -> str:
-    """Return the broken program's outputs under its own names.
+    """Return the outputs that the broken program showed, as an expression ``PROGRAM.VARIABLE == VALUE and ...``.
 
-    An output that is bound to a device is covered by the device's tag.
+    Outputs that are bound to a device are left out, because the device's tag covers them.
     """
     bound = system.plc.programs[program].outputs
     words = {v.name: dict(v.words) for v in proof.make().variables.values()}
@@ -97,7 +98,7 @@ def _message(tag: str, data: bytes) -> tuple[str, str]:
 
 
 def _input(tag: str, value: Any, bad: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield the steps of an input. `bad` has the devices that were silenced."""
+    """Yield the steps that set an input `tag` to `value`. `bad` collects the devices that a fault has silenced."""
     device = tag.partition(".")[0]
     if isinstance(value, TagValue):
         if value.quality not in (Quality.GOOD, Quality.BAD):

@@ -1,6 +1,6 @@
 """The expressions of scenarios: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
 
-`fieldtwin.gateway.core.expressions` is their grammar. Names are tags and programs' variables, and any value may be unknown.
+`fieldtwin.gateway.core.expressions` defines their grammar. Names are tags and programs' variables, and any value may be unknown.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Words = Collection[str]
 """The texts that a name can equal. A mapping gives the number of each text: the name's value is a number."""
 NO_WORDS: Mapping[str, Words] = {}
 _OWN = ("plc.late", "command_pending")
-"""``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5 s."""
+"""``plc.late``: the seconds by which the last scan was late; ``command pending``: a remote command was sent in the last 5 s."""
 Look = Callable[[str, str], Any]
 """``look(function, name)`` returns the current value of a function of a tag or variable, or None if it is unknown."""
 
@@ -61,9 +61,9 @@ class Expression:
         self._parsed = Parsed(text, "expression", "for example: relay.state == 'ACTIVE'")
         self._tree = self._parsed.tree
         self.times_s = self._parsed.times_s
-        """The times that it contains, in seconds."""
+        """The times that the expression contains, in seconds."""
         self.asks_lateness = False
-        """Whether it contains ``plc.late``."""
+        """Whether the expression contains ``plc.late``."""
         self._known = known
         self._words = words
         self._prefix = prefix
@@ -75,7 +75,7 @@ class Expression:
             raise first
 
     def evaluate(self, look: Look) -> Any:
-        """Return its value now, or None if the value is unknown.
+        """Return the expression's value now, or None if the value is unknown.
 
         An operation on an unknown operand is unknown, and so is one without a result, such as a division by zero. `and`
         and `or` follow Kleene's three-valued logic: ``false and unknown`` is false, ``true or unknown`` is true.
@@ -124,7 +124,10 @@ class Expression:
             raise self._parsed.error(f"no function {name!r}", node, expected=expected, hint=hint)
 
     def _check_words(self, asked: ast.expr, text: ast.expr) -> None:
-        """Refuse a text that the other side of a comparison can never equal, and replace the name of a number by the number."""
+        """Check a text that is compared with `asked`, and replace the name of a number by the number.
+
+        Raises an error for a text that `asked` can never equal.
+        """
         if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
             return
         words: Words = ()
@@ -210,7 +213,7 @@ def _joined(parts: Iterable[bool | None], stop_at: bool) -> bool | None:
 
 
 def _computed(operation: Callable[..., Any], *operands: Any) -> Any:
-    """Return the result of an operation on numbers, as `_applied`; None for texts, which Python would repeat and join."""
+    """Return the result of an operation on numbers as `_applied` does; None for texts, which Python would repeat or join."""
     return None if any(isinstance(operand, str) for operand in operands) else _applied(operation, *operands)
 
 

@@ -63,7 +63,7 @@ class Scenario:
     probes: tuple[ScenarioProbe, ...] = ()
     profiles: tuple[Path, ...] = ()
     group: SystemGroup | None = None
-    """The systems, if the scenario's file describes several; `system` is then their `whole`."""
+    """The group of systems, if the scenario names a group; `system` is then `group.whole`."""
     used: set[str] = field(default_factory=set, compare=False)
     """The tags and variables that the scenario uses."""
     invariants: Invariants = field(default_factory=Invariants)
@@ -160,7 +160,7 @@ def _resolve(
 
 
 def _check_one_thing(file: YamlFile) -> None:
-    """Check, before the contents, that each step has only one word. Two words are usually caused by a missing hyphen."""
+    """Check that each step has only one keyword, before the contents are checked. Two are usually caused by a missing hyphen."""
     steps = file.data.get("steps")
     for n, step in enumerate(steps if isinstance(steps, list) else ()):
         said = [word for word in step if word in WORDS] if isinstance(step, dict) else []
@@ -173,7 +173,10 @@ def _check_one_thing(file: YamlFile) -> None:
 def _system(
     file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...], errors: ErrorCollector
 ) -> tuple[System, SystemGroup | None]:
-    """Return the system that the file names, from its folder or the shipped ones, or the `whole` of a group."""
+    """Return the system that the scenario names, from its own folder or the shipped ones, and None.
+
+    If it names a group of systems, return `group.whole` and the group.
+    """
     folder = Path(file.path).parent
     beside = folder / form.system
     named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
@@ -264,7 +267,7 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
-    """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor in what the systems of a group share."""
+    """Check a fault's target. Raises `WrongAim` if neither the system nor the shared medium of a group contains it."""
     if not scenario.incomplete.isdisjoint((spec.aim.device, spec.aim.bus)):
         raise FollowingError("a part of the system has an error", path=scenario.file.path)
     if scenario.group is not None:
@@ -274,7 +277,7 @@ def _aim(scenario: Scenario, spec: FaultSpec) -> None:
 
 
 def _check_of_group(file: YamlFile, form: ScenarioForm, group: SystemGroup) -> None:
-    """Refuse keys that apply to one system only."""
+    """Raise an error for keys that a scenario of a group may not have, because they apply to one system only."""
     for key in ("probes", "prototype"):
         if getattr(form, key):
             raise file.error(

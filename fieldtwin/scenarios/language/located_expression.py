@@ -22,7 +22,7 @@ def read_expression(
     prefix: str = "",
     incomplete: Container[str] = frozenset(),
 ) -> Expression:
-    """Return `text`, which is at `loc` in `file`, as an expression. `known`, `words` and `prefix` as for `Expression`.
+    """Return `text`, which is at `loc` in `file`, as an expression. `known`, `words` and `prefix` are those of `Expression`.
 
     `incomplete` are devices and programs that have errors, so that names in them cannot be checked. Raises `FileInvalid`.
     """

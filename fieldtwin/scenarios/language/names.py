@@ -13,9 +13,9 @@ from fieldtwin.twin.site.system import System
 def names_of(
     system: System, group: SystemGroup | None = None, errors: ErrorCollector | None = None
 ) -> dict[str, Words]:
-    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a group after the name of
-    their system. The value holds the words that a program's state can be; for a device's number it is a mapping from the
-    names in the tag's `values` to numbers. It is an empty tuple for a name that may equal any text.
+    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a group with the
+    name of their system before them. By name: the texts that a program's state can equal; for a number of a device, a mapping
+    from the names in the tag's `values` to numbers; an empty tuple if any text is possible.
 
     Raises `FileInvalid` for a program that cannot be created or bound; with `errors`, such errors are added to it.
     """

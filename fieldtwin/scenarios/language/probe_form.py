@@ -29,7 +29,7 @@ _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 class ProbeForm(BaseModel):
     """A probe. `endpoint` may contain ``${NAME}`` for an environment variable.
 
-    `serve` is used instead of it to read what the system's own gateway serves under that name.
+    `serve`, instead of `endpoint`, names a server of the system's own gateway, from which the probe reads.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
@@ -117,7 +117,7 @@ def _modbus(endpoint: Endpoint, where: str) -> Endpoint:
 
 
 def _profile(file: YamlFile, loc: tuple[Key, ...], name: str, form: ProbeForm) -> DeviceProfile:
-    """Return the registers as a separate profile, whose positions refer to the scenario file."""
+    """Return the registers as a device profile. Its errors refer to positions in the scenario file."""
     data = {
         "device": f"probe/{name.replace('_', '-')}",
         "source": "a scenario",

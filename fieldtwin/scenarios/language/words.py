@@ -1,4 +1,4 @@
-"""The words of a scenario file and the forms of their contents: strict, and independent of any system."""
+"""The keywords of a scenario file, and pydantic models of their contents, which do not depend on a system."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class _Form(BaseModel):
 
 
 class SendStep(_Form):
-    """The step `send`: the remote client commands a period."""
+    """The step `send`: the remote client sends a command with a sample period."""
 
     from_: str = Field(default="topside", alias="from")
     period_s: int
@@ -52,7 +52,7 @@ class WireForm(_Form):
 
 
 class Expect(_Form):
-    """One expectation: `tag` and its keys, or `wire` and its keys, or `that`."""
+    """One expectation: of a tag (`tag` and its keys), of exchanges on a bus (`wire` and its keys), or an expression (`that`)."""
 
     tag: str | None = None
     value: Number | bool | str | None = None
@@ -84,7 +84,7 @@ class Step(_Form):
 
 
 class Within(_Form):
-    """Each time that `after` becomes true, `then` must become true `within` a time."""
+    """The rule that each time `after` becomes true, `then` must become true `within` a time."""
 
     after: str
     then: str
@@ -92,8 +92,8 @@ class Within(_Form):
 
 
 class Rate(_Form):
-    """How often a tag must be published, or a device must be asked, in any period of `over`. The rule applies while `while` is
-    true.
+    """The rule on how often a tag must be published, or a device must be polled, in any period of `over`. It applies while
+    `while` is true.
     """
 
     tag: str | None = None
@@ -105,7 +105,7 @@ class Rate(_Form):
 
 
 class Cycle(_Form):
-    """The time between changes of a tag or variable; or, without one, how late a scan of the PLC may begin."""
+    """The rule on the time between changes of a tag or variable; without `changes_of`, on how late a PLC scan may begin."""
 
     changes_of: str | None = None
     min: Time | None = None
@@ -122,7 +122,7 @@ class ScenarioForm(_Form):
     prototype: str | None = None
     seed: int | None = None
     start: Literal["fresh"] | None = None
-    """Restart PLC, simulations and devices first, on every target."""
+    """`fresh`: PLC, simulations and devices are restarted before the scenario, on every target."""
     needs: list[str] = []
     stopped: list[Literal["plc"]] = []
     """Parts of the system that must stop in this scenario. A part that stops without being named here fails the scenario, and
@@ -136,7 +136,7 @@ class ScenarioForm(_Form):
     refused: list[str] = []
     """Tags whose outputs are expected to be refused, each at least once. Any other refused output fails the scenario."""
     judge: Literal["run"] | None = None
-    """Also apply the checks of a `run` in virtual time."""
+    """`run`: the checks of `fieldtwin run` in virtual time are also applied."""
     probes: dict[str, ProbeForm] = {}
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
@@ -145,5 +145,5 @@ WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
 
 
 def word_of(step: Step) -> str:
-    """Return the word of a step."""
+    """Return the keyword of a step: one of `WORDS`."""
     return next(word for word in WORDS if getattr(step, word) is not None)

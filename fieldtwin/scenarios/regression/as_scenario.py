@@ -1,7 +1,7 @@
 """Turn a recorded run into a scenario: its inputs become stimuli, its outputs expectations with tolerance and window.
 
 Stimuli are the commands of the remote client, faults and, on request, device values; the emulators of the scenario's prototype
-replay their recordings without stimuli. Pure: a `RunHistory` in, text out.
+replay their recordings without stimuli. This module performs no I/O: it converts a `RunHistory` to text.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from fieldtwin.twin.site.system import System
 BRIEF_NS = 200_000_000
 """The scenario does not expect states that last shorter than this (ns), because a check could come too late."""
 RESTLESS = 3
-"""A tag that changes more often than this between two stimuli is compared with the device's register, not with a value."""
+"""A tag that changes more often than this between two stimuli is compared with its device's register, not with a constant."""
 MOST_STEPS = 5_000
 AHEAD_NS = 200_000_000
-"""Time before the next stimulus at which tags are compared."""
+"""Time before the next stimulus at which tags are compared, in ns."""
 STOPPING_NS = 2 * NS_PER_S
-"""At the end of a run, outputs become safe and devices leave: these changes are not expected again."""
+"""The last part of a run, in ns, whose changes are not expected: the outputs become safe and the devices disconnect."""
 
 
 @dataclass(frozen=True)
 class ScenarioOptions:
     """The options of the scenario.
 
-    `share` of a value is its tolerance, `window_s` the allowed delay. `values`: the scenario also sets device values, for a
-    prototype that replays different recordings.
+    `share` is the tolerance of a value, as a fraction of it; `window_s` is the allowed delay. With `values`, the scenario also
+    sets device values, for a prototype that replays different recordings.
     """
 
     name: str
     system: str
-    """As the scenario file names it."""
+    """The system, as the scenario file is to name it."""
     share: float = 0.01
     window_s: float = 1.0
     seed: int | None = None
@@ -56,7 +56,7 @@ class _Stimulus:
 
 
 def as_scenario(system: System, history: RunHistory, wanted: ScenarioOptions) -> str:
-    """Return the scenario file.
+    """Return the text of the scenario file.
 
     Raises `UsageError` for a run without anything to expect, or with more steps than a scenario allows.
     """
@@ -80,7 +80,7 @@ def as_scenario(system: System, history: RunHistory, wanted: ScenarioOptions) ->
 
 
 def _faults(history: RunHistory) -> Iterator[_Stimulus]:
-    """Return the steps that start and end faults, with all their parameters."""
+    """Yield the steps that start and end faults, with all parameters of the faults."""
     for event in history.faults:
         if not event.data.get("on"):
             yield _Stimulus(event.t_ns, f"clear: {json.dumps(event.where)}")
@@ -110,7 +110,7 @@ def _stimuli(system: System, history: RunHistory, wanted: ScenarioOptions) -> It
 
 
 def _steps(system: System, history: RunHistory, wanted: ScenarioOptions, stimuli: list[_Stimulus]) -> Iterator[str]:
-    """Return pauses and expectations; an expectation that is met in time takes as long as in the run."""
+    """Yield the stimuli with the pauses and expectations between them. An expectation may take as long as in the run."""
     now_ns = 0
     last_ns = max(0, history.end_ns - STOPPING_NS)
     bounds = [*(s.t_ns for s in stimuli), last_ns]
@@ -142,7 +142,7 @@ def _steps(system: System, history: RunHistory, wanted: ScenarioOptions, stimuli
 
 
 def _seen(history: RunHistory, wanted: ScenarioOptions, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:
-    """Return an expectation for each value of a program's variable that lasted long enough to be observed."""
+    """Yield (time in ns, expectation) for each value of a program's variable that lasted long enough to be observed."""
     for name, changes in history.states.items():
         for n, change in enumerate(changes):
             until_ns = changes[n + 1].t_ns if n + 1 < len(changes) else history.end_ns
@@ -155,7 +155,7 @@ def _seen(history: RunHistory, wanted: ScenarioOptions, begin_ns: int, end_ns: i
 
 
 def _looks(system: System, history: RunHistory, wanted: ScenarioOptions, begin_ns: int, look_ns: int) -> Iterator[str]:
-    """Return the expectations at the end of a period: programs' numbers, tags by value, or as the device's register."""
+    """Yield the expectations at the end of a period: for numbers of programs, and for tags (a value or the device's register)."""
     within = f"within: {_s(0, wanted)}"
     last = look_ns >= history.end_ns - STOPPING_NS - AHEAD_NS
 
@@ -198,8 +198,8 @@ def _looks(system: System, history: RunHistory, wanted: ScenarioOptions, begin_n
 
 
 def _slack(changes: list[ValueChange], history: RunHistory, *, counts: bool = False) -> float:
-    """Return the tolerance for a field whose value may change between its recording and its check: its largest step, at least
-    two for a field that `counts` in its device.
+    """Return the tolerance for a field whose value may change between its recording and its check: its largest step, and
+    at least 2 if the field is a counter of its device (`counts`).
 
     0 for a field that only commands change: its value is known exactly.
     """

@@ -19,10 +19,11 @@ MOST_SHOWN = 1_000
 
 @dataclass(frozen=True)
 class Allowed:
-    """The allowed differences.
+    """The differences between two runs that are allowed.
 
-    Times may differ by `window_s`, values by `share` of their size or by `amounts` per field, latencies by `latency_share` or
-    `latency_ms`, whichever is more. Fields of `ignored` (or a whole device or program) are left out.
+    Times may differ by `window_s`, values by the fraction `share` or, for the fields in `amounts`, by the amount given there,
+    latencies by `latency_share` or `latency_ms`, whichever is more. Fields of `ignored` (or a whole device or program) are left
+    out.
     """
 
     window_s: float = 1.0
@@ -48,10 +49,10 @@ class Allowed:
 
 @dataclass(frozen=True, slots=True)
 class RunDifference:
-    """A difference.
+    """A difference between two runs.
 
-    `what` is field, value, quality, order, time, latency or problem; `where` the field, or the device and the request; `times`
-    is how often it occurred, and `t_s` the time of the first occurrence.
+    `what` is field, value, quality, order, time, latency or problem; `where` is the field, or the device and the
+    request; `times` is how often it occurred, and `t_s` the time of the first occurrence.
     """
 
     what: str
@@ -69,7 +70,7 @@ class RunDifference:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """The number of `compared` fields and services, the `differences`, and the runs' lengths in seconds."""
+    """The result of comparing two runs: the number of `compared` fields and services, the `differences`, the lengths in s."""
 
     compared: int
     differences: tuple[RunDifference, ...]
@@ -119,9 +120,9 @@ def _until(changes: list[ValueChange], end_ns: int) -> list[ValueChange]:
 def _states(
     name: str, old: list[ValueChange], new: list[ValueChange], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[RunDifference]:
-    """Compare states: the same values in the same order, each in time.
+    """Compare states: both runs must have the same values in the same order, at times that differ by at most `window_ns`.
 
-    In the last window, one of the runs may have one more.
+    In the last `window_ns`, one of the runs may have one more value.
     """
     for one, other in zip(old, new, strict=False):
         if not allowed.near(name, one.value, other.value):
@@ -154,7 +155,7 @@ def _otherwhen(name: str, one: ValueChange, other: ValueChange) -> RunDifference
 def _values(
     name: str, old: list[ValueChange], new: list[ValueChange], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[RunDifference]:
-    """Compare values: each value of one run occurred in the other one within the window."""
+    """Compare values: each value of one run must also have occurred in the other run, within `window_ns`."""
     for one, other, swapped in ((old, new, False), (new, old, True)):
         unmatched = list(_unmatched(name, one, other, end_ns, window_ns, allowed))
         if not unmatched:
@@ -189,7 +190,7 @@ def _alike(name: str, one: ValueChange, other: ValueChange, allowed: Allowed) ->
 
 
 def _between(name: str, change: ValueChange, around: Sequence[ValueChange]) -> bool:
-    """Return whether a moving value was passed: the other run was below and above it, and sampled at different moments."""
+    """Return whether the other run had values below and above this one, so that it passed the value between two samples."""
     value = change.value
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
@@ -198,7 +199,7 @@ def _between(name: str, change: ValueChange, around: Sequence[ValueChange]) -> b
 
 
 def _latencies(old: RunHistory, new: RunHistory, allowed: Allowed) -> list[RunDifference]:
-    """Compare the medians of response times: only a slower one is worse."""
+    """Compare the medians of response times; only a slower response is a difference."""
     found = []
     for key, before in sorted(old.latency_ns.items()):
         after = new.latency_ns.get(key, [])
@@ -215,7 +216,7 @@ def _latencies(old: RunHistory, new: RunHistory, allowed: Allowed) -> list[RunDi
 
 
 def _problems(old: RunHistory, new: RunHistory, allowed: Allowed) -> list[RunDifference]:
-    """Compare requests without a good answer: a new or much more frequent problem is a difference."""
+    """Compare the numbers of requests without a good answer; a new or much more frequent problem is a difference."""
     found = []
     for key, now in sorted(new.problems.items()):
         was = old.problems[key]

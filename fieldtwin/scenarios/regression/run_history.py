@@ -1,7 +1,8 @@
 """The history of a run from its trace or capture: tags, states and qualities over time, response times, inputs.
 
-Runs of different versions can be compared by this, and not by bytes or nanoseconds. Pure: events in, a `RunHistory` out. The
-changes of a field are limited; the rest is counted.
+Runs of different versions are compared by their histories, because bytes and exact times may differ between equal runs. This
+module performs no I/O: it converts events to a `RunHistory`. The number of changes of a field is limited; further changes are
+counted.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SELDOM = 5
 
 @dataclass(frozen=True, slots=True)
 class ValueChange:
-    """From `t_ns` on the field had `value` and `quality` ("" for a state, and for a value seen only on a bus)."""
+    """A change: from `t_ns` on, the field had `value` and `quality` ("" for a state, and for a value seen only on a bus)."""
 
     t_ns: int
     value: Any
@@ -51,10 +52,10 @@ class RemoteCommand:
 
 @dataclass
 class RunHistory:
-    """The changes of a run.
+    """The history of a run.
 
-    `tags` and `states`: changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` and `problems` by (device, service) and
-    (device, service, problem); `faults` as events have them.
+    `tags` and `states` are the changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` holds the response times by (device,
+    service), `problems` the numbers of failures by (device, service, problem); `faults` are the events of faults.
     """
 
     end_ns: int = 0
@@ -78,7 +79,7 @@ class RunHistory:
         return self.end_ns * 3 // (2 * times) if times >= SELDOM else 0
 
     def note(self, into: dict[str, list[ValueChange]], name: str, change: ValueChange) -> None:
-        """Record that `name` has this value, unless it had it before."""
+        """Add `change` to the changes of `name`, unless the value is the same as before."""
         changes = into.setdefault(name, [])
         if changes and changes[-1].says() == change.says():
             return
@@ -89,7 +90,7 @@ class RunHistory:
 
 
 def run_history(system: System, events: Iterable[TraceEvent]) -> RunHistory:
-    """Return the history of events in their order. For a capture, which has only frames, tags are the devices' answers."""
+    """Return the history of events in their order. For a capture, which has only frames, tag values are taken from replies."""
     history, decoder = RunHistory(), Decoder(system)
     answered: list[tuple[str, ValueChange]] = []
     sent: list[RemoteCommand] = []
@@ -130,7 +131,7 @@ def run_history(system: System, events: Iterable[TraceEvent]) -> RunHistory:
 
 
 def _is_measured(system: System, exchange: DecodedExchange, tag: str) -> bool:
-    """Return whether the tag is a measurement: not a message, of which each occurs once, and not a sensor without a sample."""
+    """Return whether the exchange carries a measured value of `tag`: not a message, and not a reply without a sample."""
     config = system.devices.get(exchange.device)
     if config is None or tag not in config.profile.tags:
         return False
@@ -148,9 +149,9 @@ def _count(history: RunHistory, exchange: DecodedExchange) -> None:
 
 
 def _mailbox(history: RunHistory, system: System, boxes: dict[str, tuple[int, ...]], exchange: DecodedExchange) -> None:
-    """Decode a message in an inbox: sequence, length in bytes, payload, two bytes per register.
+    """Add the command in a reply that reads an inbox: sequence number, length in bytes, payload with two bytes per register.
 
-    Each sequence number is one command.
+    A repeated sequence number is the same command, and is not added again.
     """
     config = system.devices.get(exchange.device)
     box = config.profile.inbox if config is not None else None

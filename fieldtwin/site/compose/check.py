@@ -33,7 +33,7 @@ class CommandLines(Protocol):
 
 
 class ComposeCheck:
-    """One check of one file. `systems` are the systems of the site that were read already, also those with errors."""
+    """The check of one compose file. `systems` are the systems of the site that were read already, also those with errors."""
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class ComposeCheck:
 
 
 def _commands_of(name: str) -> list[str]:
-    """Return the commands that the part of a variable's name after ``FIELDTWIN_`` may stand for, the longest name first."""
+    """Return the possible commands of a variable ``FIELDTWIN_NAME_OPTION``, given `name`; the longest command name first."""
     first, _, rest = name.lower().partition("_")
     return [f"{first}-{rest}", first] if rest else [first]
 

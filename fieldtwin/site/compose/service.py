@@ -63,7 +63,7 @@ class Service:
                 yield index + 1, self.words[index + 1]
 
     def local(self, inside: str) -> Path | None:
-        """Return the path on this computer of a path in the container, or None if it is below no mounted folder."""
+        """Return the path on this computer of the path `inside` the container; None if it is not below a mounted folder."""
         for folder, outside in sorted(self.folders.items(), key=lambda item: -len(item[0])):
             if PurePosixPath(inside).is_relative_to(folder):
                 return outside / PurePosixPath(inside).relative_to(folder)
@@ -130,7 +130,7 @@ def _folders(form: object, base: Path) -> dict[str, Path]:
 
 
 def _ports(form: object) -> dict[int, str]:
-    """Return the published ports of the container with the text of their entry. A range is left out."""
+    """Return the published ports: by port in the container, the text of the entry. Ranges of ports are left out."""
     found = {}
     for entry in form if isinstance(form, list) else ():
         text = str(entry.get("target", "")) if isinstance(entry, dict) else resolved(entry)

@@ -1,6 +1,6 @@
 """The setup of one test: a field simulator with its own endpoints and their traffic, optionally with gateway and PLC.
 
-A `WorkerBench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and is removed with it.
+A `WorkerBench` lives from `open` to `aclose`; its folder contains its files and virtual serial ports, and `aclose` removes it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fieldtwin.twin.site.system import System
 
 
 class WorkerBench:
-    """The field simulator of a system. Opening it raises the errors of a field simulator and of its emulators."""
+    """The field simulator of a system. `open` raises the errors of the field simulator and of its emulators."""
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
         self.system = system
@@ -77,8 +77,8 @@ class WorkerBench:
     def describe(self) -> dict[str, Any]:
         """Return the description of the bench.
 
-        It has ``buses`` and ``far`` (endpoints in words), and ``devices`` (bus, unit, profile, tags, model or
-        recording).
+        It has ``buses`` and ``far`` (endpoints of the buses, and of the remote ends of transmitters' links, as plain data), and
+        ``devices`` (bus, unit, profile, tags, model or recording).
         """
         buses = {}
         for name, listening in self.field.listening.items():
@@ -111,7 +111,7 @@ class WorkerBench:
             self.plc.alive()
 
     def set(self, device: str, tag: str, value: Any) -> None:
-        """Make `device` hold `value` for `tag`; with None it returns to its own value."""
+        """Set `tag` in `device` to `value`; None restores the recorded or simulated value."""
         self._tag(device, tag)
         self.field.faults.set_value(device, tag, value)
 
@@ -139,7 +139,7 @@ class WorkerBench:
         return tags[tag]
 
     def fault(self, said: Mapping[str, Any]) -> str:
-        """Inject a fault and return its ID. Its times count from now."""
+        """Inject a fault and return its ID. Times in its description count from now."""
         self.field.faults.start_ns = self.field._clock.monotonic_ns()
         return self.field.faults.inject(said)
 

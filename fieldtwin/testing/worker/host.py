@@ -99,7 +99,10 @@ class Host:
         return {"fieldtwin": __version__, "pid": os.getpid()}
 
     async def _device(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Open one device: the fields of `DeviceRequest`, `profiles` (folders), `beside` (the test's folder)."""
+        """Open one device.
+
+        `args` are the fields of `DeviceRequest`, `profiles` (folders) and `beside` (the test's folder).
+        """
         wanted = _wanted(args)
         beside = Path(args["beside"]) if args.get("beside") else None
         profiles = tuple(map(Path, args.get("profiles") or ()))
@@ -112,7 +115,11 @@ class Host:
             raise
 
     async def _system(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Open the field simulator of `system`; `prototype`, `profiles`, `recordings`, `speed`, `listen` as in `FieldConfig`."""
+        """Open the field simulator of a system.
+
+        `args` are `system`, `prototype`, `profiles`, `recordings`, `speed` and `listen`, as in `FieldConfig`, `seed`, and
+        `beside` (the test's folder).
+        """
         name, beside = str(args.get("system", "")), str(args.get("beside") or ".")
         folder = new_folder()
         try:

@@ -1,6 +1,6 @@
 """Write a system of one device as files: a test's description of a device becomes the input of a field simulator.
 
-So a device in a test has the same emulator, faults and names as in any system. Pure except for the files.
+A device in a test therefore has the same emulator, faults and names as in any system. The only I/O of this module is on files.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.twin.site.data_files import find, find_recording
 
 DEVICE, BUS = "device", "wire"
 RECORDINGS = {"ctd-reference": "cast.jsonl", "inclinometer-cia410": "incl.jsonl"}
-"""Shipped profiles whose recording has a different name."""
+"""By name of a shipped profile: the name of its recording, if that differs from the profile's name."""
 KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
 
 
@@ -27,7 +27,7 @@ KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
 class DeviceRequest:
     """A test's request for a device.
 
-    `on` is one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" selects the device's usual one.
+    `on` is the kind of connection: one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" selects the usual kind of the device.
     """
 
     device: str
@@ -99,10 +99,10 @@ def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
 
 
 def _stand_in(wanted: DeviceRequest, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
-    """Return the device's entry in the prototype file.
+    """Return the device's entry in the prototype file, which selects its emulator.
 
-    It replays the recording that was named; else it is a model of its profile, whose registers accept writes; else, if
-    registers alone are not sufficient, it replays the shipped recording.
+    The emulator replays the recording that the test names. Without a recording it is a model of the profile, whose registers
+    accept writes or, if registers alone are not sufficient, it replays the shipped recording.
     """
     common: dict[str, Any] = {"identity": wanted.identity} if wanted.identity else {}
     if profile.inbox is not None:
@@ -133,7 +133,7 @@ def _shipped(stem: str) -> str:
 def endpoint_words(endpoint: Endpoint) -> dict[str, Any]:
     """Return an endpoint as plain data.
 
-    It has `url`, and those of `path`, `host`, `port`, `interface`, `channel`, `baudrate`, `frame` that apply.
+    It contains `url`, and those of `path`, `host`, `port`, `interface`, `channel`, `baudrate`, `frame` that apply.
     """
     words: dict[str, Any] = {"url": str(endpoint)}
     if endpoint.scheme == "pty" or endpoint.is_serial:

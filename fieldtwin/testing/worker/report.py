@@ -1,4 +1,4 @@
-"""Write a test run's results as one HTML page with its requirement matrix, from the plugin's data, by the scenario report."""
+"""Write the results of a test run, as the pytest plugin sends them, as one HTML page with a requirement matrix."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 
 
 def write_report(args: dict[str, Any]) -> None:
-    """Write ``file`` from the data of a test run.
+    """Write the HTML page ``args["file"]`` from the data of a test run.
 
     The data are ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role, impact),
     ``title``, ``reproduce``, ``versions``. Raises `UsageError` for an unknown verdict.

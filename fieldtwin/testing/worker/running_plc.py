@@ -1,4 +1,4 @@
-"""Gateway and PLC of a bench's system, as processes connected to its emulated field, which a test observes and controls.
+"""Gateway and PLC of a bench's system, as processes connected to its field simulator, which a test observes and controls.
 
 These are the same processes as in every run, on the wall clock; retained values of earlier runs are not used. The module does
 not depend on tests, and changes nothing in the field simulator.

@@ -1,6 +1,7 @@
-"""A PLC program that a test steps: inputs in, scans of a constant cycle, outputs out. No task, no image, no wall clock.
+"""A PLC program that a test steps: the test sets inputs, runs scans with a constant cycle, and reads outputs.
 
 The program may be that of any system, in Python, Structured Text or a PLCopen export; the test decides how much time passes.
+There are no PLC tasks, no process image and no wall clock.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ QUALITIES = {quality.name.lower(): quality for quality in Quality}
 
 
 class SteppedProgram:
-    """One program.
+    """A PLC program that is executed scan by scan.
 
     An input is BAD, and has no value, until it is set; it keeps its value, except for messages, which are present for
     one scan.

@@ -1,6 +1,6 @@
 """The decoded traffic of a field simulator: requests with their answers, and messages; numbered and bounded.
 
-It is fed with bytes by the emulators, and with frames by a listener on a CAN bus. It does not depend on tests.
+The emulators pass bytes to the log, and a passive listener on each CAN bus passes frames. This module does not depend on tests.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class WireLog:
     def since(self, number: int) -> list[dict[str, Any]]:
         """Return the exchanges after `number`, in the order in which they ended, at most `AT_ONCE`.
 
-        They are plain data with their number, times (s since the log began) and words, without the values of secrets. A
+        They are plain data with their number, times (s since the log began) and descriptions, without the values of secrets. A
         call has no side effects.
         """
         found = [(n, e) for n, e in self._kept if n > number][:AT_ONCE]

@@ -1,7 +1,7 @@
-"""Decode the CANopen traffic on one CAN bus of a trace: its input is frames, its output texts and exchanges (CiA 301, CiA 305).
+"""Decode the CANopen traffic of one CAN bus of a trace: frames become texts and exchanges (CiA 301, CiA 305).
 
-Identifiers are those of the pre-defined connection set, except for PDOs, whose identifiers are learnt (see `node_map`).
-No clock.
+Identifiers are those of the pre-defined connection set, except for PDOs, whose identifiers are learnt (see `node_map`). The
+decoder reads no clock: the caller gives the time of each frame.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CanopenBusDecoder:
         self._find_pdos()
 
     def feed(self, frame: CanFrame, t_ns: int) -> tuple[str, list[DecodedExchange]]:
-        """Add a frame, in the order of the trace."""
+        """Decode the next frame of the trace; return its description and the exchanges that it completed."""
         if frame.error:
             return "error frame", []
         if frame.extended:
@@ -74,7 +74,7 @@ class CanopenBusDecoder:
         return f"{frame}: not a CANopen identifier", []
 
     def finish(self) -> list[DecodedExchange]:
-        """End the trace: requests that are still open count as unanswered."""
+        """End the trace: return the requests that are still open, as unanswered."""
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 

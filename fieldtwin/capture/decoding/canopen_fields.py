@@ -1,4 +1,4 @@
-"""The fields of CANopen frames: the meaning of the identifier, and the bytes of its service (CiA 301). Pure."""
+"""The fields of CANopen frames: the meaning of the identifier, and the bytes of its service (CiA 301). The module does no I/O."""
 
 from __future__ import annotations
 

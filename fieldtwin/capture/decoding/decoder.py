@@ -5,7 +5,8 @@
         for exchange in decoder.feed(event): ...
     rest = decoder.finish()
 
-Bounded: one open request per line, 64 per Modbus TCP connection, one transfer per node.
+The memory for open requests is bounded: one request per serial line, 64 per Modbus TCP connection, one transfer per CANopen
+node.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from fieldtwin.twin.site.system import System
 class Decoder:
     """A decoder of one trace, whose events are fed in order.
 
-    `served` are buses on which the remote client sends requests. `framings` states the protocol on endpoints that are
-    not a bus of `system`: rtu, ascii, mbap, udp or can; nothing there has a name.
+    `served` are buses on which the remote client sends requests. `framings` states the protocol on endpoints that are not a bus
+    of `system`: rtu, ascii, mbap, udp or can; their traffic is decoded without names of devices and tags.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Decoder:
     def decode(self, event: TraceEvent) -> Decoded:
         """Describe an event in words.
 
-        Every event of a trace has a description; an unknown bus's bytes are shown unchanged.
+        Every event of a trace has a description. For the bytes of an unknown bus the description contains the bytes themselves.
         """
         if event.kind is not TraceKind.FRAME:
             return Decoded(self._words(event), dict(event.data))
@@ -61,11 +62,13 @@ class Decoder:
         return Decoded(text, fields, tuple(done))
 
     def feed(self, event: TraceEvent) -> list[DecodedExchange]:
-        """Return the exchanges that an event ended: with an answer, with the next request, or as a message without an answer."""
+        """Return the exchanges that an event ended: by an answer, by the next request (the old one stays unanswered), or as a
+        message that needs no answer.
+        """
         return self._frame(event)[1] if event.kind is TraceKind.FRAME else []
 
     def finish(self) -> list[DecodedExchange]:
-        """End the trace: requests that are still open count as unanswered."""
+        """End the trace: return the requests that are still open, as unanswered."""
         wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
 
@@ -170,9 +173,10 @@ def exchanges(system: System, events: Iterable[TraceEvent], served: Collection[s
 
 
 def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[TraceEvent]:
-    """Return the content of a tap (`fieldtwin run --capture`) as FRAME events.
+    """Return the traffic of a capture (`fieldtwin run --capture`) as FRAME events.
 
-    `start_ns` is the tap's time of the run's start. Endpoints that do not belong to a bus of the system are omitted.
+    `start_ns` is the time of the run's start on the clock of the capture. Endpoints that do not belong to a bus of the system are
+    omitted.
     """
     buses = {str(bus.endpoint): name for name, bus in system.buses.items()}
     found = []
@@ -184,7 +188,7 @@ def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0
 
 
 def frame_event(seen: Captured, bus: str, start_ns: int = 0) -> TraceEvent:
-    """Return one item of a tap as a FRAME event of a bus."""
+    """Return one chunk or CAN frame of a capture as a FRAME event of `bus`."""
     data: dict[str, Any] = {"dir": "sent" if seen.direction is Direction.SENT else "received"}
     if isinstance(seen.item, CanFrame):
         data |= {"bytes": seen.item.data.hex(), "id": seen.item.can_id}

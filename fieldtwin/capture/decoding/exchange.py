@@ -19,8 +19,10 @@ Access = Literal["read", "write"]
 
 @dataclass(frozen=True, slots=True)
 class TouchedSpan:
-    """A piece of a device that an exchange touched: `count` registers or bits of `table` from `address`, or (table ``object``)
-    one CANopen object, whose index is `address`."""
+    """A range of registers or bits, or a CANopen object, that an exchange reads or writes.
+
+    It is `count` registers or bits of `table` from `address`, or (table ``object``) the one object with the index `address`.
+    """
 
     access: Access
     table: Table | Literal["object", "file"]

@@ -1,7 +1,7 @@
 """The fields of one frame, explained for a reader who does not know the protocol by heart.
 
-`modbus_fields` and `canopen_fields` make them. They never raise, and their spans cover every byte exactly once, in order. A
-span of length 0 explains what is not among the bytes, such as a CAN identifier. Pure.
+`modbus_fields` and `canopen_fields` create them. These functions never raise, and their spans cover every byte exactly once,
+in order. A span of length 0 explains a part that is not among the bytes, such as a CAN identifier. The module does no I/O.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Decode LSS as a passive listener (CiA 305): requests on 7E5h, replies on 7E4h. Pure; keeps one request."""
+"""Decode LSS as a passive listener (CiA 305): requests on 7E5h, replies on 7E4h. Does no I/O; stores one open request."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class LssWatch:
         self._open: DecodedExchange | None = None
 
     def feed(self, data: bytes, reply: bool, t_ns: int) -> tuple[str, list[DecodedExchange]]:
-        """Add a frame with one of the two LSS identifiers."""
+        """Decode a frame with an LSS identifier (`reply`: 7E4h); return its description and the exchanges that it completed."""
         if not data:
             return "LSS without data", []
         return self._reply(data, t_ns) if reply else self._request(data, t_ns)
@@ -47,7 +47,7 @@ class LssWatch:
         return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
 
     def finish(self) -> list[DecodedExchange]:
-        """End the trace: a request that is still open counts as unanswered."""
+        """End the trace: return the request that is still open, as unanswered."""
         now, self._open = self._open, None
         if now is None:
             return []

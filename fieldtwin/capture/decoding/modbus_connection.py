@@ -1,7 +1,7 @@
-"""Decode one Modbus connection of a trace: its input is the chunks of both directions, its output texts and exchanges.
+"""Decode one Modbus connection of a trace: the chunks of both directions become texts and exchanges.
 
-On a serial line one request is awaited at a time, and the next one ends it; on MBAP replies are matched by their
-transaction ID. A frame that answers no request is a stray. No clock: times come with the chunks.
+On a serial line at most one request is open, and the next request ends it; on MBAP replies are matched by their transaction
+ID. A frame that answers no request is a stray. The decoder reads no clock: the caller gives the time of each chunk.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ class _Open:
 
 
 class ModbusConnectionDecoder:
-    """One Modbus connection.
+    """The decoder of one Modbus connection.
 
-    `framing` is rtu, ascii, mbap or udp. `echo`: sent bytes come back first. `served`: the remote side is the client.
+    `framing` is rtu, ascii, mbap or udp. `echo`: the line returns the sent bytes before the reply. `served`: the remote side is
+    the client.
     """
 
     def __init__(
@@ -68,11 +69,13 @@ class ModbusConnectionDecoder:
         return {unit: known.tags for unit, known in self._units.items()}
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[DecodedExchange]]:
-        """Add a chunk, in the order of the trace. Each text describes a whole or partial frame."""
+        """Add a chunk, in the order of the trace. Return texts, one for each whole or partial frame, and the completed
+        exchanges.
+        """
         return self._take_requests(data, t_ns) if sent != self.served else self._take_replies(data, t_ns)
 
     def finish(self) -> list[DecodedExchange]:
-        """End the trace: requests that are still open count as unanswered."""
+        """End the trace: return the requests that are still open, as unanswered."""
         texts: list[str] = []
         done: list[DecodedExchange] = []
         self._settle(texts, done)
@@ -171,7 +174,7 @@ class ModbusConnectionDecoder:
         return Expected(opened.frame.unit, opened.asked.function, opened.asked.reply_bytes)
 
     def _settle(self, texts: list[str], done: list[DecodedExchange]) -> None:
-        """End the reply when a new request begins: the bytes so far are a complete reply, or noise."""
+        """End the current reply, because a new request begins: the bytes so far are either a complete reply or noise."""
         self._judge(self._replies.flush(self._expected()), texts, done)
 
     def _judge(self, frames: Iterable[ModbusFrame], texts: list[str], done: list[DecodedExchange]) -> None:

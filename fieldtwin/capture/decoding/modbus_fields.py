@@ -1,6 +1,7 @@
 """The fields of Modbus frames: header, unit ID, function, addresses in both notations, counts, data with its tags, check sum.
 
-Clauses: AP is the Modbus Application Protocol, SL Modbus over Serial Line, TG the messaging guide for TCP/IP. Pure.
+Clauses: AP is the Modbus Application Protocol, SL Modbus over Serial Line, TG the messaging guide for TCP/IP. The module does
+no I/O.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def _rtu(is_request: bool, data: bytes, asked: DecodedRequest | None, units: Uni
 
 
 def _ascii(is_request: bool, data: bytes, request: bytes, units: Units) -> list[FieldSpan]:
-    """Explain the binary content, and stretch its fields to two characters for each byte."""
+    """Return the fields of an ASCII frame: those of its binary content, each stretched to two characters for each byte."""
     end = len(data.rstrip(b"\r\n"))
     body = _from_hex(data[1:end])
     reader = FieldReader(data)
@@ -180,7 +181,7 @@ class _Data:
         self._table: Table = TABLES.get(function, "holding")
 
     def read(self, is_request: bool) -> None:
-        """Take the fields of the function."""
+        """Divide the data into the fields of the function code."""
         function = self._function
         if function in (0x01, 0x02, 0x03, 0x04):
             self._range("") if is_request else self._counted_reply()
@@ -345,7 +346,9 @@ class _Data:
 
 
 def _groups(tags: TagMap | None, whole: TouchedSpan, values: Mapping[str, object]) -> dict[int, tuple[int, list[str]]]:
-    """Return for each first address the end and the tags of registers that belong together."""
+    """Group the tags that share registers: return, for each first address, the address after the group and the names of its
+    tags.
+    """
     if tags is None:
         return {}
     profile = tags.profile

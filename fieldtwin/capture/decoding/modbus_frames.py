@@ -1,8 +1,8 @@
 """Reassemble chunks of bytes into Modbus frames: RTU, ASCII and MBAP, one direction of a connection each.
 
-Frames are found by length and check sum, as a bus analyser does; other bytes are noise and returned as such.
-Independent of the gateway's framers on purpose, because it checks them. Holds at most one frame; times come with the
-bytes.
+Frames are found by length and check sum, as a bus analyser does; other bytes are noise and returned as such. The module is
+independent of the gateway's framers on purpose, because it checks them. It stores at most one incomplete frame and reads no
+clock: the caller gives the time of the bytes.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _LAST_UNIT = 247
 
 @dataclass(frozen=True, slots=True)
 class ModbusFrame:
-    """A frame of unit ID `unit` (-1: not readable), whose last byte came at `t_ns`.
+    """A frame of unit ID `unit` (-1: not readable), whose last byte arrived at `t_ns`.
 
-    `bad` is its fault, "" for a good frame. `transaction` is MBAP's, -1 elsewhere.
+    `bad` is its fault, "" for a good frame. `transaction` is the transaction ID of MBAP, -1 for other framings.
     """
 
     t_ns: int
@@ -36,7 +36,9 @@ class ModbusFrame:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """The reply that a serial line waits for: from `unit`, to `function`, with `pdu_bytes` (0: stated by the reply)."""
+    """The reply that a serial line waits for: from `unit`, to `function`, with `pdu_bytes` (0: the reply itself states its
+    length).
+    """
 
     unit: int
     function: int
@@ -69,7 +71,7 @@ class Splitter(ABC):
         return self._split(expected, False)
 
     def flush(self, expected: Expected | None = None) -> list[ModbusFrame]:
-        """End the present frame: no further bytes belong to it. The bytes so far are a complete frame, or noise."""
+        """End the present frame: no further bytes belong to it. Return the bytes so far as a complete frame or as noise."""
         return self._split(expected, True) if self._buffer else []
 
     @abstractmethod
@@ -159,7 +161,7 @@ class RtuSplitter(Splitter):
 
 
 def _by_its_byte_count(head: bytearray, size: int, expected: Expected | None) -> int:
-    """Return the size of a reply to a read with an unexpected byte count and a right check sum; else 0."""
+    """Return the size of a reply to a read with an unexpected byte count and a correct check sum; else 0."""
     if (
         expected is None
         or expected.function not in _READS

@@ -1,6 +1,7 @@
 """Decode Modbus protocol data units into words: the content of a request, and that of its reply (AP 6).
 
-PDUs are read by position alone; a PDU that is too short is malformed and never an error. No framing, no device.
+PDUs are read by position alone; a PDU that is too short is malformed and never an error. The module knows neither framings
+nor device profiles.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ def _other(function: int, pdu: bytes) -> DecodedRequest:
 
 
 def _file_spans(pdu: bytes) -> list[TouchedSpan]:
-    """Return the records of functions 14h and 15h: reference type, file, record, length each (AP 6.14, 6.15)."""
+    """Return the records of functions 14h and 15h, each given by reference type, file, record and length (AP 6.14, 6.15)."""
     spans, at = [], 2
     while at + 7 <= len(pdu):
         file, record, count = _words(pdu[at + 1 : at + 7])
@@ -139,7 +140,7 @@ def _file_spans(pdu: bytes) -> list[TouchedSpan]:
 
 
 def parse_reply(asked: DecodedRequest, request: bytes, pdu: bytes) -> DecodedReply:
-    """Decode a reply PDU to that request. A reply to another function, or of another size, is malformed."""
+    """Decode the reply PDU `pdu` to a request. A reply with a different function code or an unexpected size is malformed."""
     if len(pdu) == 2 and pdu[0] == asked.function | 0x80:
         return DecodedReply(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
     if not pdu or pdu[0] != asked.function or (asked.reply_bytes and len(pdu) != asked.reply_bytes):

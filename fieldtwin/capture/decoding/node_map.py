@@ -1,7 +1,7 @@
 """The knowledge about a CANopen node without querying it: its tags, its objects' types, and the content of its PDOs.
 
 At first it comes from the profile, its EDS and the system file. Observed transfers then update it, so that a mapping applies
-as soon as it was written over SDO. Pure except for reading the EDS.
+as soon as it was written over SDO. The module reads the EDS and has no other input or output.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Decode the SDO transfers of one node as a passive listener (CiA 301, 7.2.4.3).
 
-Expedited, segmented and in blocks, both ways. The first eight bits of a frame identify it, except inside a block, where
-they number its segments: therefore the state is tracked. Other frames are strays. Pure; keeps one transfer.
+It decodes expedited, segmented and block transfers, uploads and downloads. The first eight bits of a frame identify it,
+except inside a block, where they number its segments: therefore the state is tracked. Other frames are strays. The module
+does no I/O and stores one open transfer.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _ABORT = 0x80
 
 @dataclass(slots=True)
 class Transfer:
-    """A transfer, as far as it is known. `data` is complete at its end; `aborted_by` is client or server."""
+    """A transfer, as far as it is known. `data` is complete when the transfer has ended; `aborted_by` is client or server."""
 
     upload: bool
     index: int
@@ -52,8 +53,8 @@ class Transfer:
 class Seen:
     """The meaning of a frame.
 
-    `done`: the transfer that it ended. `dropped`: one that a new request left without an answer. `stray`: a frame of
-    the server that answers no request.
+    `done` is the transfer that the frame ended, and `dropped` the transfer that it left without an answer by beginning a new one.
+    `stray`: a frame of the server that answers no request.
     """
 
     text: str

@@ -1,7 +1,7 @@
 """Find the tags of a profile in a range of registers or in an object, and decode their values in engineering units.
 
-Values are decoded with the driver's codec (fieldtwin.gateway.devices.codec): a report shows how the gateway read the
-bytes. Pure.
+Values are decoded with the driver's codec (fieldtwin.gateway.devices.codec), so a report shows the values that the gateway
+read from the same bytes. The module does no I/O.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class _Plan:
 
 
 class TagMap:
-    """The tags of one device. Keeps scale factors, which may be read before the values that they scale."""
+    """The tags of one device. It stores the scale factors, because they may be read before the values that they scale."""
 
     def __init__(self, profile: DeviceProfile) -> None:
         self.profile = profile
@@ -145,7 +145,7 @@ _OBJECT_BYTES = {
 
 
 def show_value(value: object, digits: int = 7) -> str:
-    """Format a value: numbers to `digits` places, text in quotes, ``none`` for a missing value."""
+    """Format a value: numbers to `digits` significant digits, text in quotes, ``none`` for a missing value."""
     if value is None:
         return "none"
     if isinstance(value, float):

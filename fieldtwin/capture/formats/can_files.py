@@ -1,9 +1,9 @@
 """Read CAN logs of other programs (Vector's .asc and .blf, PEAK's .trc) through python-can's readers, as frames with times.
 
-One of the files that use python-can, and it uses only its readers: no interface is opened. The readers do not check a file.
-Therefore this module checks the size of lines and packed blocks before they are read, and the frames afterwards, and translates
-every error of the readers into `FileInvalid`. CAN FD and error frames are counted and omitted. These formats lose data: .trc
-has no error frames, .asc and .blf have the times of their writers.
+The module uses only the readers of python-can: no interface is opened. The readers do not check a file. Therefore this module
+checks the size of lines and packed blocks before they are read, and the frames afterwards, and translates every error of the
+readers into `FileInvalid`. CAN FD and error frames are counted and omitted. These formats lose data: .trc has no error
+frames, and the times in .asc and .blf are those that the writing program chose.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _check_blocks(path: Path) -> None:
 
 
 def _check_objects(data: bytes, path: Path, container_at: int) -> bytes:
-    """Check that objects have a size with which a reader advances and ends.
+    """Check that the size of each object lets a reader advance to the next object and reach the end.
 
     Returns the bytes of an object that continues in the next container.
     """

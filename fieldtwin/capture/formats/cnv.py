@@ -1,9 +1,9 @@
-"""Import Sea-Bird casts (.cnv, plain, .gz or .bz2) as recordings of the `ctd`.
+"""Import Sea-Bird CTD casts (.cnv, plain, .gz or .bz2) as recordings of the device `ctd`.
 
-The format is Sea-Bird's "converted data file": header lines that begin with ``*`` (instrument) or ``#`` (processing),
-one line ``*END*``, then one row per scan with columns 11 characters wide (SBE Data Processing manual, file formats and
-short variable names). Text is Latin-1 in practice. Streaming: memory does not grow with the file. The module does not
-depend on runs, emulators or the command line.
+The format is Sea-Bird's "converted data file": header lines that begin with ``*`` (instrument) or ``#`` (processing), one
+line ``*END*``, then one row per scan with columns 11 characters wide (SBE Data Processing manual, file formats and short
+variable names). Text is Latin-1 in practice. Files are read row by row: memory does not grow with the file. The module does
+not depend on runs, emulators or the command line.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def import_cnv(
 
 
 class _Lines:
-    """The file's lines as text, decompressed on the way, with the current line number."""
+    """The file's lines as text, decompressed while they are read, with the current line number."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:
         self.path = path
@@ -188,7 +188,7 @@ class _Lines:
     def _next(self) -> bytes:
         try:
             line = self._text.readline(MAX_LINE_BYTES + 1)
-        except (EOFError, zlib.error, OSError) as error:  # a bad or cut archive, or the disk
+        except (EOFError, zlib.error, OSError) as error:  # a damaged or truncated archive, or a disk error
             raise self.invalid(f"cannot read on after this line: {error}") from error
         if len(line) > MAX_LINE_BYTES:
             raise self.invalid("the line is too long: not a .cnv file", line=self.number + 1)
@@ -318,7 +318,7 @@ def _copy_rows(lines: _Lines, header: CnvHeader, plan: _Plan, writer: RecordingW
 
 
 def _cells(line: str, header: CnvHeader, lines: _Lines) -> list[str]:
-    """Return a row's columns. Values that fill their width touch their neighbours: then the width separates them."""
+    """Return a row's columns. If values fill the column width, no blank separates them; the row is then divided by that width."""
     cells = line.split()
     if len(cells) == header.nquan:
         return cells

@@ -1,8 +1,8 @@
-"""Tables of measurements as CSV: a time column and signals, read as a recording of signals, and written from one.
+"""Read tables of measurements in CSV (a time column and signals) as recordings of signals.
 
-The first row names the columns (``pressure (dbar)``: the unit in brackets). Columns are separated by commas, semicolons
-or tabs; with semicolons the numbers may have a decimal comma. Times are seconds, milliseconds or ISO 8601. Reads a line
-at a time; an error states its line.
+The first row names the columns (``pressure (dbar)``: the unit in brackets). Columns are separated by commas, semicolons or
+tabs; with semicolons the numbers may have a decimal comma. Times are seconds, milliseconds or ISO 8601. The file is read line
+by line; an error states its line.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ class _Clock:
 
 
 def _value(text: str) -> float:
-    """Return a number, or NaN for other text.
+    """Return the number in `text`, or NaN for other text.
 
     A comma is a decimal comma: if commas separate columns, no field contains one.
     """

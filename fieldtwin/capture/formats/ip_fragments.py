@@ -1,4 +1,4 @@
-"""Reassemble fragmented IP packets (RFC 791 3.2, RFC 8200 4.5). Bounded; independent of the payload."""
+"""Reassemble fragmented IP packets (RFC 791 3.2, RFC 8200 4.5), in bounded memory and without knowledge of the payload."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _Packet:
 class Fragments:
     """A reassembly of packets from fragments.
 
-    `given_up` counts packets with a missing fragment, and invalid ones.
+    `given_up` counts packets that were dropped because a fragment is missing or because they are invalid.
     """
 
     def __init__(self) -> None:

@@ -34,10 +34,9 @@ def too_much(path: Path, packed_bytes: int) -> FileInvalid:
 
 
 def unpacked(raw: io.BufferedReader, path: Path) -> BinaryIO | None:
-    """Return a reader of the unpacked content of `raw`, by its first bytes; None if it is neither gzip nor bzip2.
+    """Return a reader of the unpacked content of `raw`; None if its first bytes show neither gzip nor bzip2.
 
-    The reader raises `FileInvalid` beyond `most_unpacked`, and `OSError`, `EOFError` or `zlib.error` if the data is
-    damaged.
+    The reader raises `FileInvalid` beyond `most_unpacked`, and `OSError`, `EOFError` or `zlib.error` if the data is damaged.
     """
     magic = raw.peek(3)[:3]
     if magic[:2] == b"\x1f\x8b":

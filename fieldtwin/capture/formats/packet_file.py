@@ -1,8 +1,8 @@
 """Read packets from pcap and pcapng files, in order: time, link type, and the bytes from the link layer on.
 
-Reads a packet at a time, so that a file of any size needs no more memory than its longest packet. A file whose last
-packet is truncated is read up to it (`truncated`); any other error is `FileInvalid` with the offset. This module must
-not depend on the content of the packets.
+The module reads one packet at a time, so that a file of any size needs no more memory than its longest packet. If the last
+packet of a file is truncated, the packets before it are read and `truncated` is set; any other error is `FileInvalid` with
+the offset. This module must not depend on the content of the packets.
 
 Sources: draft-ietf-opsawg-pcap (pcap), draft-ietf-opsawg-pcapng (pcapng).
 """
@@ -39,7 +39,7 @@ Packet = tuple[int, int, bytes]
 
 
 def is_packet_file(head: bytes) -> bool:
-    """Return whether a file that begins with these four bytes can be read here."""
+    """Return whether `PacketFile` can read a file that begins with these four bytes."""
     return head[:4] in _CLASSIC or head[:4] == _SECTION
 
 

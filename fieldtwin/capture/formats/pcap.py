@@ -1,9 +1,9 @@
 """Write captures as pcap files, so that other tools (tshark, Wireshark) can read them.
 
-A tap receives chunks and frames, not packets. This module creates the missing layers around them, so that a dissector finds what
-it expects: Ethernet, IP and TCP with right check sums and sequence numbers around Modbus/TCP, nothing at all around Modbus RTU
-(DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the protocols themselves is made,
-changed or interpreted here: this module must never depend on Modbus or CANopen.
+A capture contains chunks and frames, not packets. This module creates the missing layers around them, so that a dissector
+finds what it expects: Ethernet, IP and TCP with correct check sums and sequence numbers around Modbus/TCP, nothing at all
+around Modbus RTU (DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the protocols
+themselves is made, changed or interpreted here: this module must never depend on Modbus or CANopen.
 
 Sources: the pcap file format and its link types (https://www.tcpdump.org/linktypes.html), RFC 791, RFC 9293.
 """
@@ -31,7 +31,7 @@ LINKTYPE_USER0 = 147
 LINKTYPE_CAN_SOCKETCAN = 227
 
 MAGIC_NS = 0xA1B23C4D
-"""Time stamps in nanoseconds, in the byte order of the file: big endian."""
+"""The magic number of a pcap file with times in nanoseconds and numbers in big-endian byte order."""
 SNAPLEN = 65_535
 
 MODBUS_PORT = 502
@@ -44,14 +44,14 @@ _SYN, _ACK, _PSH = 0x02, 0x10, 0x08
 
 KEPT_ENDPOINTS = 1_024
 MAX_LINE_BYTES = 1 << 20
-"""Longer lines are refused; the longest chunk that a tap sees is a fraction of it."""
+"""Maximum length in bytes of a line of a capture; longer lines are refused. The longest real chunk is a fraction of it."""
 
 
 def read_capture(path: Path, refusals: list[dict[str, Any]] | None = None) -> Iterator[Captured]:
-    """Yield the content of a file written by `TapFile`, in order, a line at a time. A truncated last line is omitted.
+    """Yield the content of a capture written by `TapFile`, in order, a line at a time. A truncated last line is omitted.
 
-    Writes that did not reach their device are not traffic: they go to `refusals`. Raises `FileInvalid` when the file
-    cannot be read, and for any other invalid line with its number.
+    Writes that did not reach their device are not traffic: they are appended to `refusals`. Raises `FileInvalid` when the file
+    cannot be read, and with the line number for any other invalid line.
     """
     try:
         with open_input(path) as file:
@@ -61,7 +61,7 @@ def read_capture(path: Path, refusals: list[dict[str, Any]] | None = None) -> It
                 try:
                     read = json.loads(line)
                     if "started" in read:
-                        continue  # a session of `WireLog`
+                        continue  # the header of a session in a `FrameLog`
                     if "refused" in read:
                         if refusals is not None:
                             refusals.append(dict(read["refused"]))
@@ -93,7 +93,7 @@ def captured_of(line: dict[str, object]) -> Captured:
 
 @lru_cache(maxsize=KEPT_ENDPOINTS)
 def _endpoint(text: str) -> Endpoint:
-    """Parse an endpoint. Cached, because a capture repeats the same few in every line."""
+    """Parse an endpoint. Results are cached, because the lines of a capture repeat a few endpoints."""
     return Endpoint.parse(text)
 
 
@@ -129,8 +129,8 @@ def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet
 def write_pcap(path: Path, captured: Iterable[Captured], endpoint: Endpoint, utc_offset_ns: int = 0) -> int:
     """Write one endpoint's conversation as a pcap file; return the number of packets.
 
-    `utc_offset_ns` is added to the captures' monotonic times to convert them to UTC. Raises `FileInvalid` where the
-    file cannot be written.
+    `utc_offset_ns` is added to the monotonic times of the capture to convert them to UTC. Raises `FileInvalid` if the file cannot
+    be written.
     """
     count = 0
     try:
@@ -161,7 +161,7 @@ Chunk = tuple[int, Direction, bytes]
 
 
 def _turns(chunks: Iterable[Chunk]) -> Iterator[Packet]:
-    """Yield a packet for each sent chunk of a line, and one for all bytes received before the next."""
+    """Yield one packet for each sent chunk of a serial line, and one for all bytes received before the next sent chunk."""
     reply, reply_ns = b"", 0
     for t_ns, direction, data in chunks:
         if direction is Direction.RECEIVED:

@@ -1,9 +1,9 @@
 """Convert the output of modpoll and mbpoll into exchanges: the request that they report, and the values that they received.
 
-They print values and no bytes, so the reply is reconstructed from them: 16-bit registers and bits as they are, 32-bit values in
-the word order that the output names, or in modpoll's order (low word first) if it names none. They print no times; polls are
-spaced by their rate. A poll that failed with a named exception has that exception; any other failure has no reply. Pure text;
-bounded by a line.
+Both programs print values and no bytes, so the reply is reconstructed from the values: 16-bit registers and bits as they are,
+32-bit values in the word order that the output names, or in modpoll's order (low word first) if it names none. They print no
+times; polls are spaced by their rate. A poll that failed with a named exception becomes an exchange with that exception; any
+other failed poll has no reply. The module opens no files and holds one poll in memory.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class _Asked:
 
 
 def read_polls(lines: Iterable[str], path: str = "") -> Iterator[RecordedExchange]:
-    """Yield the polls of one session or of several in sequence. Raises `FileInvalid` with the line."""
+    """Yield the polls of one or several sessions in sequence. Raises `FileInvalid` with `path` and line."""
     asked, cells, failed, polls, number = _Asked(), dict[int, str](), "", 0, 0
     polling = False
     for number, line in enumerate(lines, 1):
@@ -126,7 +126,7 @@ def _read_head(asked: _Asked, text: str) -> None:
 
 
 def _number(text: str) -> int:
-    """Parse ``0x0003``, ``3``, ``-5``, ``65531 (-5)``."""
+    """Return the integer in texts such as ``0x0003``, ``3``, ``-5``, ``65531 (-5)``."""
     first = text.split()[0]
     return int(first, 16) if first.lower().startswith("0x") else int(first)
 

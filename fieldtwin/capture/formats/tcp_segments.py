@@ -1,8 +1,8 @@
 """Extract the bytes of conversations from packets: link layer, IP, UDP, and TCP reassembled.
 
 `Conversations` is fed packets and calls back with the payload of each TCP or UDP conversation, in the order of sending;
-`Segments` reassembles one direction of a TCP stream. Sans-IO and bounded, in the number of conversations and in the
-bytes that wait for a missing segment. It must never depend on the payload's protocol.
+`Segments` reassembles one direction of a TCP stream. Sans-IO; the number of conversations and the bytes that wait for a
+missing segment are bounded. The module must never depend on the payload's protocol.
 
 Sources: RFC 791, 8200, 768, 9293; link types: https://www.tcpdump.org/linktypes.html.
 """
@@ -65,8 +65,9 @@ class Segments:
         return self._give_up() if full else []
 
     def acknowledged(self, number: int) -> list[tuple[int, bytes]]:
-        """Note that the receiver has all data before `number`. A gap before it is missing only in the capture, so it will not
-        be sent again."""
+        """Note that the receiver has all data before `number`; return the available data, as `add`. A gap before `number`
+        exists only in the capture, so it will not be filled.
+        """
         found: list[tuple[int, bytes]] = []
         while self._waiting and 0 < (number - self.next) % _SEQUENCES < _SEQUENCES // 2:
             found += self._give_up()
@@ -104,7 +105,9 @@ class Segments:
 
 @dataclass(slots=True)
 class Conversation:
-    """Two sides that talk over TCP or UDP. `client` is the one that opened it (None where the capture did not see that)."""
+    """A conversation of two sides over TCP or UDP. `client` is the side that opened it (None if the capture does not show
+    that).
+    """
 
     udp: bool
     sides: tuple[Side, Side]
@@ -123,7 +126,7 @@ OnEnd = Callable[[Conversation], None]
 
 @dataclass(slots=True)
 class PacketCounters:
-    """The counts of packets. `carried` had a payload; `fragments` are IP packets with a missing fragment."""
+    """The counts of packets. `carried` had a payload; `fragments` are IP packets of which a fragment is missing."""
 
     packets: int = 0
     carried: int = 0
@@ -223,7 +226,7 @@ class Conversations:
             self.counters.cut_short += 1
             return
         head, total = (data[at] & 15) * 4, data[at + 2] << 8 | data[at + 3]
-        end = at + total if total else len(data)  # 0: the network card divided it later
+        end = at + total if total else len(data)  # 0: the network card divides the packet later
         if (data[at + 6] & 0x3F) | data[at + 7]:
             place = data[at + 6] << 8 | data[at + 7]
             key = data[at + 12 : at + 20], data[at + 9], data[at + 4 : at + 6]
@@ -251,7 +254,7 @@ class Conversations:
     def _piece(
         self, t_ns: int, key: Hashable, offset: int, more: bool, data: bytes, addresses: bytes, protocol: int
     ) -> None:
-        """Add a fragment of an IP packet; the last fragment yields the payload."""
+        """Add a fragment of an IP packet; when the packet is complete, process its payload."""
         whole = self._fragments.add(key, offset, data, more=more)
         if whole is not None:
             half = len(addresses) // 2

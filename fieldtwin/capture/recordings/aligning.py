@@ -1,10 +1,10 @@
-"""Find the position at which a live dialogue continues a recorded one, cell by cell.
+"""Find the position at which a live dialogue continues a recorded one, for each register and bit.
 
-An emulator of a recording gives each register and bit its recorded values one after the other. If it was read before,
-its values come from further on in the recording; a comparison by position would then report differences for the same device.
-So where exchanges differ, the live values are looked up in the recorded ones. A shifted match counts only if it is
-exact and contains at least two different values: a device with a constant value, or a different device, matches
-nothing. Values after the end of the recorded ones are not compared. Pure.
+An emulator of a recording gives each register and bit its recorded values one after the other. If it was read before, its
+values come from further on in the recording; a comparison by position would then report differences for the same device. So
+where exchanges differ, the live values are looked up in the recorded ones. A shifted match counts only if it is exact and
+contains at least two different values: a device with a constant value, or a different device, matches nothing. Values after
+the end of the recorded ones are not compared. The module does no I/O.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ Cell = tuple[int, str, int]
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """The position at which the values of a cell continue the recorded ones: index `at` of `recorded`, `compared` values."""
+    """The position at which the values of a cell continue the recorded ones.
+
+    `at` is the index of the first live value in the recorded values, `recorded` the number of recorded values, and `compared` the
+    number of values that were compared.
+    """
 
     unit: int
     where: str
@@ -38,7 +42,9 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Aligned:
-    """A pair to be compared. `recorded` None: not comparable, because the recording has no value at that position."""
+    """A recorded and a live exchange to be compared. `recorded` None: the recording has no value at that position to compare
+    with.
+    """
 
     recorded: RecordedExchange | None
     other: RecordedExchange
@@ -92,7 +98,7 @@ class _Series:
         return tail == self.recorded[: len(tail)] or all(value == self.recorded[-1] for value in tail)
 
     def shows(self, shift: int) -> bool:
-        """Return whether the match at `shift` has enough different values not to be chance."""
+        """Return whether the match at `shift` has enough different values that it is not a coincidence."""
         size = len(self.recorded) - shift
         tail = self.other[size:]
         begins_again = tail == self.recorded[: len(tail)] and any(value != self.recorded[-1] for value in tail)
@@ -193,7 +199,7 @@ class Dialogue:
     def _expected(
         self, recorded: RecordedExchange, other: RecordedExchange, seen: dict[Cell, int]
     ) -> RecordedExchange | None:
-        """Return the recorded exchange with the values of the positions that were found."""
+        """Return the recorded exchange, its values replaced by the recorded values at the positions that were found."""
         both = _values(recorded), _values(other)
         if both[0] is None or both[1] is None or len(both[0][1]) != len(both[1][1]):
             return recorded
@@ -237,9 +243,9 @@ def _reply(function: int, values: Sequence[int]) -> bytes:
 
 
 def _overlaps(live: Sequence[int], recorded: Sequence[int]) -> list[int]:
-    """Return the positions in `recorded`, ascending, from which on it equals `live` as far as both go.
+    """Return the ascending positions in `recorded` from which it equals `live`, up to the end of the shorter of the two.
 
-    Linear in their lengths (Knuth, Morris, Pratt).
+    The time is linear in the lengths of both (Knuth, Morris, Pratt).
     """
     if not live:
         return []

@@ -1,9 +1,9 @@
-"""Compare the behaviour of a device with that of another one or of a recording: outcomes, values and timing.
+"""Compare the behaviour of a device with that of a second device or of a recording: outcomes, values and timing.
 
-Fidelity has two figures. *Values*: the share of exchanges with the same outcome (values inside
-their tolerance, the same exception, the same silence). *Timing*: the similarity of the two distributions of latency, as
-the mean ratio of their quantiles. Pure and bounded: exchanges come in pairs, differences are kept up to a number and
-only counted beyond it.
+Fidelity has two figures. *Values*: the share of exchanges with the same outcome (values inside their tolerance, the same
+exception, or no reply on both sides). *Timing*: the similarity of the two distributions of latency, as the mean ratio of
+their quantiles. The module does no I/O. Exchanges are compared in pairs; a limited number of differences is stored, and
+further ones are only counted.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ MAX_DIFFERENCES = 1000
 MAX_LATENCIES = 200_000
 """Maximum number of latencies kept of each side; later ones are only counted."""
 LOOK_AHEAD = 10_000
-"""Maximum offset of the other recording; an exchange further away counts as missing."""
+"""Maximum number of the other side's exchanges that wait for a partner; an exchange that has no partner by then counts as
+missing.
+"""
 MAX_UNWRITTEN = 100_000
-"""Maximum number of cells that are remembered as targets of omitted writes."""
+"""Maximum number of registers and bits that are remembered as targets of omitted writes."""
 QUANTILES = tuple(q / 100 for q in range(5, 100, 5))
 FLOOR_S = 0.001
 """Added to both quantiles of a ratio, so that a tenth of a millisecond more than zero is not a difference."""
@@ -85,7 +87,7 @@ class ReplyDifference:
 
 @dataclass(frozen=True, slots=True)
 class LatencyRow:
-    """Latencies of one function on both sides: how many, and median, 90 and 99 % in seconds."""
+    """Latencies of one service on both sides: their number, and the median, the 90th and the 99th percentile in seconds."""
 
     service: str
     count: int
@@ -135,7 +137,7 @@ class Comparison:
 
 
 class Comparer:
-    """Compares pairs of exchanges that it is given one after the other. Call `result` after the last pair."""
+    """Compares pairs of exchanges that it is given in sequence. Call `result` after the last pair."""
 
     def __init__(self, rules: Rules | None = None, profile: DeviceProfile | None = None) -> None:
         self._rules, self._profile = rules or Rules(), profile
@@ -174,7 +176,7 @@ class Comparer:
         return not trial._result.by_kind
 
     def left_out(self, exchange: RecordedExchange) -> None:
-        """Count an exchange that was not repeated. The effect of a write that was omitted may be missing later."""
+        """Count an exchange that was not repeated. If it is a write, later reads may differ because its effect is missing."""
         self._result.left_out += 1
         asked = self._asked(exchange.request)
         if asked.write_span is None or not exchange.reply or exchange.reply[0] & 0x80:
@@ -184,7 +186,7 @@ class Comparer:
             self._unwritten.update((exchange.unit, *cell) for cell in _cells(asked.write_span))
 
     def not_compared(self) -> None:
-        """Count an exchange that was repeated but for which the recording has no value."""
+        """Count an exchange that was repeated, but with which no value of the recording can be compared."""
         self._result.not_compared += 1
 
     def shifted(self, shifts: Iterable[Shift]) -> None:
@@ -293,9 +295,10 @@ def compare_latencies(result: Comparison, kept: Mapping[str, tuple[array[float],
 def pairs_of(
     recorded: Iterable[T], other: Iterable[T], key_of: Callable[[T], Hashable]
 ) -> Iterator[tuple[T | None, T | None]]:
-    """Pair each exchange with the one of the same key on the other side, the first with the first, in order.
+    """Pair the exchanges of both sides that have the same key: the first with the first, the second with the second, and so on.
 
-    An exchange without partner within `LOOK_AHEAD` exchanges is missing; the other side's remaining ones are extra.
+    An exchange without a partner within `LOOK_AHEAD` exchanges is paired with None (missing); the other side's remaining
+    exchanges follow, also paired with None (extra).
     """
     waiting: dict[Hashable, deque[T]] = {}
     behind, rest = 0, iter(other)

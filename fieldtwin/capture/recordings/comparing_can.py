@@ -1,8 +1,8 @@
 """Compare CANopen nodes by logs of their bus, as `comparing` compares exchanges: SDO transfers one by one, unrequested
 messages by kind.
 
-The times of a node's own messages (PDOs, heartbeats) vary: the same messages, of the same length and about as often,
-are equal; their contents are signals, which a replay reads at its own clock. Pure.
+The times of a node's own messages (PDOs, heartbeats) vary. Two kinds of messages are equal if they have the same length and
+about the same rate; their contents are signals, which a replay reads according to its own clock. The module does no I/O.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TRANSFERS = ("SDO upload", "SDO download")
 RARE = 5
 """The rates of a kind of message are compared only if there are at least this many messages of it."""
 OFTEN = Tolerance(0.005, 0.5)
-"""Permitted difference of the mean time between messages, in seconds."""
+"""Permitted difference of the mean time between messages: 5 ms or 50 %, whichever is larger."""
 
 Frames = Iterable[tuple[int, CanFrame]]
 """The frames of a log, each with its time: (time in ns, frame)."""
@@ -153,7 +153,7 @@ def _alike(one: DecodedExchange, two: DecodedExchange, rules: Rules, tags: TagMa
 def _values(
     one: DecodedExchange, two: DecodedExchange, tags: TagMap | None
 ) -> tuple[str, Scalar | None, Scalar | None]:
-    """Return the tag's name and its values.
+    """Return the tag's name and its values on both sides.
 
     Without a tag, bytes with the length of a number become a number, lowest byte first.
     """

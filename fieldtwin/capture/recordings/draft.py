@@ -1,8 +1,8 @@
 """Draft a profile of each unit of a recording: the requested registers as tags, for the user to name and interpret.
 
-Only facts from the traffic are written: addresses, functions, limits, writes and refusals. Facts that traffic does not
-show (types over several registers, scales, units) are not guessed here: `fieldtwin infer` ranks them from dumps. Pure
-and bounded.
+Only facts from the traffic are written: addresses, functions, limits, writes and refusals. Facts that traffic does not show
+(types over several registers, scales, units) are not guessed here: `fieldtwin infer` ranks them from dumps. The module does
+no I/O, and its memory is bounded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MAX_UNITS = 256
 MAX_SHAPES = 10_000
-"""Different requests of one unit that are remembered; later ones are not in the draft."""
+"""Maximum number of different requests of one unit that are remembered; later ones are not in the draft."""
 LOOKED_AT = 50
 """Maximum number of replies to one request whose values are examined."""
 TABLES: Final = ("coil", "discrete", "input", "holding")
@@ -45,9 +45,7 @@ class _Unit:
 
 
 class Drafts:
-    """Collects the facts about each unit from exchanges, of which there may be any number. `texts` returns the drafted
-    profiles by unit.
-    """
+    """Collects the facts about each unit from any number of exchanges. `texts` returns the drafted profiles by unit ID."""
 
     def __init__(self) -> None:
         self.units: dict[int, _Unit] = {}

@@ -1,8 +1,8 @@
 """Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap files for Wireshark.
 
-The format follows from the kind of the recording and the file's name. Streaming, so that a recording of days needs
-little memory; raises `FileInvalid` where a file cannot be written, and `UsageError` for a kind and a format that do not
-fit.
+The format follows from the kind of the recording and the file's name. Records are processed one by one, so that a recording
+of days needs little memory. Raises `FileInvalid` if a file cannot be written, and `UsageError` for a kind that cannot be
+written in a format.
 """
 
 from __future__ import annotations
@@ -185,7 +185,9 @@ def _write_csv(out: Path, columns: Sequence[TableColumn], rows: Rows) -> int:
 
 
 def _not_a_formula(text: str) -> str:
-    """Return `text` so that a spreadsheet shows it: it may run a cell that begins with =, +, -, @ or a control character."""
+    """Return `text` in a form that a spreadsheet displays and does not run: cells that begin with =, +, -, @ or a control
+    character can be taken for formulas.
+    """
     return f"'{text}" if text[:1] in _FORMULA and text else text
 
 

@@ -1,6 +1,4 @@
-"""Guess the framing of a line from its bytes: RTU, ASCII or Modbus TCP, whichever finds the most bytes in complete frames.
-Pure.
-"""
+"""Guess the framing of a line from its bytes: RTU, ASCII or Modbus TCP, whichever finds the most bytes in complete frames."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Convert a capture of foreign traffic into recordings: one for each Modbus server, a log of CAN, and draft profiles.
+"""Convert a capture of third-party traffic into recordings: one for each Modbus server, a log of CAN, and draft profiles.
 
-Streaming: memory is bounded by the open conversations. Malformed frames and stray replies are kept next to the
-recording (``.bad.jsonl``, read as a capture) and counted.
+Memory is bounded by the number of open conversations. Malformed frames and stray replies are counted and written to a file
+next to the recording (``.bad.jsonl``, which can be read as a capture).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """One file that the import has written."""
+    """A recording that the import has written, and the draft profiles for it."""
 
     path: Path
     endpoint: str
@@ -78,7 +78,7 @@ class _Server:
 
 class PacketImport:
     """Imports the capture `source` as the recording `out` (``.jsonl``; if there are several servers, ``NAME.HOST-PORT.jsonl``
-    each). If `ports` are given, only conversations with these ports are taken for Modbus.
+    each). If `ports` are given, only conversations with these ports are treated as Modbus.
     """
 
     def __init__(self, source: Path, out: Path, ports: Collection[int] = ()) -> None:
@@ -194,7 +194,7 @@ class PacketImport:
     # -- Modbus on a line ---------------------------------------------------------------------------------------------
 
     def _serial(self, t_ns: int, link: int, data: bytes) -> None:
-        """Handle serial frames as analysers write them: bare, or after the RTAC link header, which states the direction."""
+        """Handle serial bytes as line analysers write them: bare, or after the RTAC link header, which states the direction."""
         self.summary.packets.packets += 1
         sent = True
         if link == LINK_RTAC:
@@ -252,7 +252,7 @@ class PacketImport:
 
 
 def socketcan_frame(data: bytes) -> CanFrame | None:
-    """Return a classic frame of link type 227; None for CAN FD and XL, and for truncated data."""
+    """Return the classic CAN frame in a packet of link type 227; None for CAN FD and XL, and for truncated data."""
     if len(data) < 8 or data[4] > 8 or data[5] & 0x04 or len(data) < 8 + min(data[4], 8):
         remote = len(data) >= 8 and data[0] & 0x40 and data[4] <= 8
         if not remote:
@@ -265,7 +265,7 @@ def socketcan_frame(data: bytes) -> CanFrame | None:
 
 
 def _renamed(parts: list[Path], old: Path, new: Path) -> list[Path]:
-    """Rename the only recording to the requested name."""
+    """Rename the parts of the only recording to the requested name, and return their new paths."""
     found = []
     for path in parts:
         target = path.with_name(new.stem + path.name.removeprefix(old.stem))

@@ -1,7 +1,7 @@
-"""Detect the kind of a foreign file and import it. All of `fieldtwin import` goes through here, except casts of a CTD.
+"""Detect the kind of a third-party file and import it. `fieldtwin import` uses this module for all files except CTD casts.
 
-The kind is detected by the content if the format has a mark (pcap, pcapng, a fieldtwin trace, mbpoll's banner), else by
-the file's name. This module opens files; the formats themselves are in `fieldtwin.capture.formats`.
+The kind is detected by the content if the format has a mark (pcap, pcapng, a fieldtwin trace, mbpoll's banner), else by the
+file's name. This module opens files; the formats themselves are in `fieldtwin.capture.formats`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_LINE = 65_536
 
 @dataclass(slots=True)
 class TextSummary:
-    """The result of importing a log, a capture or a poll session."""
+    """The result of importing a CAN log, a capture or a poll session."""
 
     out: Path | None = None
     records: int = 0
@@ -122,7 +122,7 @@ def import_polls(path: Path, out: Path) -> TextSummary:
 def import_capture(
     path: Path, out: Path, framing: str = "", url: str = "", header: RecordingHeader | None = None
 ) -> TextSummary:
-    """Import a fieldtwin capture or tap as a recording.
+    """Import a fieldtwin capture as a recording.
 
     Such a file comes from `fieldtwin run --capture` or `record --tap`, or is a command's log of sent frames. If it has several
     endpoints, `url` selects one; `framing` (rtu, ascii, mbap) overrides the endpoint's. Raises `FileInvalid`, `UsageError`.
@@ -147,7 +147,7 @@ def _captured(path: Path) -> Iterator[Captured]:
 
 
 def _framing(path: Path, endpoint: Endpoint) -> str:
-    """Return the framing that the bytes show; if they show none, that of the endpoint."""
+    """Return the framing that the bytes of the endpoint show; if they show none, the framing that the endpoint's URL states."""
     if endpoint.scheme in ("udp", "tls"):
         return framing_of(endpoint)
     chunks = (
@@ -160,7 +160,7 @@ def _framing(path: Path, endpoint: Endpoint) -> str:
 
 
 def endpoints_of(path: Path) -> list[Endpoint]:
-    """Return the endpoints of a capture, in the order of their first appearance; 64 at most."""
+    """Return the first 64 endpoints of a capture, in the order of their first appearance."""
     found: dict[Endpoint, None] = {}
     for captured in _captured(path):
         if len(found) < 64:
@@ -195,7 +195,7 @@ def _pair_capture(
 
 
 def write_drafts(drafts: Drafts, recording: Path, origin: str) -> list[Path]:
-    """Write the draft profiles next to a recording: ``NAME.unit1.yaml``."""
+    """Write the draft profiles next to a recording, as ``NAME.unit1.yaml`` and so on; return their paths."""
     found = []
     for unit, text in drafts.texts(recording.stem, origin).items():
         path = recording.with_suffix(f".unit{unit}.yaml")
@@ -212,7 +212,7 @@ def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
 
 
 def _of_prototype(capture: Path) -> bool:
-    """Return whether the run of a capture was marked as a prototype's (paper.md, ruling 15)."""
+    """Return whether the header of a capture marks it as the run of a digital twin prototype (paper.md, ruling 15)."""
     try:
         with open_input(capture) as file:
             head = json.loads(file.readline(MAX_LINE))
@@ -275,7 +275,7 @@ class BadFile:
             self.path.unlink(missing_ok=True)
 
     def keep(self, bad: Bad, endpoint: str = "") -> None:
-        """Add one more frame."""
+        """Count one more frame, and write it unless `most` frames were written already."""
         if self._file is None:
             self.path.unlink(missing_ok=True)
             self._file = RotatingFile(self.path)

@@ -1,8 +1,8 @@
 """Write a data sheet (EDS) of a CANopen node from a log of its bus, sufficient to emulate the logged behaviour.
 
-Its objects are those that were read or written over SDO, with the sizes seen; process data without a mapping in the log
-is declared as in the frame, one object for each byte. A log contains no names and meanings, and neither does the data
-sheet. Pure.
+Its objects are those that were read or written over SDO, with the sizes seen; process data without a mapping in the log is
+declared as in the frame, one object for each byte. A log contains no names and meanings, and neither does the data sheet. The
+module does no I/O.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class LogSheet:
     # -- the text -----------------------------------------------------------------------------------------------------
 
     def eds(self, name: str) -> str:
-        """Return the data sheet; `name` is the product's."""
+        """Return the text of the data sheet; `name` is the name of the product."""
         indices: dict[int, dict[int, str]] = {}
         for (index, subindex), what in self._objects.items():
             size = next(iter(what.sizes)) if len(what.sizes) == 1 else 0

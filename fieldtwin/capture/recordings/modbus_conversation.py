@@ -1,8 +1,8 @@
 """A TCP or UDP conversation that may be Modbus: its client, its framing, and its exchanges.
 
-Nothing is assumed except a port that the user named: the framing is found from the first bytes of either side, and the
-client from the port, from the side that opened the connection, or from the first frame. A conversation that is not
-recognised as Modbus is dropped after `MAX_UNDECIDED` bytes. Sans-IO.
+Nothing is assumed except a port that the user named: the framing is found from the first bytes of either side, and the client
+from the port, from the side that opened the connection, or from the first frame. A conversation that is not recognised as
+Modbus is dropped after `MAX_UNDECIDED` bytes. Sans-IO.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MODBUS_PORTS = frozenset({502, 503, 802})
 MAX_UNDECIDED = 600
-"""Number of bytes after which a conversation that is not recognised counts as foreign."""
+"""Number of bytes after which a conversation that is not recognised as Modbus counts as a different protocol."""
 
 
 class ModbusConversation:
@@ -37,7 +37,9 @@ class ModbusConversation:
         self._undecided = 0
 
     def feed(self, side: Side, data: bytes, t_ns: int, lost: int) -> list[RecordedExchange]:
-        """Add bytes from `side`; `lost` bytes before them are missing in the capture."""
+        """Add bytes from `side`, before which `lost` bytes are missing in the capture; return the exchanges that are now
+        complete.
+        """
         if self.pairer is not None:
             if lost:
                 self.pairer.lost(side != self.server)
@@ -50,7 +52,7 @@ class ModbusConversation:
         return self._catch_up()
 
     def finish(self) -> list[RecordedExchange]:
-        """End the conversation."""
+        """End the conversation; return its remaining exchanges."""
         if self.pairer is None and not self.foreign and self._seen and self._known_port:
             self._settle(self._framing_of_port())
             return [*self._catch_up(), *self.finish()]
@@ -117,7 +119,7 @@ class ModbusConversation:
 
 
 def is_mbap(data: bytes) -> bool:
-    """Return whether the bytes begin with a Modbus TCP frame: protocol 0, a length that fits a PDU, a function."""
+    """Return whether the bytes begin with a Modbus TCP frame: protocol ID 0, a length that fits a PDU, a valid function code."""
     size = data[4] << 8 | data[5]
     return (
         data[2:4] == b"\0\0" and 3 <= size <= 254 and 0 < data[7] & 0x7F < 0x70 and not (data[7] & 0x80 and size != 3)
@@ -125,7 +127,7 @@ def is_mbap(data: bytes) -> bool:
 
 
 def is_rtu(data: bytes) -> bool:
-    """Return whether the bytes contain an RTU frame with a right check sum."""
+    """Return whether the bytes contain an RTU frame with a correct check sum."""
     found = RtuSplitter()
     frames = [*found.feed(data[:MAX_UNDECIDED], 0), *found.flush()]
     return bool(frames) and not frames[0].bad and 0 < frames[0].pdu[0] & 0x7F < 0x70

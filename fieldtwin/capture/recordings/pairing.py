@@ -1,9 +1,9 @@
-"""Combine observed requests and replies into exchanges: the content of a capture or a tap in the form of a recording.
+"""Combine observed requests and replies into exchanges: convert the content of a capture to the form of a recording.
 
-A `Pairer` is fed the bytes of one connection or line, both ways, as they were seen, and yields `RecordedExchange`s in the order
-of their requests. Bytes that form no frame, and frames without a counterpart, are given to `on_bad` and counted; none
-is dropped silently. Sans-IO: it uses no files and no clocks; times come with the bytes. Bounded: at most `MAX_OPEN`
-requests wait for an answer.
+A `Pairer` is fed the bytes of both directions of one connection or line, in the order of their capture, and returns
+`RecordedExchange`s in the order of their requests. Bytes that form no frame, and frames without a counterpart, are given to
+`on_bad` and counted; none is dropped silently. Sans-IO: it uses no files and no clocks; the caller gives the time of the
+bytes. At most `MAX_OPEN` requests wait for an answer.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_REMEMBERED = 4096
 """Maximum number of requests whose reply length is remembered."""
 _LAST_UNIT = 247
 _DIGITS = 6
-"""Times are kept to the microsecond."""
+"""Number of decimal places of times in seconds: microseconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ OnBad = Callable[[Bad], None]
 
 
 class Pairer(ABC):
-    """The pairer of one connection or line. `zero_ns` is the time from which the times of exchanges count."""
+    """The pairer of one connection or line. The times of exchanges are relative to `zero_ns`."""
 
     def __init__(self, zero_ns: int, on_bad: OnBad | None = None) -> None:
         self.counters = PairCounters()
@@ -71,7 +71,7 @@ class Pairer(ABC):
 
     @abstractmethod
     def finish(self) -> list[RecordedExchange]:
-        """End the connection: requests that are still open count as unanswered."""
+        """End the connection; return the remaining exchanges: requests that are still open are unanswered."""
 
     def lost(self, sent: bool) -> None:  # noqa: B027 - only a stream can lose its place
         """Note that bytes of one direction are missing (a capture dropped packets): an open frame stays incomplete."""
@@ -104,7 +104,7 @@ class MbapPairer(Pairer):
         self._datagrams = datagrams
         self._rest = {True: b"", False: b""}
         self._open: dict[int, tuple[int, int, bytes]] = {}  # transaction id -> time, unit, request
-        self._done: dict[int, RecordedExchange] = {}  # answered, and an older request is not
+        self._done: dict[int, RecordedExchange] = {}  # answered exchanges that wait for an older one
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
         rest = self._rest[sent]
@@ -221,7 +221,9 @@ class SerialPairer(Pairer):
         return found
 
     def _is_frame(self, sent: bool, data: bytes) -> bool:
-        """Return whether a chunk is exactly one frame while no incomplete frame is waiting: it saves 12 % of an import."""
+        """Return whether a chunk is exactly one frame while no incomplete frame is waiting. This fast path saves 12 % of an
+        import's time.
+        """
         size = len(data)
         if self._requests.pending or self._replies.pending or not MIN_FRAME <= size <= MAX_FRAME or crc16(data):
             return False
@@ -258,8 +260,8 @@ class SerialPairer(Pairer):
         self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], size), frame.t_ns)
 
     def _settle(self, found: list[RecordedExchange]) -> None:
-        """End the exchange at the next request or at the end of the recording. The remaining bytes are a complete reply, or
-        noise.
+        """End the exchange at the next request or at the end of the recording. The remaining bytes are either a complete
+        reply or noise.
         """
         if self._replies.pending:
             self._take_replies(self._replies.flush(self._expected), found)

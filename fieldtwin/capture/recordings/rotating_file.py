@@ -1,8 +1,8 @@
-"""A file of lines that may grow for days: in parts of a bounded size.
+"""A file of lines that may grow for days, divided into parts of a bounded size.
 
-Each line is one write, so a kill loses one at most. ``r.jsonl`` is followed by ``r.0001.jsonl``, ``r.0002.jsonl`` and
-so on, each with the head of the first. Times continue over the parts, which `parts_of` finds again. This module must
-not depend on the content of the lines, nor on a clock.
+Each line is one write, so that a process that is killed loses at most one line. ``r.jsonl`` is followed by ``r.0001.jsonl``,
+``r.0002.jsonl`` and so on, each with the header of the first. Times continue over the parts, which `parts_of` finds. This
+module must not depend on the content of the lines, nor on a clock.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 MAX_PARTS = 9999
 MB = 1_000_000
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""The flags with which a new file is opened. Of the last two flags, each operating system has one."""
+"""The flags with which a new file is opened. O_CLOEXEC and O_BINARY each exist on only some operating systems."""
 
 
 class RotatingFile:
     """A file that appends lines to `path` and its further parts. An existing part is never overwritten.
 
-    A new part begins when `max_bytes` would be exceeded, or with the first line `max_s` seconds after the first of a
-    part (0: never). At most `keep` parts are kept (0: all), the oldest are removed; `removed` counts those. Raises
-    `FileInvalid` when a part exists already or writing fails; everything written before is complete. As a context
-    manager it leaves no file if an error ends the block before the first line: the name is free for the next attempt.
+    A new part begins when `max_bytes` would be exceeded, or with the first line `max_s` seconds after the first line of the
+    current part (0: never). At most `keep` parts are kept (0: all) and the oldest are removed; `removed` counts the removed
+    parts. Raises `FileInvalid` when a part exists already or writing fails; all earlier lines are then complete in the file. Used
+    as a context manager, it leaves no file if an error ends the block before the first line, so that the name can be used again.
     """
 
     def __init__(
@@ -113,10 +113,9 @@ def part(path: Path, number: int) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """Return the existing parts of the recording at `path`, in order, from the oldest that was kept.
+    """Return the existing parts of the recording at `path`, the oldest first.
 
-    A last part without a header does not count: its recorder was killed after creating the file and before writing to
-    it.
+    A last part without a header does not count: its recorder was killed after creating the file and before writing to it.
     """
     numbers = sorted(
         int(name)

@@ -1,6 +1,6 @@
 """Destinations of a recording in progress: exchanges, CAN frames, or the bytes of a line, in a file that may grow for days.
 
-Each record is one write, so that a killed recorder loses at most the last one.
+Each record is one write, so that a recorder that is killed loses at most the last record.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ class ExchangeSink:
 
 
 class CanLogSink(Tap):
-    """A tap that writes the frames of a bus to `file` in candump format, with UTC times by the clock's state at the start.
+    """An observer that writes the frames of a bus to `file` in candump format. The difference between UTC and the monotonic clock
+    is taken once, at the start.
 
-    A tap may not fail: when writing fails, `check` raises the error.
+    An observer of a connection (`Tap`) may not raise: when writing fails, `check` raises the error.
     """
 
     def __init__(self, file: RotatingFile, clock: Clock, channel: str = "can0") -> None:
@@ -41,7 +42,7 @@ class CanLogSink(Tap):
         self._error: FieldtwinError | None = None
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        """Ignore bytes: a CAN bus has none."""
+        """Ignore bytes: a CAN bus transfers only frames."""
 
     def check(self) -> None:
         """Check that all frames were written. Raises `FileInvalid` otherwise."""

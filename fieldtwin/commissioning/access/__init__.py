@@ -1,1 +1,1 @@
-"""One device on a live connection: its address, and reading, writing and watching its values."""
+"""One device on a live connection: the parsing of its address, and reading, writing and watching its values."""

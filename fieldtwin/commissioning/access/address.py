@@ -1,7 +1,7 @@
 """Parse the addresses and names of a command line into tags: ``holding:100``, ``40101``, ``6040h:00``, or a tag of a profile.
 
-Pure text handling. A raw address becomes a tag named as the user wrote it, so that all later steps handle only tags and
-decode them with the gateway's codec.
+The module only handles text. A raw address becomes a tag named as the user wrote it, so that all later steps handle only tags
+and decode them with the gateway's codec.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary
 
 AUTO = "auto"
-"""The type of a CANopen object of unknown type: it follows from the data's length."""
+"""The type of a CANopen object whose type is not stated: it follows from the length of the data."""
 
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 TYPES = (*REGISTERS_OF, "int8", "uint8", "string", "bytes")
@@ -44,8 +44,8 @@ _OF_TYPE_CODE = {
 class RawForm:
     """The interpretation of raw addresses.
 
-    `type` None is uint16, bool for bits, and for an object it follows from the length; `registers` is the length of
-    text; `count` is the number of consecutive values.
+    `type` None is uint16 for registers and bool for bits; for an object the type then follows from the length of the data.
+    `registers` is the length of a text in registers; `count` is the number of consecutive values.
     """
 
     type: str | None = None
@@ -63,7 +63,7 @@ class RawForm:
 
 
 def of_behaviour(name: str, profile: DeviceProfile | None) -> list[str]:
-    """Return the writes that a profile has under `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
+    """Return the writes that a profile defines for the behaviour `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
     if profile is None:
         raise UsageError(f"the behaviour {name!r} needs a profile", expected="--profile NAME")
     if name not in profile.form.behaviours:
@@ -81,11 +81,10 @@ def tags_of(
 ) -> list[Tag]:
     """Return the tags that `items` name, in their order and each once.
 
-    Without items: every readable tag of the profile, or else every readable object of the EDS except DOMAIN objects
-    (files).
+    Without items: every readable tag of the profile, or else every readable object of the EDS except DOMAIN objects (files).
 
-    A name is looked up in the profile first (a shell pattern selects all matching tags: ``voltage_*``), then in the
-    EDS; the rest are raw addresses. Raises `UsageError` that names the item and similar names.
+    A name is looked up in the profile first (a shell pattern selects all matching tags: ``voltage_*``), then in the EDS; the rest
+    are raw addresses. Raises `UsageError`, which contains the item and similar names.
     """
     form = form or RawForm()
     if not items:
@@ -136,8 +135,8 @@ def _by_name(item: str, tags: Mapping[str, Tag]) -> list[Tag]:
 
 
 def with_care(tag: Tag, profile: DeviceProfile | None) -> Tag:
-    """Mark a raw address as dangerous or nonvolatile if a tag of the profile at that address is, so that a raw address does
-    not bypass these checks.
+    """Return a raw address marked as dangerous or nonvolatile if an overlapping tag of the profile is, so that a raw address
+    does not bypass these checks.
     """
     if profile is None or tag.name in profile.tags or tag.at is None:
         return tag
@@ -209,7 +208,9 @@ def raw_tag(
     object_: tuple[int, int] | None = None,
     order: str = "ABCD",
 ) -> Tag:
-    """Return a tag with only an address and a type; the device decides whether it may be written."""
+    """Return a tag with only an address and a type. It is writable except in the tables discrete and input; the device
+    decides whether it accepts a write.
+    """
     fixed = at is not None and at.table in ("discrete", "input")
     stores = object_ is not None and object_[0] in _STORING
     return Tag(

@@ -1,7 +1,8 @@
-"""A live connection for the commissioning commands: opened by its URL, observed by taps, closed on leaving.
+"""A live connection for the commissioning commands: opened by its URL, observed by `Tap` objects, closed at the end of the
+context.
 
-A command sends through the gateway's own Modbus client or CANopen master, with the framing, silences and refusals that
-run the plant. This module must not depend on the purpose of a command.
+A command sends through the gateway's own Modbus client or CANopen master, with the same framing, silent intervals and checks
+as in plant operation. This module must not depend on the purpose of a command.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ async def modbus_at(
 ) -> AsyncIterator[ModbusClient]:
     """Yield a Modbus client at `url` (``rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1``, ``tcp://HOST:502``...).
 
-    `timeout_s` is for each reply, `spacing_s` is the pause after every exchange (the rate limit of sweeps); `taps` see
-    everything that is sent and received. Raises `UsageError` for a URL that is not a Modbus endpoint, `Unreachable`
-    where it cannot be opened.
+    `timeout_s` is for each reply, `spacing_s` is the pause after every exchange (the rate limit of sweeps); `taps` observe
+    everything that is sent and received. Raises `UsageError` for a URL that is not a Modbus endpoint, `Unreachable` if it cannot
+    be opened.
     """
     endpoint = Endpoint.parse(url)
     framing_of(endpoint)
@@ -64,8 +65,8 @@ async def canopen_at(
 ) -> AsyncIterator[CanopenMaster]:
     """Yield a CANopen master on the bus at `url`, already listening; it sends nothing by itself.
 
-    `bitrate` in bit/s, 0: the bus's current rate, where the medium knows it. Raises `UsageError` for a URL that is not
-    a CAN bus, `Unreachable` or `ConnectionLost` where the bus cannot be opened.
+    `bitrate` is in bit/s; 0 is the present rate of the bus, if the adapter or simulated bus knows it. Raises `UsageError` for a
+    URL that is not a CAN bus, `Unreachable` or `ConnectionLost` if the bus cannot be opened.
     """
     clock = clock or WallClock()
     async with frames_at(url, bitrate, taps=taps, connector=connector, clock=clock) as connection:
@@ -79,7 +80,7 @@ async def canopen_at(
 async def bytes_at(
     url: str, *, taps: Sequence[Tap] = (), connector: Connector | None = None, clock: Clock | None = None
 ) -> AsyncIterator[ByteConnection]:
-    """Yield the byte connection at `url`, for listening only. Raises as `modbus_at`."""
+    """Yield the byte connection at `url`, for listening only. Raises the same errors as `modbus_at`."""
     connection = await _observed(connector, taps, clock or WallClock()).open_bytes(Endpoint.parse(url))
     try:
         yield connection
@@ -96,7 +97,7 @@ async def frames_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[CanConnection]:
-    """Yield the frame connection of a CAN bus, for listening only. Raises as `canopen_at`."""
+    """Yield the frame connection of a CAN bus, for listening only. Raises the same errors as `canopen_at`."""
     endpoint = Endpoint.parse(url)
     if not endpoint.is_can:
         raise UsageError("CANopen needs a CAN bus", expected="can:socketcan/can0 or can:fieldtwin/HOST:PORT", got=url)

@@ -16,7 +16,9 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def check_plot(path: Path) -> None:
-    """Raise `UsageError` if matplotlib is missing, so that the user learns it before an hour of watching and not after it."""
+    """Raise `UsageError` if matplotlib is missing, so that the user learns this before the recording begins and not at its
+    end.
+    """
     if path.suffix.lower() not in FORMATS:
         raise UsageError("unsupported image format", expected=", ".join(FORMATS), got=path.name)
     if not _there():

@@ -1,6 +1,7 @@
-"""One device on a live connection for the commissioning commands: read tags, write one, show the frames without sending.
+"""One device on a live connection for the commissioning commands: read tags, write a tag, and return the frames for a dry
+run.
 
-It must never decide what may be written (`writing` does), and must not depend on files or displays.
+This module must never decide what may be written (`writing` does), and must not depend on files or displays.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 WIRE_TROUBLE = (ReplyTimeout, CrcError, Desync)
 OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4}
-"""Number of bytes of an object of that type; 8 for the other numeric types."""
+"""Number of bytes of a CANopen object by type; 8 for the numeric types that are not listed."""
 
 
 MOST_SILENT = 3
-"""Number of consecutive requests without a reply after which a unit is not asked again in the same reading."""
+"""Number of consecutive requests without a reply after which no further request is sent to the unit during the same reading."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,29 +66,31 @@ class PointValue:
 
 
 class Point(Protocol):
-    """A device that can be queried. Each frame is given as on the bus, in one line: as hex digits, or in candump's notation."""
+    """A device that can be queried. Methods return each frame as sent on the bus, in one line: hex digits, or candump's
+    notation.
+    """
 
     protocol: str
     where: str
     requests: int
-    """Number of requests, or transfers, sent to it."""
+    """Number of requests or SDO transfers sent to the device."""
 
     async def read(
         self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
     ) -> dict[str, PointValue]:
         """Return each tag's value by name, read in as few requests as possible.
 
-        A refused or lost read is an answer too; only errors that end the connection are raised. `found` then holds the
-        values read until then. With `alone` the tags of a request that failed are read again, one by one.
+        A refused or lost read gives a bad value with its problem; only errors that end the connection are raised. In that case
+        `found` holds the values that were read before. With `alone` the tags of a request that failed are read again, one by one.
         """
         ...
 
     async def write(self, tag: Tag, data: bytes) -> None:
-        """Write the bytes of `encoded` in one request, once. Raises the errors of connection and device."""
+        """Write `data`, the result of `encoded`, in one request, once. Raises the errors of connection and device."""
         ...
 
     def read_frames(self, tags: Sequence[Tag]) -> list[str]:
-        """Return the first frames that `read` would send."""
+        """Return the frames of the requests that `read` would send if all succeed; of an SDO transfer only its first frame."""
         ...
 
     def write_frames(self, tag: Tag, data: bytes) -> list[str]:
@@ -127,7 +130,7 @@ def _text(tag: Tag, value: str) -> bytes:
 def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     """Return the value in `data`.
 
-    An object of unknown type is an unsigned number if it has the length of one, else text or bytes.
+    An object of unknown type is an unsigned number if its length is that of a number, else text or bytes.
     """
     if tag.at is not None:
         return decode(tag, data, t_ns)
@@ -143,7 +146,7 @@ def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
 
 
 class ModbusPoint:
-    """`unit` at `url`, queried through `client`.
+    """The unit `unit` at the endpoint `url`, queried through `client`.
 
     `profile` gives its limits and gaps; limits that the device reveals are kept in `learnt`.
     """
@@ -173,10 +176,10 @@ class ModbusPoint:
     async def read(
         self, tags: Sequence[Tag], found: dict[str, PointValue] | None = None, *, alone: bool = False
     ) -> dict[str, PointValue]:
-        """Read as `Point.read` describes. A tag that is scaled by a second tag reads that tag too.
+        """Read as `Point.read` describes. If a tag is scaled by a second tag, the second tag is read too.
 
-        With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: the tags
-        that were requested together keep the answer that they had then.
+        With `alone`, reading one by one ends when the unit has left `MOST_SILENT` consecutive requests without a reply: the
+        remaining tags keep the result of the request in which they were read together.
         """
         found = {} if found is None else found
         plan = self._plan(self._with_scales(tags))
@@ -250,7 +253,7 @@ class ModbusPoint:
         return PointValue(apply_scale(tag, answer.value, by.value if by is not None else None))
 
     def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
-        """Return the gateway's own planner for these tags only. Later calls use the limits that were learnt."""
+        """Return the gateway's own read planner for these tags only. Later calls use the limits that were learnt."""
         key = tuple(t.name for t in tags)
         if key not in self._plans:
             self._plans[key] = GroupPlan(asked_profile(tags, self._profile), "asked", self.learnt)
@@ -258,7 +261,7 @@ class ModbusPoint:
 
 
 class CanopenPoint:
-    """`node` on the bus at `url`, queried over SDO through `master`; its NMT state is never changed."""
+    """The node `node` on the bus at `url`, queried over SDO through `master`; its NMT state is never changed."""
 
     protocol = "canopen"
 
@@ -305,7 +308,7 @@ class CanopenPoint:
 
 
 def _singly(read: Read) -> tuple[Read, ...]:
-    """Return a separate read for each tag of `read`; an empty list if it has only one tag or must be read whole."""
+    """Return a separate read for each tag of `read`; an empty tuple if it has only one tag or must be read whole."""
     if read.messages or len(read.tags) < 2:
         return ()
     return tuple(Read(t.registers, (t,), ()) for t in read.tags)
@@ -330,14 +333,14 @@ def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, .
 
 
 def part(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
-    """Return the bytes of the range `at` from the bytes of the whole `read`; a bit takes one byte."""
+    """Return the bytes of the registers or bits `at`, cut from `raw`, the bytes of the whole `read`; a bit takes one byte."""
     width = 1 if read.table in ("coil", "discrete") else 2
     start = (at.address - read.address) * width
     return raw[start : start + at.count * width]
 
 
 def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Request[Any]:
-    """Return the one request that writes `tag`.
+    """Return the one request that writes `tag`. `functions` are the function codes that the device has (None: unknown).
 
     It is 05 or 0Fh for a coil, 06 for one register if the device has it or is unknown, else 10h.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class PhaseProgress:
-    """A phase in words, and its elapsed and estimated seconds (`total_s` 0: not known)."""
+    """The name of the current phase, and its elapsed and estimated seconds (`total_s` 0: not known)."""
 
     phase: str
     done_s: float

@@ -56,7 +56,7 @@ def target_of(
 ) -> DeviceTarget:
     """Return the device that a command line names. Without `address` it is the profile's factory setting, else 1.
 
-    A serial line whose URL states no baud rate or frame takes the profile's. Raises `UsageError` where endpoint and
+    If the URL of a serial line states no baud rate or frame, the profile's settings are used. Raises `UsageError` if endpoint and
     profile do not belong together, `FileInvalid` for an invalid profile or EDS.
     """
     endpoint = Endpoint.parse(url)
@@ -123,9 +123,9 @@ async def read_all(
 ) -> dict[str, PointValue]:
     """Read each of `tags` once, and return a value or a problem for each of them by name.
 
-    A tag that cannot be read (`access: wo`) is not requested. A tag of a request that failed is read alone. If the
-    connection is lost, the tags that were not read before have that as their problem; if none was read, the error is
-    raised: `Unreachable` or `ConnectionLost`.
+    A tag that cannot be read (`access: wo`) is not requested. A tag of a request that failed is read alone. If the connection is
+    lost, that error becomes the problem of the tags that were not read before; if none was read, the error is raised:
+    `Unreachable` or `ConnectionLost`.
     """
     found: dict[str, PointValue] = {}
     lost: Unreachable | None = None
@@ -147,14 +147,14 @@ def _not_read(tag: Tag, lost: Unreachable | None) -> PointValue:
 
 
 def dry_point(target: DeviceTarget) -> Point:
-    """Return the device for `--dry-run`: it returns frames and cannot send."""
+    """Return the device for `--dry-run`: it returns the frames of requests and cannot send them."""
     if target.protocol == "canopen":
         return CanopenPoint(None, target.url, target.address)
     return ModbusPoint(None, target.url, target.address, target.profile)
 
 
 def text_of(tag: Tag, answer: PointValue) -> str:
-    """Return a value for display, with the profile's name of the number if it has one; secrets are hidden."""
+    """Return a value for display, with the profile's name for the number if it has one; secrets are hidden."""
     value = answer.value.value
     if value is None:
         return "-"
@@ -179,7 +179,7 @@ def place_of(tag: Tag) -> str:
 
 
 def row_of(tag: Tag, answer: PointValue) -> dict[str, Any]:
-    """Return a value for JSON. `raw` are the bytes that the device sent, in hex (bits one per byte)."""
+    """Return a value as a dictionary for JSON. `raw` are the bytes that the device sent, in hex (one byte for each bit)."""
     value = answer.value
     shown = value.value.hex() if isinstance(value.value, bytes) else value.value
     row = {

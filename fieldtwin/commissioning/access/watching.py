@@ -1,4 +1,4 @@
-"""Read values of one device repeatedly: their bounded history, and a sparkline of it.
+"""Read values of one device repeatedly: a bounded history of each, and a sparkline of it.
 
 This module must never write, and never reads faster than requested. It prints nothing.
 """
@@ -22,7 +22,7 @@ GAP = " "
 
 @dataclass
 class History:
-    """The history of a tag, in seconds since the start; None where there was no good value.
+    """The history of a tag: times in seconds since the start, and values, with None for a sample without a good number.
 
     `least` and `most` are the extremes of all samples, including those that were dropped.
     """
@@ -56,7 +56,7 @@ class History:
 
 
 def sparkline(values: Sequence[float | None]) -> str:
-    """Return one character per value. A constant value is a line in the middle."""
+    """Return one block character per value, a blank for None. A constant value is a line in the middle."""
     known = [v for v in values if v is not None]
     if not known:
         return GAP * len(values)
@@ -70,7 +70,9 @@ def sparkline(values: Sequence[float | None]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One round: its time in seconds since the first, and its answers. `late_s`: its delay."""
+    """The results of one reading of all tags: its time in seconds since the first reading, and the values. `late_s` is its
+    delay.
+    """
 
     number: int
     t_s: float
@@ -88,7 +90,7 @@ async def samples(
 ) -> AsyncGenerator[Sample, None]:
     """Yield a sample every `every_s` seconds: `count` samples, those that begin within `for_s` seconds, or until closed.
 
-    A round that takes longer than `every_s` makes the next one late; missed samples are not repeated.
+    If reading takes longer than `every_s`, the next sample is late; missed samples are not made up for.
     """
     start_ns = due_ns = clock.monotonic_ns()
     end_ns = None if for_s is None else start_ns + round(for_s * NS_PER_S)

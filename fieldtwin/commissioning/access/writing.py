@@ -1,7 +1,7 @@
 """Write one value with care: read the old value, write, read back and compare.
 
-Every refusal that needs no device comes before anything is sent. This module must never repeat a write: a value that
-wears out its memory is written once, and a lost reply does not show whether the device executed the write.
+A write that can be refused without the device is refused before anything is sent. This module must never repeat a write: each
+write wears a memory with limited write cycles, and a lost reply does not show whether the device executed the write.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ _TRUE, _FALSE = ("true", "on", "yes"), ("false", "off", "no")
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One permitted write: no rule that can be checked without the device forbids it. `warnings` are for the prompt."""
+    """A write that no rule forbids, as far as this can be checked without the device. `warnings` are shown when the user is
+    asked.
+    """
 
     tag: Tag
     value: Scalar
@@ -75,7 +77,9 @@ def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = Fal
 
 
 def plan_writes(pairs: list[tuple[Tag, str]], *, i_know: bool = False, restore: bool = False) -> list[Write]:
-    """Return several writes, in order. Raises as `plan_write`; and for a nonvolatile tag that occurs twice."""
+    """Return several writes, in order. Raises the errors of `plan_write`, and `NotAllowed` for a nonvolatile tag that occurs
+    twice.
+    """
     seen: set[str] = set()
     for tag, _ in pairs:
         if tag.name in seen and tag.nonvolatile:
@@ -118,15 +122,15 @@ def parse_value(tag: Tag, text: str) -> Scalar:
 
 
 def check_broadcast(point: Point, *, i_know: bool) -> None:
-    """Raise `NotAllowed` for unit 0 of a line without `i_know`: every unit would execute the write."""
+    """Raise `NotAllowed` for unit 0 of a serial line without `i_know`: every unit would execute the write."""
     if isinstance(point, ModbusPoint) and point.is_broadcast and not i_know:
         raise NotAllowed("unit 0 is a broadcast to all units of the line, and no unit answers it", expected="--i-know")
 
 
 async def before(point: Point, write: Write) -> PointValue | None:
-    """Return the device's current value; None where it cannot be read.
+    """Return the device's current value; None if it cannot be read (a write-only tag, or a broadcast).
 
-    Raises `CheckFailed` where the device refuses or does not answer: without the old value a write cannot be undone.
+    Raises `CheckFailed` if the device refuses or does not answer: without the old value a write cannot be undone.
     """
     if not write.tag.readable or _broadcasts(point):
         return None
@@ -141,10 +145,10 @@ async def before(point: Point, write: Write) -> PointValue | None:
 
 
 async def carry_out(point: Point, write: Write, old: PointValue | None) -> Written:
-    """Write the value, read it back, and compare. A nonvolatile value that is held already is not written.
+    """Write the value, read it back, and compare. A nonvolatile value is not written if the device holds it already.
 
-    Raises `VerifyFailed` when the device acknowledged the write but holds a different value, and the errors of
-    connection and device.
+    Raises `VerifyFailed` when the device acknowledged the write but holds a different value, and the errors of connection and
+    device.
     """
     held = old.value.raw if old is not None else None
     if write.tag.nonvolatile and held is not None and _same(write, held):
@@ -158,7 +162,7 @@ async def carry_out(point: Point, write: Write, old: PointValue | None) -> Writt
 async def restore(point: Point, done: Written) -> Written:
     """Restore the value from before the write, and read it back. If the device holds it already, nothing is written.
 
-    Raises `NotAllowed` where the old value is not known, otherwise the same errors as `carry_out`.
+    Raises `NotAllowed` if the old value is not known, otherwise the same errors as `carry_out`.
     """
     tag = done.write.tag
     if done.before is None:
@@ -191,7 +195,9 @@ def _same(write: Write, held: bytes) -> bool:
 
 
 def _equal(tag: Tag, data: bytes, held: bytes) -> bool:
-    """Return whether the value is held. A coil comes back as one byte; other values are compared byte by byte."""
+    """Return whether `held`, as read from the device, is the value `data`. A coil is read as one byte; other values are
+    compared byte by byte.
+    """
     if tag.type == "bool":
         return bool(int.from_bytes(data)) == bool(int.from_bytes(held))
     return data == held

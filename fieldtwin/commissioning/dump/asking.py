@@ -1,6 +1,7 @@
-"""Send one question to a device and classify the result. Questions are repeated as often as a sweep needs.
+"""Send one question to a device and classify the result.
 
-A busy reply is not a refusal, and noise may be the cause of silence. This module must never send a request that changes the
+A question is a read of a range or an object, or a request with a function code; it is repeated as often as a sweep needs. A
+busy reply is not a refusal, and noise may be the cause of silence. This module must never send a request that changes the
 device.
 """
 
@@ -49,7 +50,7 @@ PROBES: tuple[tuple[int, Request[Any]], ...] = (
     (0x11, ReportServerId()),
     (0x2B, ReadDeviceIdentification(1)),
 )
-"""Functions that only read. Whether other functions exist cannot be tested without side effects."""
+"""Requests with functions that only read. Whether a device has other functions cannot be tested without side effects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +74,14 @@ class DeviceReader(Protocol):
         ...
 
     async def function(self, request: Request[Any]) -> AskResult:
-        """Send a request with this function code and return the result."""
+        """Send `request`, which tests whether the device has its function, and return the result."""
         ...
 
 
 class ModbusAsker:
     """A reader that sends its questions to one unit through `client`.
 
-    A question without a good reply is repeated up to `retries` times; after each exchange the line is left free for
+    A request without a good reply is repeated up to `retries` times; after each exchange the line is left free for
     `spacing_s` seconds.
     """
 

@@ -1,8 +1,8 @@
 """Continue a sweep where asking address by address is too expensive: in silent areas, and with other read lengths.
 
-Every question in a silent area costs a timeout, so only some addresses are tried, round numbers first, until the time budget is
-used up. Registers that are refused one by one may hold values that can only be read whole, so reads of two and more registers
-are tried there. Pure, as `sweep` is.
+Every request in a silent area costs a timeout, so only some addresses are tried, round numbers first, until the time budget
+is used up. Registers that are refused one by one may hold values that can only be read whole, so reads of two and more
+registers are tried there. The functions are generators without I/O, as those of `sweep`.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from fieldtwin.commissioning.dump.sweep import ROUND, Asking, Sweep
 LEVELS = ((1000, 4096), (500, 1024), (100, 256), (ROUND, 64), (16,))
 """Steps at which manuals usually begin blocks, the likeliest first."""
 SILENT_AGAIN = 3
-"""Number of consecutive questions without a reply that end a readable block inside a silent area."""
+"""Number of consecutive requests without a reply that end a readable block inside a silent area."""
 LENGTHS = (1, 2, 4, 8, 16, 32)
 """Lengths in registers of the reads that look for values that can only be read whole."""
 
 
 def beyond_silence(sweep: Sweep) -> Asking:
-    """Sample the addresses of `sweep` that the device has not answered for. Where the device answers, continue to ask from
-    that address.
+    """Sample the addresses of `sweep` for which the device has given no definite answer. Where it answers, continue the sweep
+    from that address.
     """
     span, known = sweep.span, sweep.coverage
     sweep.most_silent = SILENT_AGAIN
@@ -47,7 +47,7 @@ def beyond_silence(sweep: Sweep) -> Asking:
 
 
 def _last_asked(sweep: Sweep, at: int) -> int:
-    """Return the nearest address below `at` that was read, or the one before the span."""
+    """Return the nearest address below `at` that was requested, or the one before the span."""
     states = sweep.coverage.states
     return next((a for a in range(at - 1, sweep.span.address - 1, -1) if states[a]), sweep.span.address - 1)
 
@@ -89,7 +89,9 @@ def _places(sweep: Sweep, length: int) -> Iterator[int]:
 
 
 def _may_hide(sweep: Sweep, at: int, length: int) -> bool:
-    """Return whether `length` registers at `at` could be one value: none was readable, and the device is not silent there."""
+    """Return whether `length` registers from `at` could be one value: none of them was readable, and the device is not silent
+    there.
+    """
     if at + length > sweep.span.end:
         return False
     states = sweep.coverage.states
@@ -97,7 +99,9 @@ def _may_hide(sweep: Sweep, at: int, length: int) -> bool:
 
 
 def _extend(sweep: Sweep, at: int, length: int) -> Asking:
-    """Find the neighbours of a read of `length` registers at `at` that succeeded where shorter ones did not."""
+    """After a successful read of `length` registers at `at`, where shorter reads failed, read the neighbours in steps of
+    `length`.
+    """
     low, high = at, at + length
     while high + length <= sweep.span.end and sweep.coverage.states[high] != READABLE:
         if not (yield from sweep.ask(high, length)):

@@ -1,9 +1,8 @@
 """The state of each address of a Modbus table in a dump: readable, refused, silent, invalid reply, or not asked.
 
-The states are derived from the recorded reads alone, so that the terminal, the file, the reports and `diff` cannot
-disagree. An address is readable once a read that contains it was answered with values. Otherwise the shortest read that
-contains it decides, and only if that read is short: the refusal of 125 registers does not show which of them is
-refused.
+The states are derived from the recorded reads alone, so that the terminal, the file, the reports and `diff` cannot disagree.
+An address is readable if any read that contains it was answered with values. Otherwise the shortest read that contains it
+decides, and only if that read is short: the refusal of 125 registers does not show which of them is refused.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from fieldtwin.gateway.core.files.profile import RegisterRange, Table, gap_text
 
 NOT_ASKED, READABLE, REFUSED, SILENT, INVALID = range(5)
 STATE_NAMES = ("not asked", "readable", "refused", "no reply", "invalid reply")
-"""The names for users; the keys of a dump file are `STATE_KEYS`."""
+"""The names of the states for users; the keys of a dump file are `STATE_KEYS`."""
 STATE_KEYS = ("not_asked", "readable", "refused", "silent", "invalid")
 SHORT = 2
 """A refused read of more values than this does not show the state of a single address."""
@@ -29,7 +28,9 @@ Spans = Sequence[tuple[int, int]]
 
 
 class Coverage:
-    """The states of one table. Reads of at most `longest_deciding` values decide about each address in them."""
+    """The states of the addresses of one table. A failed read decides their states only if it has at most `longest_deciding`
+    values.
+    """
 
     def __init__(self, longest_deciding: int = SHORT) -> None:
         self.states = bytearray(ADDRESSES)
@@ -69,7 +70,9 @@ class Coverage:
                     start = address
 
     def unknown(self, scope: Spans) -> list[tuple[int, int]]:
-        """Return the stretches without a definite answer: of at least `GRID` addresses, or a whole smaller range."""
+        """Return the ranges without a definite answer that have at least `GRID` addresses or fill a whole, smaller range of
+        `scope`.
+        """
         found: list[tuple[int, int]] = []
         for low, high in scope:
             start = low
@@ -89,7 +92,7 @@ class Coverage:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A range of addresses from `start` to before `end`: `asked` of them were read, all with the outcome `state`."""
+    """A range of addresses from `start` to before `end`, of which `asked` were requested, all with the outcome `state`."""
 
     start: int
     end: int
@@ -128,7 +131,7 @@ def stretches(coverage: Coverage, scope: Spans) -> list[Stretch]:
 
 
 def _tail(stretch: Stretch) -> int:
-    """Return the number of addresses of a stretch without gaps; 0 for one with gaps, which more samples may join."""
+    """Return the number of addresses of a stretch if all of them were requested; else 0, because more samples may join it."""
     return stretch.asked if stretch.is_whole else 0
 
 

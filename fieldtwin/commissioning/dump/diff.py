@@ -1,7 +1,7 @@
 """Compare two dumps, or a dump with a profile or an EDS. Differences are named where names are known.
 
-Pure. A difference is something in which two devices of one kind, or a device and its profile, should agree and do not. Other
-facts that the user should know are notes.
+The module does no I/O. A difference is something in which two devices of one kind, or a device and its profile, should agree
+and do not. Other facts that the user should know are notes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)
 
 @dataclass(frozen=True, slots=True)
 class DumpDifference:
-    """A difference of `name` at `at`: the two sides and the kind of the difference."""
+    """A difference of the tag, object or property `name` at the address `at`: the two sides and the kind of the difference."""
 
     kind: str
     name: str
@@ -83,7 +83,7 @@ def diff_dumps(
     dictionary: ObjectDictionary | None = None,
     leave: Leave | None = None,
 ) -> Differences:
-    """Compare the last passes of two dumps, then the readable ranges of the devices."""
+    """Compare the values in the last passes of two dumps, and the limits and functions of the two devices."""
     leave, out = leave or Leave(), Differences()
     one, other = left.passes[-1], right.passes[-1]
     tags = _tags(profile, dictionary)
@@ -114,7 +114,7 @@ def diff_dumps(
 
 
 def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None) -> Differences:
-    """Compare a Modbus profile with a dump: its tags exist, their values are plausible, its limits hold."""
+    """Compare a Modbus profile with a dump: whether its tags exist, their values are plausible, and its limits hold."""
     leave, out, last = leave or Leave(), Differences(), dump.passes[-1]
     asked = set(dumped_tags(profile)[0])
     named: set[Cell] = set()
@@ -140,7 +140,9 @@ def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None)
 
 
 def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
-    """Compare a node's EDS with a dump: objects exist with the size of their type; constants have the stated values."""
+    """Compare a node's EDS with a dump: whether objects exist with the size of their type, and constants have the stated
+    values.
+    """
     out, last = Differences(), dump.passes[-1]
     for entry in dictionary:
         cell = (entry.index, entry.subindex)
@@ -198,7 +200,7 @@ def value_in(one: Pass, tag: Tag, profile: DeviceProfile | None) -> TagValue | N
 
 
 def place(tag: Tag) -> str:
-    """Return the address as sent: ``holding:4``, ``6041h:00``."""
+    """Return the address of a tag as sent on the bus: ``holding:4``, ``6041h:00``."""
     if tag.at is not None:
         return f"{tag.at.table}:{tag.at.address}"
     assert tag.object is not None
@@ -206,7 +208,7 @@ def place(tag: Tag) -> str:
 
 
 def spans(cells: Iterable[Cell]) -> list[str]:
-    """Return ranges such as ``holding:0..3`` of neighbouring cells."""
+    """Return texts such as ``holding:0..3``, one for each range of neighbouring cells."""
     runs: list[tuple[Cell, int]] = []
     for table, number in sorted(cells, key=lambda c: (str(c[0]), c[1])):
         if runs and runs[-1][0][0] == table and runs[-1][0][1] + runs[-1][1] == number:
@@ -232,7 +234,7 @@ def _shown(tag: Tag, value: TagValue | None) -> str:
 
 
 def _diff_unnamed(out: Differences, left: Dump, right: Dump, named: set[Cell], leave: Leave) -> int:
-    """Compare registers and objects without a name by their bytes. Return the number of those in only one of the dumps."""
+    """Compare registers and objects without a name by their bytes. Return how many have a value in only one of the dumps."""
     one, other, alone = left.passes[-1], right.passes[-1], 0
     for cell in sorted((one.cells.keys() | other.cells.keys()) - named, key=lambda c: (str(c[0]), c[1])):
         name = spans([cell])[0]
@@ -278,7 +280,7 @@ def _refused(dump: Dump, cells: Sequence[Cell]) -> bool:
 
 
 def _why_not(dump: Dump, cells: Sequence[Cell]) -> str:
-    """Return why a dump has no value of `cells`, if the device did not refuse them."""
+    """Return, in words, why a dump has no value of `cells` although the device did not refuse them."""
     states = {dump.state_of(c) for c in cells}
     return {INVALID: "got no valid reply", SILENT: "got no reply"}.get(max(states), "was not asked for")
 
@@ -287,7 +289,7 @@ def _why_not(dump: Dump, cells: Sequence[Cell]) -> str:
 
 
 def _diff_access(out: Differences, left: Dump, right: Dump) -> None:
-    """Compare longest reads and functions, if both dumps contain them."""
+    """Compare the longest read of each table and the functions, if both dumps contain them."""
     for table in left.maps.keys() & right.maps.keys():
         a, b = left.maps[table], right.maps[table]
         if a.get("limit_proved") and b.get("limit_proved") and a["max_read"] != b["max_read"]:

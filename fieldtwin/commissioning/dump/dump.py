@@ -1,7 +1,7 @@
 """Dump a device: send the questions of a sweep, and write down every answer before the next question.
 
-An interrupted dump continues by answering the sweep's questions from the file as far as it goes. This module must never
-write to the device, and sends only requests that are logged.
+An interrupted dump is continued by starting the sweep again and answering its questions from the file until the recorded
+answers are used up. This module must never write to the device, and sends only requests that are logged.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from fieldtwin.results.subject import who
 DEFAULT_BUDGET_S = 600.0
 ALL_TABLES = tuple(RegisterRange(table, 0, 65536) for table in TABLES)
 NOT_OF_THE_JOB = ("ended", "latency", "resumed")
-"""The kinds of lines that each session writes and that do not belong to the job."""
+"""The kinds of lines that describe a session and not the dump, so that they are ignored when a dump is continued."""
 
 Progress = Callable[[int, int, int], None]
-"""``(done, total, requests)``: the number of addresses (or reads of a later pass) that are done, the number of all, and the
-number of requests sent.
+"""A function called with ``(done, total, requests)``: the number of addresses (or, in a later pass, of reads) that are
+done, the number of all, and the number of requests sent.
 """
 Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 
@@ -54,11 +54,11 @@ Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 class DumpJob:
     """The task of a dump.
 
-    For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride` is that
-    of `Sweep`; `most` is the longest read to try; `pairs`: the device has pairs of registers only. It makes `passes` passes,
-    one every `every_s` seconds from start to start. `functions`: find out which harmless functions exist. `budget_s`: the time
-    that each table (or the objects) may take for questions without a result, where the device is silent or allows a value to
-    be read only whole. `spacing_s`: the pause after each request, which counts against it.
+    For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride` is that of
+    `Sweep`; `most` is the longest read to try; `pairs`: the device has pairs of registers only. It makes `passes` passes, one
+    every `every_s` seconds from start to start. `functions`: find out which functions that only read exist. `budget_s`: the time
+    that each table (or the objects) may take for requests without a result, where the device is silent or allows a value to be
+    read only whole. `spacing_s`: the pause after each request, which is counted as part of that time.
     """
 
     target: DeviceTarget
@@ -116,7 +116,7 @@ class DumpJob:
 
 @dataclass
 class DumpResult:
-    """The result of a dump. `requests` counts those sent in this session, `replayed` those answered from the file."""
+    """The result of a dump. `requests` counts those sent in this session, `replayed` the questions answered from the file."""
 
     maps: list[TableMap] = field(default_factory=list)
     functions: dict[int, dict[str, Any]] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class DumpResult:
 
 
 class Dumper:
-    """One session of a job. `earlier`: the dump that is continued."""
+    """One session of a dump job. `earlier` is the dump that is continued (None: a new dump)."""
 
     def __init__(
         self,
@@ -149,8 +149,8 @@ class Dumper:
     async def run(self) -> DumpResult:
         """Run all passes and return the result.
 
-        Raises `Unreachable` where the device answered no request at all, and errors that end a connection; the answers
-        received until then are in the file.
+        Raises `Unreachable` if the device answered no request at all, and errors that end a connection; the answers received
+        until then are in the file.
         """
         result = self.result
         self._pass(0)
@@ -197,7 +197,7 @@ class Dumper:
             self._write(map_line(self._so_far, found.table, _map_line(found)))
 
     def _objects_line(self, sweep: ObjectSweep | ListedObjects) -> dict[str, Any]:
-        """Return the number of objects in each state, and those that were not asked."""
+        """Return the line of the dump file with the number of objects in each state, and of those that were not requested."""
         first = self._so_far.passes[0]
         indexes = {index for cells in (first.cells, first.refused, first.silent, first.invalid) for index, _ in cells}
         if isinstance(sweep, ListedObjects):
@@ -232,8 +232,8 @@ class Dumper:
             self._progress(i + 1, len(reads), self.result.requests)
 
     async def _read_again(self, asked: RegisterRange | ObjectKey) -> None:
-        """Repeat a read, and halve it if it is refused: the device may not accept a read across the border between two earlier
-        sweeps.
+        """Repeat a read. If it is refused, read its two halves: the device may not accept a read across the border between
+        two earlier sweeps.
         """
         outcome = await self._outcome(asked)
         if isinstance(outcome, RefusedRead) and isinstance(asked, RegisterRange) and asked.count > 1:
@@ -276,7 +276,7 @@ class Dumper:
 
     def _count(self, function: int, line: dict[str, Any]) -> None:
         self.result.answered += "silent" not in line and "invalid" not in line
-        if "hex" in line:  # a refusal costs a device less
+        if "hex" in line:  # a device refuses faster than it reads, so refusals are left out
             name = f"{function:02X}" if function else "SDO"
             self.result.latency.setdefault(name, Histogram(LATENCY_LIMITS_NS)).record(int(line["us"]) * NS_PER_US)
 
@@ -289,7 +289,7 @@ class Dumper:
         self._write({"pass": number, "at": _iso(self._clock.utc_ns())})
 
     def _write(self, line: dict[str, Any]) -> None:
-        """Write a line of the job, unless it was written in an earlier session."""
+        """Write a line, unless an earlier session of the same dump wrote it."""
         what = next(iter(line))
         if self._next_recorded(what, line[what]) is None:
             self._writer.write(line)
@@ -321,7 +321,7 @@ def check_resumable(job: DumpJob, earlier: Dump) -> None:
 
 
 def started(job: DumpJob, clock: Clock) -> dict[str, Any]:
-    """Return the header of a new dump."""
+    """Return the header line of a new dump."""
     return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns()), "by": who()}
 
 
@@ -365,7 +365,7 @@ def _size(sweep: Sweeping) -> int:
 
 
 def _place(sweep: Sweeping, asked: RegisterRange | ObjectKey) -> int:
-    """Return the progress of a sweep after this question."""
+    """Return the number of addresses or indices of `sweep` that are done when it asks for `asked`."""
     if isinstance(sweep, Sweep) and isinstance(asked, RegisterRange):
         return asked.address - sweep.span.address
     if isinstance(sweep, ObjectSweep) and isinstance(asked, ObjectKey):

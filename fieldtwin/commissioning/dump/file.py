@@ -1,4 +1,5 @@
-"""A dump on disk: JSON lines, one for each answer. A killed dump loses at most its last line and can be continued.
+"""A dump on disk: JSON lines, one for each answer. If the writer is killed, at most the last line is lost, and the dump can
+be continued.
 
 ::
 
@@ -53,7 +54,7 @@ READABLE_VERSIONS = (1, 2)
 TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
 MOST_LINE_BYTES = 1 << 20
 MOST_CELLS = 50_000_000
-"""Maximum number of cells in all passes together, limited by memory. A larger file is refused."""
+"""Maximum number of registers, bits and objects in all passes together, limited by memory. A larger file is refused."""
 
 LATENCY_LIMITS_NS = tuple(round(10 * 10 ** (step / 10)) * NS_PER_US for step in range(71))
 """The limits of a dump's histograms of response times: ten per decade, from 10 us to 100 s."""
@@ -64,10 +65,10 @@ Cell = tuple[str, int] | tuple[int, int]
 
 @dataclass
 class Pass:
-    """The values of one pass. Registers are 2 bytes, bits one (0 or 1); objects as the node sent them.
+    """The values of one pass. Registers are 2 bytes, bits one byte (0 or 1); objects are as the node sent them.
 
-    `refused` holds exception or abort codes; `silent` and `invalid` hold addresses without a reply and without a valid
-    one. For registers these three hold only addresses that were read one by one. `failed` counts the reads of any
+    `refused` holds exception or abort codes; `silent` and `invalid` hold the reasons for addresses without a reply and with an
+    invalid reply. For registers these three hold only addresses that were read one by one. `failed` counts the reads of any
     length without values.
     """
 
@@ -87,8 +88,8 @@ class Pass:
 class Dump:
     """A dump as read from its file.
 
-    `lines` are all lines except the header; `ended` means that it is complete. `whole_bytes` is the end of its last
-    complete line.
+    `lines` are all lines except the header; `ended` means that the dump is complete. `whole_bytes` is the offset in the file
+    after the last complete line.
     """
 
     path: str
@@ -110,7 +111,7 @@ class Dump:
 
     @property
     def names_ranges(self) -> bool:
-        """Return whether the dump is of address ranges, not of the tags of a profile."""
+        """Return whether the dump covers address ranges, and not the tags of a profile."""
         return bool(self.header["ranges"]) or not self.header.get("profile")
 
     def scope(self, table: str) -> list[tuple[int, int]]:
@@ -142,7 +143,7 @@ class Dump:
         return 2 * unknown > asked_for
 
     def state_of(self, cell: Cell) -> int:
-        """Return one of the states in `coverage`, for a register or an object, from the first pass."""
+        """Return the state of a register or an object in the first pass, one of the states in `coverage`."""
         if isinstance(cell[0], str):
             known = self.coverage.get(cell[0])
             return known.states[cell[1]] if known is not None else NOT_ASKED
@@ -154,7 +155,7 @@ class Dump:
 
 
 def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
-    """Read a dump. An incomplete last line is left by a writer that died, and is skipped.
+    """Read a dump. An incomplete last line was left by a writer that was killed, and is skipped.
 
     Raises `FileInvalid` with the line number for any other line that is not part of a dump.
     """
@@ -215,7 +216,7 @@ def describe_latency(times: Histogram) -> dict[str, Any]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Yield line number, end position and content."""
+    """Yield the line number, the offset of the line's end, and the content of each complete line."""
     try:
         with path.open("rb") as file:
             end = 0
@@ -324,10 +325,10 @@ def key_of(asked: RegisterRange | ObjectKey) -> str:
 
 
 class DumpWriter:
-    """A writer that appends lines to `path`; each is handed to the operating system when the call returns.
+    """A writer that appends lines to `path`. When `write` returns, the line has been passed to the operating system.
 
-    `resume`: continue after the last complete line. It writes at most `max_bytes` bytes. Raises `FileInvalid` when the file
-    cannot be written.
+    `resume_at`: continue at this offset, after the last complete line. It writes at most `max_bytes` bytes. Raises `FileInvalid`
+    when the file cannot be written.
     """
 
     def __init__(self, path: Path, *, resume_at: int | None = None, max_bytes: int = 4 << 30) -> None:

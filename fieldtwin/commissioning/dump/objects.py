@@ -1,6 +1,6 @@
 """Explore a node's object dictionary over SDO: index by index, or entry by entry of an EDS.
 
-Pure, and a generator as `sweep` is. Nothing is written; a write-only object is never requested.
+The sweeps are generators without I/O, as in `sweep`. Nothing is written; a write-only object is never requested.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8
-"""Number of consecutive missing subindices that end an array, whatever the value of its subindex 0."""
+"""Number of consecutive missing subindices after which the rest of an array is skipped, whatever the value of its subindex 0."""
 LEVELS = ((0x1000,), (0x100, 0x800), (0x40,), (0x10,))
 """Steps at which profiles usually begin groups of objects, the likeliest first."""
 EVERYTHING = ((0x1000, 0x9FFF),)
-"""Communication, manufacturer and device profile area (CiA 301, 7.4.1)."""
+"""The whole range of indices: communication, manufacturer and device profile area (CiA 301, 7.4.1)."""
 
 Asking = Generator["ObjectKey", Outcome, None]
 
@@ -43,7 +43,9 @@ class ObjectKey:
 
 
 class _Patience:
-    """The patience with a silent node. `budget_us`: the time that questions without a result may take together."""
+    """The decision how long to query a silent node. `budget_us`: the total time in us that requests without a result may
+    take.
+    """
 
     def __init__(self, budget_us: int | None) -> None:
         self.stopped = ""
@@ -54,11 +56,11 @@ class _Patience:
 
     @property
     def lost(self) -> bool:
-        """Return whether the node was silent for the last `MOST_SILENT` questions."""
+        """Return whether the node was silent for the last `MOST_SILENT` requests."""
         return self._silent >= MOST_SILENT
 
     def note(self, outcome: Outcome) -> None:
-        """Record the outcome of a question, to know whether the node is silent."""
+        """Record the outcome of a request, to know whether the node is silent."""
         self._silent = self._silent + 1 if isinstance(outcome, Silent) else 0
         self._heard |= not isinstance(outcome, Silent)
         self._spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
@@ -72,7 +74,7 @@ class _Patience:
 class ObjectSweep(_Patience):
     """A sweep over every index of `ranges` (both ends included): subindex 0 first, then the others of existing objects.
 
-    After `MOST_SILENT` consecutive questions without a reply, only some of the other indices are tried, round numbers first.
+    After `MOST_SILENT` consecutive requests without a reply, only some of the other indices are tried, round numbers first.
     Where the node answers again, the sweep continues from there.
     """
 
@@ -125,7 +127,7 @@ class ObjectSweep(_Patience):
 
 
 class ListedObjects(_Patience):
-    """A sweep that asks for `keys`, one after the other, without retries while the node is silent."""
+    """A sweep that reads `keys` in their order, without retries while the node is silent."""
 
     def __init__(self, keys: Iterable[ObjectKey], budget_us: int | None = None) -> None:
         super().__init__(budget_us)
@@ -139,5 +141,5 @@ class ListedObjects(_Patience):
 
 
 def of_dictionary(dictionary: ObjectDictionary, budget_us: int | None = None) -> ListedObjects:
-    """Return a sweep of every entry that can be read."""
+    """Return a sweep of every entry of the EDS that can be read."""
     return ListedObjects((ObjectKey(e.index, e.subindex) for e in dictionary if e.readable), budget_us)

@@ -1,7 +1,8 @@
 """Read the tags of a profile in the fewest requests that the limits of the profile and of the device allow.
 
-A generator as `sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused
-read is halved, and limits learnt on the way are used from the next pass on.
+The sweep is a generator without I/O, as in `sweep`. It uses the gateway's read planner
+(`fieldtwin.gateway.devices.read_plan`): a refused read is halved, and limits learnt in one pass are used from the next pass
+on.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, Group
 class ProfileSweep:
     """A sweep that reads `tags` of `profile`. `maps` are the findings by table.
 
-    Where the device is silent, reads are not repeated after `MOST_SILENT` in a row, and end when they have taken
-    `budget_us`.
+    After `MOST_SILENT` consecutive reads without a reply, reads are not repeated any more. The sweep ends when the device has
+    answered none of the first `MOST_SILENT` reads, or when reads without a result have taken `budget_us` microseconds.
     """
 
     def __init__(self, profile: DeviceProfile, tags: Sequence[Tag], budget_us: int | None = None) -> None:
@@ -68,9 +69,7 @@ class ProfileSweep:
 
 
 def _let_alone(profile: DeviceProfile, tags: Sequence[Tag]) -> list[RegisterRange]:
-    """Return the registers of tags that must not be read, so that a read over a gap between two other tags does not include
-    them.
-    """
+    """Return the registers of the profile's other tags, so that a read over a gap between two of `tags` does not include them."""
     wanted = [t.registers for t in tags]
     others = [t.registers for t in profile.tags.values() if t.name not in {w.name for w in tags}]
     return [o for o in others if not any(w.overlaps(o) for w in wanted)]

@@ -1,4 +1,4 @@
-"""A dump from end to end: the ranges of the user, the estimated duration, the files, the open connection.
+"""A dump from end to end: the ranges of the user, the estimated duration, the files, and the connection.
 
 This module must not depend on a display.
 """
@@ -29,7 +29,7 @@ from fieldtwin.gateway.devices.read_plan import read_request
 from fieldtwin.gateway.wallclock import WallClock
 
 REPLY_S = 0.01
-"""Assumed response time of a device, for an estimate."""
+"""Assumed response time of a device in seconds, for an estimate."""
 _INDEXES = re.compile(r"^(?:0x)?([0-9A-Fa-f]{4})h?(?:\.\.(?:0x)?([0-9A-Fa-f]{4})h?)?$")
 CAN_BITS = 2 * 130
 """Number of bits of an SDO request and its reply on the bus, with stuff bits."""
@@ -37,10 +37,11 @@ CAN_BITS = 2 * 130
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The number of requests and the duration of the first pass, if everything can be read, and if nearly nothing can be read.
+    """The number of requests and the duration in seconds of the first pass, if everything can be read and if nearly nothing can
+    be read.
 
-    `budgets_s` is the additional time that questions without a result may take, in all tables together. `shorter` names
-    what the user can give to make the dump shorter.
+    `budgets_s` is the additional time that requests without a result may take, in all tables together. `shorter` names the
+    options with which the user can make the dump shorter.
     """
 
     least_requests: int
@@ -52,7 +53,7 @@ class Estimate:
 
 
 def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
-    """Parse ``holding``, ``holding:0..999``, ``40001..40100``. Raises `UsageError`."""
+    """Return the ranges of texts such as ``holding``, ``holding:0..999``, ``40001..40100``. Raises `UsageError`."""
     spans = []
     for text in texts:
         table = next((t for t in TABLES if t == text), None)
@@ -64,7 +65,7 @@ def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
 
 
 def object_ranges(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Parse ``6000..6FFF``, ``1018h``. Raises `UsageError`."""
+    """Return the ranges of indices (both ends included) of texts such as ``6000..6FFF``, ``1018h``. Raises `UsageError`."""
     ranges = []
     for text in texts:
         match = _INDEXES.match(text)
@@ -77,7 +78,7 @@ def object_ranges(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 def estimate(job: DumpJob, spacing_s: float) -> Estimate:
-    """Return the estimated number of requests and duration of a pass at this rate."""
+    """Return the estimated number of requests and duration of a pass, with a pause of `spacing_s` seconds after each request."""
     least = most = 0
     for sweep in job.sweeps():
         if isinstance(sweep, Sweep):
@@ -138,7 +139,7 @@ def frames(job: DumpJob) -> list[str]:
 
 
 def log_path(out: Path) -> Path:
-    """Return the path of the log of all sent frames for the dump `out`, in the same folder."""
+    """Return the path of the log of all sent frames of the dump `out`, in the same folder."""
     return out.with_name(out.name.removesuffix(".jsonl") + ".sent.jsonl")
 
 
@@ -154,9 +155,9 @@ async def dump(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> DumpResult:
-    """Dump to the file `out`, which must not exist unless `resume`. Raises as `Dumper.run`, and `FileInvalid`.
+    """Dump to the file `out`, which must not exist unless `resume`. Raises the errors of `Dumper.run`, and `FileInvalid`.
 
-    For a file that is complete, `resume` only makes further passes.
+    For a file that is complete, `resume` only makes further passes. `words` is the command line, for the log of sent frames.
     """
     clock = clock or WallClock()
     if job.target.address == 0 and Endpoint.parse(job.target.url).scheme in ("rtu", "ascii", "rtu+tcp"):

@@ -1,12 +1,14 @@
 """Explore a whole register table with few reads: the readable addresses, the holes, and the longest read.
 
-Pure: a sweep is a generator that yields questions and receives their outcomes. The same answers always lead to the same
-questions. This is how an interrupted dump continues: recorded answers are replayed, and no question is sent twice.
+A sweep is a generator without I/O that yields questions (the ranges to read) and receives their outcomes. The same answers
+always lead to the same questions. This is how an interrupted dump continues: recorded answers are replayed, and no question
+is sent twice.
 
-A read that is refused contains a hole or is too long, and the exception code does not show which (devices disagree). Therefore
-a single register is read next. If it is readable, the sweep reads on from there to the next refusal, and a short read across
-that border shows its cause. In an area that cannot be read only some addresses are tried (`Sweep.stride`). Where the device is
-silent `asking` stops early, because each question costs a timeout; `beyond` continues from there within a time budget.
+A read that is refused contains a hole (addresses that cannot be read) or is too long, and the exception code does not show
+which (devices disagree). Therefore a single register is read next. If it is readable, the sweep reads on from there to the
+next refusal, and a short read across that border shows its cause. In an area that cannot be read only some addresses are
+tried (`Sweep.stride`). Where the device is silent `asking` stops early, because each request costs a timeout; `beyond`
+continues from there within a time budget.
 """
 
 from __future__ import annotations
@@ -27,13 +29,15 @@ ROUND = 50
 MOST_SILENT = 10
 """Number of consecutive reads without a reply after which a sweep stops trying single addresses."""
 TRUSTED_SILENCE = 2
-"""After this many repeated questions without a reply, silence counts as a refusal, and probes are no longer repeated."""
+"""After this many repeated requests without a reply, further silence is trusted: probes of single addresses are not repeated."""
 MOST_PAIR_TRIALS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """The device answered; `raw` as on the bus, bits one per byte. It took `us` microseconds, as in the other outcomes."""
+    """A read that the device answered with values. `raw` is as on the bus, for bits one byte each. `us` is the time in
+    microseconds from the question to the end of its answer or timeout, in this and the other outcomes.
+    """
 
     raw: bytes
     us: int = 0
@@ -49,7 +53,7 @@ class RefusedRead:
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """No reply arrived, despite all repetitions."""
+    """A read without a reply, despite all repetitions."""
 
     problem: str
     us: int = 0
@@ -73,12 +77,12 @@ Trying = Generator[RegisterRange, Outcome, bool]
 class TableMap:
     """The properties of a table that single addresses do not show. Intervals are [start, end).
 
-    A border is an address that a read may not cross although both sides can be read. In ``(start, end, n)`` of `units`
-    reads take multiples of `n` registers from `start` on. `max_read` is the longest accepted read; `limit_proved` means
-    that one more register is refused (or that it is the standard's limit). `codes` counts exceptions. `stopped` is the
-    reason why the sweep did not ask all its questions; `function_refused` means that the device does not know the
-    table's function. `lengths` are the read lengths that were tried wherever the sweep looked for registers among
-    refusals.
+    A border is an address that a read may not cross although both sides can be read. In ``(start, end, n)`` of `units` reads take
+    multiples of `n` registers from `start` on. `max_read` is the longest accepted read; `limit_proved` means that one more
+    register is refused (or that it is the standard's limit). `grain` 2: the device accepts only pairs of registers. `codes`
+    counts exceptions by code. `stopped` is the reason why the sweep did not ask all its questions; `function_refused` means that
+    the device does not know the table's function. `lengths` are the read lengths that were tried wherever the sweep looked for
+    registers among refusals.
     """
 
     table: Table
@@ -103,7 +107,7 @@ class TableMap:
         self.units = [u for u in self.units if not (start <= u[0] and u[1] <= end)] + [(start, end, size)]
 
     def reads(self) -> list[RegisterRange]:
-        """Return the fewest reads that cover everything readable, never over a hole or a border."""
+        """Return the fewest reads that cover all readable addresses and cross no hole and no border."""
         most = self.max_read or 1
         planned: list[RegisterRange] = []
         for start, end in self.readable:
@@ -117,11 +121,12 @@ class TableMap:
 
 
 class Sweep:
-    """An exploration of `span`. `most` is the longest read to try (None: the standard's). `stride` 1 reads every address.
+    """An exploration of `span`. `most` is the longest read to try (None: the standard's limit). `stride` is the distance of the
+    addresses that are tried in an area that cannot be read; 1 tries every address.
 
     `found` and `coverage` are filled while `asking` runs. `patient` is true if the last yielded question is to be repeated when
-    no reply arrives. `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the
-    pause after each.
+    no reply arrives. `budget_us` limits the time that requests without a result take (None: no limit); `spacing_us` is the pause
+    after each.
     """
 
     def __init__(
@@ -189,9 +194,9 @@ class Sweep:
             at = begins = yield from self._after_a_refusal(at, count)
 
     def _after_a_refusal(self, at: int, count: int) -> Generator[RegisterRange, Outcome, int]:
-        """Return the address at which to continue after a refused read of `count` cells at `at`.
+        """Return the address at which to continue after a failed read of `count` cells at `at`.
 
-        Finds the readable prefix, and the reason for its end.
+        The method finds the readable beginning of that range, and the reason for its end.
         """
         grain = self.found.grain
         good = grain if count > grain and (yield from self.ask(at, grain)) else 0
@@ -213,7 +218,7 @@ class Sweep:
     def ask_the_length_that_came(self, at: int) -> Generator[RegisterRange, Outcome, int]:
         """If the last reply for `at` carried an unexpected number of registers, read that number.
 
-        Return it if the device then answers, else 0.
+        Return that number if the device answers with values, else 0.
         """
         (place, count), self._hint = self._hint, (-1, 0)
         if place != at or not count or (at, count) in self.asked or at + count > self.span.end:
@@ -225,7 +230,7 @@ class Sweep:
         return count
 
     def _longest(self, at: int, good: int, bad: int, *, forward: bool) -> Generator[RegisterRange, Outcome, int]:
-        """Return the longest accepted read, from `at` on or up to it, between an accepted and a refused length."""
+        """Return the longest accepted read that begins (`forward`) or ends at `at`, between an accepted and a refused length."""
         grain = self.found.grain
         while bad - good > grain:
             middle = good + max(grain, (bad - good) // 2 // 2 * 2)
@@ -236,7 +241,10 @@ class Sweep:
         return good
 
     def _why_it_ends(self, at: int, good: int) -> Generator[RegisterRange, Outcome, int]:
-        """Find why a read of `good` cells from `at` is accepted and a longer one is not: a hole, a border, or the limit."""
+        """Find why a read of `good` cells from `at` is accepted and a longer one is not: a hole, a border, or the limit.
+
+        Return the address at which to continue.
+        """
         grain, edge = self.found.grain, at + good
         if edge + grain > self.span.end or self.halted:
             return edge
@@ -255,7 +263,11 @@ class Sweep:
         return edge
 
     def through_a_void(self, at: int) -> Generator[RegisterRange, Outcome, int]:
-        """Continue from `at`, after an address that could not be read, to the next readable one, or to the end."""
+        """Return the address at which to continue after an address that could not be read: the next readable block, or the span's
+        end.
+
+        `at` is the first address that was not tried yet.
+        """
         end, grain, dense = self.span.end, self.found.grain, at + DENSE
         unasked = probe = at  # the addresses between these two were not read
         while probe < end and not self.halted:
@@ -285,10 +297,10 @@ class Sweep:
         return at
 
     def _probe(self, at: int, *, strided: bool) -> Trying:
-        """Return whether `at` can be read.
+        """Read at `at`, unless this was done before, and return whether the address can be read.
 
-        As long as no register was readable, the device may permit reads of two registers only. Therefore a pair of registers
-        is also read, and it is read first if the sweep does not read every address.
+        As long as no single register was readable, the device may permit only reads of two registers. Therefore a pair of
+        registers is also read, and it is read first if the sweep does not try every address (`strided`).
         """
         grain = self.found.grain
         readable = self.coverage.states[at] == READABLE
@@ -316,7 +328,7 @@ class Sweep:
         return max(jump + -jump % grain, probe + grain)
 
     def ask(self, address: int, count: int) -> Trying:
-        """Ask for `count` cells from `address` and record the outcome. Return whether the device returned their values."""
+        """Read `count` cells from `address` and record the outcome. Return whether the device returned their values."""
         if self.found.stopped:
             return False
         self.asked.add((address, count))
@@ -351,7 +363,7 @@ class Sweep:
         return isinstance(outcome, Taken)
 
     def _charge(self, outcome: Outcome) -> None:
-        """Count the time of a question without a result against the budget."""
+        """Count the time of a request without a result against the budget."""
         if self.charges_everything or isinstance(outcome, Silent | Invalid):
             self.spent_us += outcome.us + self._spacing_us
         if self._budget_us is not None and self.spent_us > self._budget_us and not self.found.stopped:
@@ -361,7 +373,7 @@ class Sweep:
 
     @staticmethod
     def _add(spans: list[tuple[int, int]], start: int, end: int) -> None:
-        """Add [start, end).
+        """Add the interval [start, end) to `spans`.
 
         Nearly always it follows or touches the last interval; otherwise the intervals are sorted and joined.
         """

@@ -1,6 +1,7 @@
-"""`identify` of a CANopen node: 1000h, 1008h, 1009h, 100Ah and 1018h, compared with the data sheets of known profiles.
+"""`identify` of a CANopen node: read 1000h, 1008h, 1009h, 100Ah and 1018h, and compare them with the data sheets of known
+profiles.
 
-It only reads, one object at a time, with a pause after each.
+The command only reads, one object at a time, with a pause after each.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ LONGEST_TEXT = 256
 
 @dataclass(slots=True)
 class CanIdentity:
-    """The result of `identify` for a node: what the node reported of itself, and the profiles that may fit."""
+    """The result of `identify` for a node: the values of its identity objects, and the profiles that may fit."""
 
     url: str
     node: int
@@ -33,7 +34,7 @@ class CanIdentity:
     candidates: list[Candidate] = field(default_factory=list)
     answers: bool = False
     conflict: str = ""
-    """The reason why two nodes seem to have this ID; a value may then come from either of them."""
+    """The reason to assume that two nodes have this ID, "" without such a reason; a value may then come from either of them."""
 
     @property
     def summary(self) -> str:
@@ -43,7 +44,7 @@ class CanIdentity:
 
     @property
     def certain(self) -> str | None:
-        """Return the one profile that is certain, if there is one."""
+        """Return the profile that is certain; None if there is none or more than one."""
         return None if self.conflict else certain(self.candidates)
 
 
@@ -60,7 +61,9 @@ async def identify_canopen(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> CanIdentity:
-    """Identify `node` on the bus at `url`, and compare it with `profiles`. Errors as `canopen_at`."""
+    """Identify `node` on the bus at `url`, and compare it with `profiles`, with at most `per_s` requests a second. Raises the
+    same errors as `canopen_at`.
+    """
     clock = clock or WallClock()
     result = CanIdentity(url, node)
     async with canopen_at(url, bitrate, sdo_timeout_s=timeout_s, taps=taps, connector=connector, clock=clock) as master:
@@ -85,7 +88,7 @@ async def identify_canopen(
 
 
 class _Asker:
-    """A sender of single uploads, for which an abort is an answer."""
+    """A sender of single SDO uploads. An abort or a missing reply is noted in the result and not raised."""
 
     def __init__(self, master: CanopenMaster, result: CanIdentity, clock: Clock, pause_s: float) -> None:
         self._master, self._result, self._clock = master, result, clock

@@ -1,8 +1,8 @@
-"""Find the profile that fits a device, with certainty and reasons. Pure: clues in, a ranking out.
+"""Find the profile that fits a device, with certainty and reasons. The functions do no I/O: they rank profiles by clues.
 
 Certainty requires an unambiguous identification by the device itself: its identity objects (2Bh/0Eh), its vendor ID and
-product code (1018h), or the SunSpec header and a model number. Readable and plausible registers never make a profile
-certain: sister models share maps, and an empty register is plausible everywhere.
+product code (1018h), or the SunSpec header and a model number. Readable and plausible registers never make a profile certain:
+sister models share maps, and an empty register is plausible everywhere.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 ENOUGH_SIGNS = 6
-"""If at least this many values are plausible, of those that could also have been implausible, the profile is likely to fit."""
+"""Number of plausible values (only those count that could also have been implausible) from which on a profile is likely
+to fit.
+"""
 TELLING_BYTES = 4
 """A server ID shorter than this many bytes is shared by many devices, so it identifies none."""
 _SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")
@@ -51,8 +53,8 @@ class SunSpec:
 
 @dataclass(slots=True)
 class ModbusClues:
-    """The identification that a unit gives of itself. None: the unit gave none, for the reason in `silence` (by function, such
-    as ``"2B"``).
+    """The data with which a unit identifies itself. A value is None if the unit did not give it; `silence` has the reason, by
+    function, such as ``"2B"``.
     """
 
     server_id: bytes | None = None
@@ -63,7 +65,7 @@ class ModbusClues:
 
 @dataclass(slots=True)
 class CanClues:
-    """The identification that a node gives of itself."""
+    """The data with which a node identifies itself. `silence` has the reasons for missing values, by object."""
 
     identity: Identity | None = None
     name: str = ""
@@ -74,7 +76,7 @@ class CanClues:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A profile, with reasons for and against it."""
+    """A profile, the certainty that it fits, and the reasons for and against it."""
 
     profile: str
     sureness: Sureness
@@ -99,13 +101,13 @@ def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
 
 
 def certain(ranked: Sequence[Candidate]) -> str | None:
-    """Return the one profile that is certain, if there is one."""
+    """Return the profile that is certain; None if there is none or more than one."""
     found = [c.profile for c in ranked if c.sureness is Sureness.CERTAIN]
     return found[0] if len(found) == 1 else None
 
 
 def summary(ranked: Sequence[Candidate]) -> str:
-    """Return a cautious sentence: several profiles that fit equally well are not an answer."""
+    """Return the result as a cautious sentence: if several profiles fit equally well, it names all of them."""
     best = [c for c in ranked if c.sureness is not Sureness.RULED_OUT and c.sureness == ranked[0].sureness]
     if not best:
         return "no known profile fits"
@@ -119,9 +121,8 @@ def summary(ranked: Sequence[Candidate]) -> str:
 
 
 def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
-    """Return why `profile` contradicts the unit's identification; empty if it does not.
-
-    Its registers then need not be read.
+    """Return why `profile` contradicts the unit's identification; empty if it does not. If it does, the profile's registers
+    need not be read.
     """
     if clues.objects is not None:
         for number, label in ((0, "vendor"), (1, "product code")):
@@ -137,9 +138,9 @@ def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
 
 
 def rate_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]) -> Candidate:
-    """Return the certainty that the unit is a device of `profile`.
+    """Return the certainty that the unit is a device of `profile`, with the reasons.
 
-    `readings`: tags of its `identify`, and others, by name.
+    `readings` are the values of the tags in the profile's `identify` section, and of other tags, by name.
     """
     against = contradicted(profile, clues)
     if against:
@@ -173,7 +174,7 @@ def rate_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[st
 def _own_words(
     profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]
 ) -> tuple[list[str], list[str], bool]:
-    """Compare the unit's identification with `profile`'s: reasons for, doubts, and whether they prove it."""
+    """Compare the unit's identification with that in `profile`. Return reasons for, doubts, and whether the reasons prove it."""
     reasons: list[str] = []
     doubts: list[str] = []
     certain = False
@@ -206,9 +207,9 @@ def _own_words(
 
 
 def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
-    """Return, in words, where the profile's registers lie in the device's SunSpec map, or an empty string.
+    """Return ``model N`` if all registers of the profile lie in SunSpec blocks of the device, else an empty string.
 
-    It is the device's model 1, its model `number`, or the marks around all models ("SunS" and the end model).
+    These blocks are the device's model 1, its model `number`, and the marks around all models ("SunS" and the end model).
     """
     blocks = [(at, at + 2 + size) for n, at, size in found.models if n in (1, number)]
     end = max((at + 2 + size for _, at, size in found.models), default=found.base)
@@ -219,7 +220,7 @@ def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
 
 
 def _keys(profile: DeviceProfile, readings: Mapping[str, ProfileReading]) -> tuple[list[str], list[str]]:
-    """Check the `identify` entries of the profile: reasons for, and contradictions that rule it out."""
+    """Check the entries in the profile's `identify` section. Return reasons for, and contradictions that rule the profile out."""
     good: list[str] = []
     wrong: list[str] = []
     for entry in profile.form.identify:
@@ -248,7 +249,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, ProfileReading]) -> tup
 
 
 def _plausibility(readings: Iterable[ProfileReading]) -> tuple[list[str], list[str]]:
-    """Return the plausible values, out of those that could have been implausible, and the implausible ones."""
+    """Return the names of tags with a plausible value that could have been implausible, and the implausible values."""
     signs: list[str] = []
     nonsense: list[str] = []
     for reading in readings:
@@ -292,7 +293,7 @@ def _shown(reading: ProfileReading) -> str:
 
 
 def rate_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: CanClues) -> Candidate:
-    """Return the certainty that the node is a device of `profile`, whose data sheet is `eds`."""
+    """Return the certainty that the node is a device of `profile`, whose data sheet is `eds`, with the reasons."""
     told = clues.identity
     if eds is None or told is None:
         return Candidate(profile.name, Sureness.RULED_OUT, (), ("there is nothing to compare",))

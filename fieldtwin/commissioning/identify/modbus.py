@@ -1,5 +1,5 @@
-"""`identify` of a Modbus unit: read the unit's own identification, then check whether the registers of known profiles have
-plausible values. It only reads.
+"""`identify` of a Modbus unit: read the unit's own identification, then check whether the registers of known profiles
+have plausible values. The command only reads.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ from fieldtwin.gateway.protocols.modbus.requests.replies import Reply
 from fieldtwin.gateway.protocols.modbus.requests.request import Request
 
 MOST_TAGS = 24
-"""Number of values of a profile that are read to see whether they are plausible, in addition to those of its `identify`."""
+"""Number of values of a profile that are read to see whether they are plausible, in addition to those in its `identify`
+section.
+"""
 SILENT = (ReplyTimeout, CrcError, Desync)
 NAMES = {0: "vendor", 1: "product code", 2: "revision", 3: "vendor URL", 4: "product", 5: "model", 6: "application"}
 R = TypeVar("R", bound=Reply)
@@ -48,7 +50,7 @@ R = TypeVar("R", bound=Reply)
 
 @dataclass(slots=True)
 class ModbusIdentity:
-    """The findings about a unit."""
+    """The result of `identify` for a unit: its own identification, and the profiles that may fit."""
 
     url: str
     unit: int
@@ -65,7 +67,7 @@ class ModbusIdentity:
 
     @property
     def certain(self) -> str | None:
-        """Return the one profile that is certain, if there is one."""
+        """Return the profile that is certain; None if there is none or more than one."""
         return certain(self.candidates)
 
 
@@ -114,14 +116,14 @@ async def identify_modbus(
 
 
 def modbus_frames(url: str, unit: int) -> list[str]:
-    """Return the frames that are sent before any profile's registers are read, for `--dry-run`."""
+    """Return the frames of the requests that `identify` sends before it reads any profile's registers, for `--dry-run`."""
     headers = [ReadRegisters("holding", base, 2) for base in sunspec.BASES]
     questions = [ReportServerId(), *headers, *(ReadDeviceIdentification(code) for code in (1, 2, 3))]
     return [frame_of(url, unit, question).hex(" ") for question in questions]
 
 
 class _Asker:
-    """A sender of single questions, for which a refusal is an answer."""
+    """A sender of single requests. A refusal or a missing reply is noted in the result and not raised."""
 
     def __init__(self, client: ModbusClient, unit: int, result: ModbusIdentity) -> None:
         self._client, self._unit, self._result = client, unit, result
@@ -215,7 +217,7 @@ async def _compare(client: ModbusClient, result: ModbusIdentity, profile: Device
 
 
 def _telling(tag: Tag) -> int:
-    """Return the rank of a tag: those that could turn out to be implausible come first."""
+    """Return the sort key of a tag: tags whose values could turn out to be implausible come first."""
     return 0 if tag.type.startswith("float") else 1 if tag.values or tag.range is not None else 2
 
 

@@ -1,9 +1,9 @@
-"""Calibrate the model's probabilities with the share of right readings on generated register maps whose meaning is known.
+"""Calibrate the model's probabilities with the share of correct readings on generated register maps whose meaning is known.
 
-The model's arithmetic takes its assumptions for granted, so its probabilities are too high where registers could be
-read in several ways that look the same. Each kind of reading therefore has a curve from the model's probability to the
-observed share of right readings. The curves are fitted by `benchmarks/infer_calibration.py --fit` and checked there on
-other maps. Pure.
+A reading is an interpretation of registers as a value of a type and order. The model relies on its assumptions, so its
+probabilities are too high where several readings of the same registers look alike. Each kind of reading therefore has a curve
+from the model's probability to the observed share of correct readings. The curves are fitted by
+`benchmarks/infer_calibration.py --fit` and checked there on other maps. The module does no I/O.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 Curve = tuple[tuple[float, float], ...]
-"""Points ``(log odds of the model, observed share)``, both rising."""
+"""Points ``(log odds of the model's probability, observed share of correct readings)``; both numbers rise from point to point."""
 
 UPPER_HALF = "may be its upper half"
 """A part of the text that says why the certainty of a reading is limited: the register and its neighbour could be one longer
@@ -63,7 +63,10 @@ CURVES: dict[str, Curve] = {
 
 
 def kind_of(kind: str, registers: int, *, moves: bool, capped: str) -> str:
-    """Return the kind of a reading, which selects its calibration curve."""
+    """Return the name of the calibration curve for a reading of the type `kind`.
+
+    `moves`: its values changed. `capped` is the reason why its certainty is limited, "" without one.
+    """
     if kind == "string":
         return "text"
     if not moves:
@@ -80,7 +83,9 @@ def log_odds(probability: float) -> float:
 
 
 def calibrated(probability: float, kind: str) -> float:
-    """Return the observed share of right readings for this kind and this probability of the model."""
+    """Return the observed share of correct readings for this kind of reading (see `kind_of`) and this probability of the
+    model.
+    """
     curve = CURVES[kind]
     if not curve:
         return probability
@@ -95,7 +100,7 @@ def calibrated(probability: float, kind: str) -> float:
 
 
 def fitted(samples: Sequence[tuple[float, bool]], bins: int = 16) -> Curve:
-    """Return a curve for ``(probability of the model, right)``.
+    """Return the calibration curve for `samples`, which are ``(probability of the model, whether the reading was correct)``.
 
     Bins have equally many samples; adjacent bins are merged where the curve would decrease. The curve lies one standard error
     below the observation, so that it claims too little rather than too much.

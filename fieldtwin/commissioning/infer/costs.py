@@ -1,8 +1,9 @@
-"""The cost of reading a series of register words as a value of a type and order, in nats (natural bits).
+"""The cost of reading a series of register words as a value of a type and order, in nats (negative natural logarithms of
+probabilities).
 
-The right reading of a device's registers is the least surprising one: a float in the right word order changes a little,
-in the wrong one it jumps over decades. Costs are minus log probabilities, so the costs of neighbours add up and
-readings can be weighed against each other. Pure arithmetic; independent of dumps and profiles.
+The correct reading of a device's registers is the least surprising one: a float in the correct word order changes a little,
+in the wrong one it jumps over decades. The costs of neighbouring values add up, and the costs of readings can be compared.
+The module only calculates; it is independent of dumps and profiles.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from fieldtwin.gateway.core.files.profile import REGISTERS_OF
 from fieldtwin.gateway.devices.codec import reorder
 
 IMPOSSIBLE = math.inf
-"""The cost of a reading that no device can have, such as NaN or a number of an impossible size."""
+"""The cost of a reading that no device can have, such as NaN or a float of an implausible magnitude."""
 MOST_TEXT_REGISTERS = 24
 
 TYPE_COST = {
@@ -30,7 +31,7 @@ ORDER_COST = {"ABCD": 0.3, "CDAB": 1.0, "BADC": 3.0, "DCBA": 2.5}
 """The cost of each byte order, by its rarity among devices."""
 NUMBERS = tuple(kind for kind in TYPE_COST if kind != "string")
 SWAPPED_SINGLE_COST = 3.0
-"""A device that swaps the bytes of longer values seldom swaps those of single registers."""
+"""The cost of swapped bytes in a single register: devices that swap the bytes of longer values seldom swap these."""
 ZERO_COST = 0.7
 """The cost of a register that is always 0, like most unused registers."""
 
@@ -41,15 +42,16 @@ _FORMATS = {
 _MANTISSA_BITS = {"float32": 23, "float64": 52}
 _LN2 = math.log(2)
 WILD_COST = 9.0
-"""The cost of a single number that jumps over its whole range, as the lower half of a longer number does."""
+"""The cost of a number that jumps over its whole range, as the lower half of a longer number does."""
 LARGE, LARGE_COST = 1 << 28, 4.0
-"""A whole number of this size is a counter.
+"""The limit above which a 32-bit integer that rises and falls is unlikely, and the cost of such an integer.
 
-A varying one would be a measurement of nine digits, and is more likely a float.
+A large integer is usually a counter. One that rises and falls would be a measurement of nine digits, and is more likely a
+float.
 """
 _LEAST_STEP_COST = 0.05
 _TEMPER = 0.7
-"""The weight of the evidence of steps, because they depend on each other."""
+"""The weight of the costs of steps. It is less than 1, because successive steps are not independent evidence."""
 
 
 def orders_of(kind: str) -> tuple[str, ...]:
@@ -60,7 +62,7 @@ def orders_of(kind: str) -> tuple[str, ...]:
 
 
 def whole_numbers(words: Sequence[Sequence[int]], order: str) -> list[int]:
-    """Return each pass's words combined in this order, as unsigned numbers."""
+    """Return one unsigned number for each row of `words` (a pass): the words of the row combined in this order."""
     if order in ("BADC", "DCBA"):
         words = [[w >> 8 | (w & 0xFF) << 8 for w in row] for row in words]
     if order in ("CDAB", "DCBA"):
@@ -73,12 +75,12 @@ def whole_numbers(words: Sequence[Sequence[int]], order: str) -> list[int]:
 
 
 def decode_series(words: Sequence[Sequence[int]], kind: str, order: str) -> list[float] | None:
-    """Return the raw numbers of each pass's words; None where a word is not a number (a BCD digit above 9)."""
+    """Return one raw number for each row of `words` (a pass); None if a word is not a number (a BCD digit above 9)."""
     return decode_numbers(whole_numbers(words, order), kind)
 
 
 def decode_numbers(wholes: Sequence[int], kind: str) -> list[float] | None:
-    """Return unsigned numbers as numbers of this type."""
+    """Return the bit patterns `wholes` as numbers of the type `kind`; None if one of them is not a number of that type."""
     if kind.startswith("uint"):
         return list(wholes)
     bits = 16 * REGISTERS_OF[kind]
@@ -93,7 +95,7 @@ def decode_numbers(wholes: Sequence[int], kind: str) -> list[float] | None:
 
 
 def cost(words: Sequence[Sequence[int]], kind: str, order: str) -> float:
-    """Return the cost of `words` (one row a pass) as a series of this type.
+    """Return the cost of `words` (one row per pass) as a series of values of this type.
 
     The rarity of the type is included; that of the order is not (`order_cost`).
     """
@@ -103,7 +105,7 @@ def cost(words: Sequence[Sequence[int]], kind: str, order: str) -> float:
 
 
 def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
-    """Return the cost as `cost` does, for numbers that are combined already."""
+    """Return the same cost as `cost`, for words that are already combined to unsigned numbers."""
     if not any(wholes):
         return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind]
     numbers = decode_numbers(wholes, kind)
@@ -127,7 +129,7 @@ def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
 
 
 def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
-    """Return the cost of an order, given the costs of the four orders.
+    """Return the cost of the order `order`, given the costs of the four orders.
 
     One register and a text have no word order; their bytes are either swapped or not.
     """
@@ -151,14 +153,14 @@ def _is_wild(numbers: Sequence[int], bits: int) -> bool:
 
 
 def _first_cost(first: int, bits: int, *, signed: bool) -> float:
-    """Return the cost of a first number: small ones are more frequent, with each magnitude equally likely."""
+    """Return the cost of the first number of a series: each order of magnitude is equally likely, so small numbers are cheap."""
     return math.log(abs(first) + 1) + math.log(bits * _LN2) + (_LN2 if signed else 0.0)
 
 
 def walk_cost(numbers: Sequence[int]) -> float:
-    """Return the cost of the steps of a series that is constant, wanders or counts.
+    """Return the cost of the steps of a series that is constant, rises and falls, or counts.
 
-    The distribution has heavy tails around a step of zero or around the usual step.
+    The assumed distribution has heavy tails around a step of zero or around the median step.
     """
     steps = [b - a for a, b in pairwise(numbers)]
     if not steps:
@@ -198,7 +200,7 @@ def _float_cost(numbers: Sequence[float], kind: str) -> float:
 def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
     """Return the cost of steps as real numbers, for values that cross zero or a power of two, and for even changes.
 
-    Each step costs the digits that it shows beyond its scale.
+    A step costs more, the larger it is and the finer the resolution of its value is compared with the scale of all steps.
     """
     steps = [b - a for a, b in pairwise(numbers)]
     if not steps or not any(steps):
@@ -213,7 +215,9 @@ def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
 
 
 def _real_walk(distances: Sequence[float], fine: Sequence[float]) -> float:
-    """Return the cost of Cauchy distributed distances, to the resolution of each value; a value of 0.0 has a fixed cost."""
+    """Return the cost of Cauchy distributed distances, given the resolution `fine` of each value (0: the value is 0.0, a
+    fixed cost).
+    """
     scale = max(median(distances), sum(distances) / len(distances) / 4, 0.3 * max(fine), 1e-300)
     total = 3.0
     for distance, resolution in zip(distances, fine, strict=True):
@@ -226,7 +230,7 @@ def _real_walk(distances: Sequence[float], fine: Sequence[float]) -> float:
 
 @lru_cache(maxsize=4096)
 def _mantissa_cost(value: float, kind: str) -> float:
-    """Return the cost of a first value's digits: low for a round number, binary or decimal."""
+    """Return the cost of the digits of a series' first value: low for a round number, binary or decimal."""
     bits = _MANTISSA_BITS[kind]
     raw = struct.pack(_FORMATS[kind], value)
     mantissa = int.from_bytes(raw) & ((1 << bits) - 1)
@@ -239,14 +243,14 @@ def _mantissa_cost(value: float, kind: str) -> float:
 
 
 def _ordered(value: float, kind: str) -> int:
-    """Return the number of a float among all floats, so that neighbours differ by 1."""
+    """Return the position of a float in the ordered sequence of all floats of its type, so that neighbours differ by 1."""
     raw = int.from_bytes(struct.pack(_FORMATS[kind], value))
     sign = 1 << (31 if kind == "float32" else 63)
     return raw if raw < sign else sign - raw
 
 
 def _text_cost(words: Sequence[Sequence[int]], order: str) -> float:
-    """Return the cost of a text: it is constant, printable and padded with NULs or blanks at its end."""
+    """Return the cost of a text: `IMPOSSIBLE` unless it is constant, printable and padded only with NULs or blanks at its end."""
     if any(row != words[0] for row in words[1:]):
         return IMPOSSIBLE
     data = b"".join(w.to_bytes(2) for w in words[0])

@@ -1,8 +1,8 @@
 """Write a draft profile from inferred registers: valid for the profile reader, with the doubts as comments.
 
-It must never sound more certain than the inference: guesses are marked, and a value of unknown type is drafted register
-by register. Every register and bit that could be read has a tag, so that an emulator of the draft answers as the device
-does.
+The draft must never sound more certain than the inference: guesses are marked, and a value of unknown type is drafted
+register by register. Every register and bit that could be read has a tag, so that an emulator of the draft answers as the
+device does.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
 def _factory(header: Mapping[str, Any], unit: int) -> str:
     """Return the line with the unit ID and, for a serial line, the settings with which the dump reached the device.
 
-    A recording does not name its line.
+    If the passes come from a recording, the line has only the unit ID, because a recording does not state its endpoint.
     """
     endpoint = Endpoint.parse(header["endpoint"]) if "endpoint" in header else None
     stated = dict(endpoint.params) if endpoint is not None and endpoint.is_serial else {}
@@ -73,7 +73,7 @@ def tag_name(reading: Interpretation) -> str:
 
 
 def doubts(reading: Interpretation) -> str:
-    """Return one line with the certainty, the alternatives, and other remarks."""
+    """Return one line with the certainty of a reading, its alternatives, its values, and other remarks."""
     parts = [f"{reading.level}" if reading.level is Level.CERTAIN else f"{reading.level} ({_percent(reading)})"]
     if reading.level is Level.UNKNOWN:
         parts = [f"unknown, perhaps {reading.type} {reading.order} ({_percent(reading)})"]
@@ -127,7 +127,7 @@ def _tag(reading: Interpretation) -> list[str]:
 
 
 def _flags(reading: Interpretation) -> list[str]:
-    """Return a tag for each bit of a status word that changed."""
+    """Return a line for each bit that changed, if the register is a status word: a tag of this bit."""
     if "bits" not in reading.marks:
         return []
     words = [int(v) & 0xFFFF for v in reading.values]
@@ -140,8 +140,8 @@ def _flags(reading: Interpretation) -> list[str]:
 
 
 def _states(dumps: Sequence[Dump]) -> list[str]:
-    """Return comments on the addresses that the draft leaves out, so that a reader does not take silent addresses for refused
-    ones.
+    """Return comments with the number of addresses in each state and the silent ranges, so that a user does not take silent
+    addresses for refused ones.
     """
     lines = []
     for line in (m for d in dumps for m in d.maps.values() if "counts" in m):
@@ -158,7 +158,7 @@ def _states(dumps: Sequence[Dump]) -> list[str]:
 
 
 def _bits(series: Series) -> tuple[list[str], int]:
-    """Return a tag for each bit, at most `MOST_BITS`, and the number of omitted ones."""
+    """Return a line with a tag for each coil and discrete input, at most `MOST_BITS`, and the number of omitted ones."""
     lines: list[str] = []
     left = 0
     for table in BIT_TABLES:
@@ -173,7 +173,7 @@ def _bits(series: Series) -> tuple[list[str], int]:
 
 
 def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
-    """Return the functions, read length and gaps that the dumps found, as keys of a profile."""
+    """Return the functions, read length and gaps that the dumps found, as lines of a profile."""
     maps = [m for d in dumps for m in d.maps.values()]
     words = [m for m in maps if m["map"] in ("holding", "input") and m.get("max_read")]
     proved = [int(m["max_read"]) for m in words if m.get("limit_proved")]
@@ -192,7 +192,7 @@ def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
 
 
 def _gaps(series: Series) -> list[str]:
-    """Return the gaps between readable registers that are small enough to be read over."""
+    """Return the gaps between readable registers that are short enough to lie within one read."""
     gaps = []
     for table, cells in series.cells.items():
         known = sorted(cells)

@@ -1,7 +1,8 @@
-"""Find the registers that belong together, their type and order, by weighing all readings of a run against each other.
+"""Find the registers that belong together, their type and order, by comparing all readings of a run of neighbouring
+registers.
 
 Each reading of a stretch of registers has a cost (`costs`); a tiling divides a run of registers into readings. A reading's
-probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a hidden
+probability is the share of all tilings, weighted by their costs, that contain it (forward and backward sums, as in a hidden
 Markov model). So a word that fits both of its neighbours is doubtful, and is reported as such.
 """
 
@@ -38,7 +39,7 @@ FEWEST_PASSES, FEWEST_VALUES = 6, 4
 
 
 class Level(Enum):
-    """A probability in words."""
+    """The certainty of a reading in words."""
 
     CERTAIN = "certain"
     LIKELY = "likely"
@@ -51,12 +52,12 @@ class Level(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Interpretation:
-    """A stretch of registers read as one value. `probability` compares this reading with all other readings, and `rivals` holds
-    the next best readings, the best first.
+    """A reading of a stretch of registers as one value. `probability` compares it with all other readings, and `rivals` holds the
+    next best readings, the best first.
 
-    `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value
-    was seen that distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is
-    the reason why it is not certain, however probable.
+    `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value was seen that
+    distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is the reason why the
+    reading is not certain, however probable it is.
     """
 
     table: str
@@ -84,9 +85,9 @@ class Interpretation:
 
     @property
     def level(self) -> Level:
-        """Return the level of the reading.
+        """Return the certainty of the reading.
 
-        Certainty needs observed changes: a constant could be anything with the same bits.
+        `CERTAIN` requires observed changes, because a constant could be any value with the same bits.
         """
         if self.probability < GUESS:
             return Level.UNKNOWN
@@ -115,7 +116,9 @@ class _Tile:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Neighbouring registers and every way to read a stretch of them. `words[i]` are those of ``address + i``, one a pass."""
+    """A run of neighbouring registers and every way to read a stretch of them. `words[i]` has the word of the register
+    ``address + i`` in each pass.
+    """
 
     table: str
     address: int
@@ -124,7 +127,7 @@ class Run:
 
 
 def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
-    """Return all readings of a run with their costs. This is the slow part: it takes a few milliseconds per register."""
+    """Return a run with all readings and their costs. This takes most of the time: a few milliseconds per register."""
     return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
 
 
@@ -192,7 +195,7 @@ def _number_tiles(words: Sequence[Sequence[int]], start: int, size: int) -> list
 
 
 def _sums(by_end: Sequence[Sequence[_Tile]], count: int) -> list[float]:
-    """Return the log of the summed weights of all tilings of the first i registers."""
+    """Return, for each i from 0 to `count`, the log of the summed weights of all tilings of the first i registers."""
     sums = [0.0] * (count + 1)
     for end in range(1, count + 1):
         sums[end] = _log_sum([sums[t.start] - t.cost for t in by_end[end]])
@@ -270,7 +273,7 @@ def _reading(
 
 
 def _same_text(words: Sequence[Sequence[int]], tile: _Tile, covering: Sequence[_Tile]) -> list[_Tile]:
-    """Return the other readings with this text: registers cannot tell whether the padding after a text belongs to it."""
+    """Return the other readings with the same text: registers cannot show whether the padding after a text belongs to it."""
 
     def text(size: int) -> str:
         return text_of([w[0] for w in words[tile.start : tile.start + size]], tile.order)
@@ -280,7 +283,7 @@ def _same_text(words: Sequence[Sequence[int]], tile: _Tile, covering: Sequence[_
 
 
 def _twin(tile: _Tile, values: Sequence[float | str]) -> str:
-    """Return the integer type of the other sign, if both give the same numbers; "" if a value distinguishes them."""
+    """Return the integer type of the same size with the other signedness, if both give the same values; else ""."""
     if "int" not in tile.type:
         return ""
     most = 1 << (16 * tile.size - 1)
@@ -321,15 +324,15 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
 
 
 def _zeros_beside(tile: _Tile, words: Sequence[Sequence[int]]) -> bool:
-    """Return whether the two registers of a longer number's upper half were always 0."""
+    """Return whether the two registers that would be the upper half of a longer number were always 0."""
     places = (tile.end, tile.end + 1) if tile.order in ("CDAB", "DCBA") else (tile.start - 2, tile.start - 1)
     return all(0 <= i < len(words) and not any(words[i]) for i in places)
 
 
 def _is_regular(steps: Sequence[float]) -> bool:
-    """Return whether most steps of a register are about equal, also around the end of its range.
+    """Return whether most steps of a register are about equal, also when the value wraps around at the end of its range.
 
-    Where a float passes a power of two its steps change once.
+    In half of a float the steps change when the float passes a power of two; therefore not all steps need to be equal.
     """
     usual = median(steps)
     off = [abs((s - usual + 0x8000) % 0x10000 - 0x8000) for s in steps]
@@ -343,7 +346,9 @@ def text_of(words: Sequence[int], order: str) -> str:
 
 
 def runs_of(cells: Mapping[int, Sequence[int]], most: int = 4096) -> list[tuple[int, list[Sequence[int]]]]:
-    """Return runs of neighbouring registers, ``(first address, the words of each)``; those longer than `most` are cut."""
+    """Return the runs of neighbouring registers, as ``(first address, the words of each register)``, of at most `most`
+    registers each.
+    """
     runs: list[tuple[int, list[Sequence[int]]]] = []
     for address in sorted(cells):
         if runs and runs[-1][0] + len(runs[-1][1]) == address and len(runs[-1][1]) < most:

@@ -1,8 +1,8 @@
 """Infer the meaning of registers from several dumps of one unit.
 
-The byte orders that the device seems to use are learnt in a first pass and have weight in a second one. A single float
-is never certain: large whole numbers that vary look the same, but not several of them. This module must never see a
-profile.
+The inference has two passes: the byte orders that the device seems to use are learnt in the first, and weight the readings in
+the second. A single float is never certain: it cannot be distinguished from a large integer that rises and falls. Several
+floats can. This module must never see a profile.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
 
 FLOCK = 3
-"""If the device has at least this many floats of one word order, they support each other."""
+"""Number of floats of one word order from which on they support each other as evidence that the device uses floats."""
 PRIOR_WEIGHT = 4.0
 """Weight of the general knowledge about byte orders of devices, expressed as a number of registers of this device."""
 SINGLE_COST = 7.0
@@ -31,12 +31,14 @@ REGISTER_TABLES, BIT_TABLES = ("holding", "input"), ("coil", "discrete")
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The history of cells: per table and address a word (or bit) for each pass. It contains only cells that every pass has."""
+    """The history of registers and bits: for each table and address one word (or bit) per pass. It contains only those that
+    every pass has.
+    """
 
     times_s: tuple[float, ...]
     cells: Mapping[str, Mapping[int, Sequence[int]]]
     pairs: frozenset[str] = frozenset()
-    """Tables whose registers the device has in pairs only: its values take two."""
+    """Tables in which the device only permits reads of register pairs, so that each value takes two registers."""
 
     @property
     def passes(self) -> int:
@@ -49,7 +51,9 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Inference:
-    """The inferred readings of the registers in the order of tables and addresses, and the bits, unchanged."""
+    """The result of `infer`: the readings of the registers, in the order of tables and addresses, and the cost of each byte
+    order on this device. The bits are only in `series`.
+    """
 
     series: Series
     readings: tuple[Interpretation, ...]
@@ -57,9 +61,9 @@ class Inference:
 
 
 def series_of(dumps: Sequence[Dump]) -> Series:
-    """Return all passes of all dumps by time.
+    """Return all passes of all dumps, in the order of their times.
 
-    Raises `FileInvalid` if they are not of one Modbus unit, or have no cells in common.
+    Raises `FileInvalid` if they are not of one Modbus unit, or have no registers and bits in common.
     """
     for dump in dumps:
         if dump.protocol != "modbus":
@@ -102,7 +106,7 @@ def without_repetitions(series: Series) -> Series:
 
 
 def infer(series: Series) -> Inference:
-    """Infer the meaning of the registers. Pure; takes a few milliseconds per register."""
+    """Infer the meaning of the registers. The function does no I/O and takes a few milliseconds per register."""
     seen = without_repetitions(series)
     tables = [(table, seen.cells.get(table, {})) for table in REGISTER_TABLES]
     clocks, runs = [], []
@@ -139,7 +143,9 @@ def _look(runs: Sequence[Run], orders: Mapping[str, float], pairs: frozenset[str
 
 
 def _marked(reading: Interpretation, series: Series) -> Interpretation:
-    """Return the reading with the marks of all passes, including repetitions, because the time that a state is held matters."""
+    """Return the reading with the marks and notes from all passes. Repetitions are included, because the time that a state is
+    held matters.
+    """
     if reading.type == "string":
         return reading
     columns = [series.cells[reading.table][reading.address + i] for i in range(reading.registers)]
@@ -149,7 +155,7 @@ def _marked(reading: Interpretation, series: Series) -> Interpretation:
 
 
 def _as_observed(reading: Interpretation) -> Interpretation:
-    """Return the reading with the observed share of right readings on generated maps as its probability."""
+    """Return the reading with its calibrated probability: the observed share of correct readings on generated maps."""
     kind = kind_of(reading.type, reading.registers, moves=reading.moves, capped=reading.capped)
     share = calibrated(reading.probability, kind)
     left = (1 - share) / max(1e-9, 1 - reading.probability)
@@ -168,7 +174,9 @@ def _orders_kept(readings: Sequence[Interpretation]) -> dict[str, float]:
 
 
 def _supported(readings: Sequence[Interpretation]) -> list[Interpretation]:
-    """Cap readings without support on the device: of an order with few values, or a single float."""
+    """Return the readings. A reading is limited (`capped`) if few values of the device have its order, or if it is a single
+    float.
+    """
     moving = [r for r in readings if r.moves and r.probability >= LIKELY and r.type != "string"]
     orders = Counter(r.order for r in moving if r.registers > 1)
     floats = Counter(r.order for r in moving if r.type.startswith("float"))

@@ -1,7 +1,7 @@
-"""Evidence beyond the numbers of one register: a carry from the low word into the high word of a neighbour, and single bits of
-status words.
+"""Evidence beyond the numbers of one register: a carry from the low word into the high word of a neighbour, and single bits
+of status words.
 
-Pure arithmetic in nats, as `costs` is.
+The module only calculates. Costs and evidence are in nats, as in `costs`.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from itertools import pairwise
 
 HALF = 0x8000
 _CARRY_SIGN = math.log(40)
-"""By chance a change of the high word would rarely match the low word's overflow exactly."""
+"""The evidence in nats of a carry: by chance a change of the high word would rarely match the low word's overflow exactly."""
 MOST_BITS, FEWEST_CHANGES = 8, 3
 
 
 def carry_evidence(highs: Sequence[int], lows: Sequence[int]) -> float:
-    """Return how much more likely `highs` and `lows` are one number than two independent ones; 0 without evidence.
-
-    Evidence is a high word that changes exactly in those passes in which the low word overflows or underflows: of all
-    ways to place these changes among the passes only one fits. A high word that changes without such an overflow is not
+    """Return the evidence in nats that `highs` and `lows` are the words of one number and not two independent numbers; 0 without
     evidence.
+
+    Evidence is a high word that changes exactly in those passes in which the low word overflows or underflows: of all ways to
+    place these changes among the passes only one fits. A high word that changes without such an overflow is not evidence.
     """
     steps = [((b - a), (d - c)) for (a, b), (c, d) in zip(pairwise(highs), pairwise(lows), strict=True)]
     changes = [(up, low) for up, low in steps if up]
@@ -43,8 +43,8 @@ def carry_evidence(highs: Sequence[int], lows: Sequence[int]) -> float:
 def toggled_bits(values: Sequence[int]) -> tuple[int, ...]:
     """Return the bits of a status word that changed, lowest first; empty if the register does not behave like one.
 
-    A status word changes a bit or two at a time and rests between. A count changes its lowest bits most, and a
-    measurement many at once.
+    In a status word one or two bits change at a time, with pauses between. In a counter the lowest bits change most often, and in
+    a measurement many bits change at once.
     """
     flips = [a ^ b for a, b in pairwise(values) if a != b]
     if len(flips) < FEWEST_CHANGES or any(v >> 16 or v < 0 for v in values):
@@ -64,7 +64,9 @@ def toggled_bits(values: Sequence[int]) -> tuple[int, ...]:
 
 
 def bits_cost(values: Sequence[int]) -> float:
-    """Return the cost of a register as sixteen flags of which a few change; `math.inf` if it does not behave so."""
+    """Return the cost of a register as sixteen flags of which a few change; `math.inf` if it does not behave like a status
+    word.
+    """
     bits = toggled_bits(values)
     if not bits:
         return math.inf

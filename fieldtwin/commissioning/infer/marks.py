@@ -1,6 +1,6 @@
-"""Classify values by their behaviour over time: a counter, a state, a time of day, or another value scaled.
+"""Classify values by their behaviour over time: a counter, a state, a time of day, or a scaled copy of another value.
 
-Pure. A mark needs enough observations; a mere resemblance becomes a note that begins with "perhaps".
+The module does no I/O. A mark needs enough observations; a mere resemblance becomes a note that begins with "perhaps".
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MAINS = (
 
 
 def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
-    """Return `reading` with its marks. `times_s`: the time of each pass, in seconds since 1970 UTC."""
+    """Return `reading` with its marks and notes. `times_s`: the time of each pass, in seconds since 1970 UTC."""
     if reading.type == "string" or not reading.moves:
         return reading
     numbers = [float(v) for v in reading.values]
@@ -66,14 +66,18 @@ def _bits_note(bits: Sequence[int]) -> str:
 
 
 def _is_time(numbers: Sequence[float], times_s: Sequence[float]) -> bool:
-    """Return whether the values are seconds since 1970, within a day of the truth (any time zone), and advance with time."""
+    """Return whether the values are seconds since 1970 that advance with time and differ from it by less than a day (time
+    zones).
+    """
     near = all(abs(n - t) < DAY_S for n, t in zip(numbers, times_s, strict=True))
     shifts = [n - t for n, t in zip(numbers, times_s, strict=True)]
     return near and max(shifts) - min(shifts) <= 2 + 0.01 * (times_s[-1] - times_s[0])
 
 
 def _runs_with(steps: Sequence[float], elapsed: Sequence[float]) -> bool:
-    """Return whether the value advances by one a second, with seconds that differ enough from a count of the passes."""
+    """Return whether the value advances by one per second. The intervals between passes must be long enough to exclude a
+    count of passes.
+    """
     total = sum(elapsed)
     return (
         total >= 20
@@ -84,7 +88,9 @@ def _runs_with(steps: Sequence[float], elapsed: Sequence[float]) -> bool:
 
 
 def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
-    """Return whether the values are few small numbers near 0, each held for a while. A value that jitters is not a state."""
+    """Return whether the values are few small numbers near 0, each held for a while. A value that changes constantly is not a
+    state.
+    """
     states = set(numbers)
     changes = sum(s != 0 for s in steps)
     return (
@@ -97,7 +103,7 @@ def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
 
 
 def _likeness(reading: Interpretation, numbers: Sequence[float], *, whole: bool) -> list[str]:
-    """Return notes for a reading that resembles a counter, a state or a time without proof."""
+    """Return a note if all values lie in the usual range of a mains frequency or voltage."""
     if reading.type.startswith("float") or whole:
         for scale in SCALES if whole else (1.0,):
             for (low, high), what, unit in _MAINS:
@@ -116,7 +122,9 @@ def with_scales(readings: Sequence[Interpretation]) -> list[Interpretation]:
 
 
 def _scaled(reading: Interpretation, floats: Sequence[Interpretation]) -> Interpretation:
-    """Find the scale with which all passes agree to the last digit. It is significant only if the digits change much."""
+    """Return the reading with its scale, if it equals a float times a power of ten in all passes. Its values must vary enough
+    for that to be significant.
+    """
     numbers = [float(v) for v in reading.values]
     spread = max(numbers) - min(numbers)
     if len(numbers) < FEWEST_PASSES or len(set(numbers)) < 4 or spread < 5:
@@ -136,9 +144,11 @@ _CLOCK = ("year", "month", "day", "hour", "minute", "second")
 def clock_fields(
     table: str, address: int, words: Sequence[Sequence[int]], times_s: Sequence[float]
 ) -> list[Interpretation]:
-    """Return six registers that are the date and time of day, year first or second first, as numbers or as BCD, as readings.
+    """Find date-and-time clocks in `words`, the words of neighbouring registers from `address` on. Return a reading for each
+    register.
 
-    They are a clock when each pass gives a date within a day of the truth (time zones) that advances with time.
+    A clock has six registers, from year to second or from second to year, as numbers or as BCD. In each pass they must give a
+    date that differs from the pass's time by less than a day (time zones) and advances with it.
     """
     found: list[Interpretation] = []
     start = 0
@@ -162,7 +172,7 @@ def clock_fields(
 
 
 def _clock_s(row: Sequence[int], *, bcd: bool) -> float | None:
-    """Return the seconds since 1970 of year, month, day, hour, minute, second taken as UTC; None if they are not a date."""
+    """Return the seconds since 1970 of `row` (year, month, day, hour, minute, second, taken as UTC); None if it is not a date."""
     parts = [f"{w:x}" for w in row] if bcd else [str(w) for w in row]
     if not all(p.isdecimal() for p in parts):
         return None

@@ -20,8 +20,9 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 MOST_PASSES = 2_000
 """Maximum number of passes of a long recording, spread evenly over it."""
 FEWEST_REPLIES = 3
-"""A request with fewer answers is omitted if a different request has at least this many. It would reduce the number of passes,
-because each pass needs a value of every register."""
+"""Number of answers that a request needs to be used, if any request has as many. A request with fewer answers would
+reduce the number of passes, because each pass needs a value of every register.
+"""
 
 
 def dump_of_recording(
@@ -82,7 +83,7 @@ def _passes(reads: list[RecordedExchange], start_ns: int) -> list[Pass]:
 
 
 def _values(exchange: RecordedExchange) -> dict[Cell, bytes] | None:
-    """Return the cells that a reply carries; None if it is an exception or does not fit its request."""
+    """Return the registers or bits in a reply, with their bytes; None if it is an exception or does not fit its request."""
     asked = parse_request(exchange.request)
     span, reply = asked.read_span, exchange.reply
     if span is None or reply is None:

@@ -1,1 +1,1 @@
-"""Record a live device by polling, relaying or listening, and compare it with a recording."""
+"""Record a live device by polling, relaying or listening, and compare a live device with a recording."""

@@ -1,7 +1,8 @@
-"""Send one arbitrary request to a live device and return the result as a recording keeps it: PDU in, `RecordedExchange` out.
+"""Send one arbitrary request PDU to a live device and return the result as a `RecordedExchange`.
 
-The gateway's own Modbus client sends it, with its silences and its validation of replies. It never retries; a fault of the
-connection is a possible outcome. This module must never decide which requests are allowed: the caller does, with `changes`.
+The gateway's own Modbus client sends the request, with the silent intervals and the validation of replies of normal
+operation. It never retries; a fault of the connection is a possible outcome. This module must never decide which requests are
+allowed: the caller does, with `changes`.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def frame_for(url: str, unit: int, pdu: bytes) -> bytes | None:
 
 
 class _Sent(Tap):
-    """A tap that records the time of the last byte of the latest sent frame."""
+    """An observer of a connection that records the time of the last byte of the latest sent frame."""
 
     def __init__(self, char_time_ns: int) -> None:
         self.t_ns = 0
@@ -66,12 +67,12 @@ class _Sent(Tap):
             self.t_ns = t_ns + len(data) * self._char_time_ns
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
-        """Ignore CAN frames: Modbus has none."""
+        """Ignore CAN frames: a Modbus connection has none."""
 
 
 class RecordingClient:
-    """A sender of single requests through `client`, which returns recorded exchanges. Their times count from `zero_ns` of
-    `clock`.
+    """A sender of single requests through `client`, which returns recorded exchanges. Their times are relative to `zero_ns`
+    of `clock`.
     """
 
     def __init__(self, client: ModbusClient, clock: Clock, endpoint: Endpoint, sent: _Sent, zero_ns: int) -> None:
@@ -85,10 +86,10 @@ class RecordingClient:
         self._lost = False
 
     async def ask(self, unit: int, pdu: bytes) -> RecordedExchange | None:
-        """Send the request and return the exchange; None if it cannot be sent.
+        """Send the request and return the exchange; None if the request cannot be sent.
 
-        Raises `ConnectionLost` when the connection was lost before. If it is lost during the request, that is the
-        request's outcome.
+        Raises `ConnectionLost` if the connection was already lost. If it is lost during the request, the exchange has the error
+        ``lost``.
         """
         asked = asked_of(pdu)
         if asked is None or (unit == 0 and self._broadcasts and pdu[0] not in BROADCAST_FUNCTIONS):
@@ -131,7 +132,10 @@ async def asker_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[RecordingClient]:
-    """Yield an asker on the endpoint `url`; errors as `modbus_at`. Times count from `zero_ns`, by default from now."""
+    """Yield a `RecordingClient` on the endpoint `url`. Raises the same errors as `modbus_at`.
+
+    The times of exchanges are relative to `zero_ns` (None: the time at which the connection is open).
+    """
     clock = clock or WallClock()
     endpoint = Endpoint.parse(url)
     sent = _Sent(round(endpoint.serial.char_time_s * NS_PER_S) if endpoint.is_serial else 0)

@@ -1,4 +1,5 @@
-"""Compare a live device with a recording by repeating its requests in order. Reads only, unless writes are requested.
+"""Compare a live device with a recording by repeating its requests in order. Only reads are repeated, unless writes are
+requested.
 
 This module must not depend on a display; its caller decides which writes are allowed.
 """
@@ -51,13 +52,13 @@ async def compare_device(
     stop: asyncio.Event | None = None,
     progress: Progress = lambda done: None,
 ) -> None:
-    """Repeat `most` (0: all) of the recorded requests, to the recorded unit or to `unit`.
+    """Repeat `most` (0: all) of the recorded requests, to the recorded unit or to `unit`, and give the exchanges to `comparer`.
 
-    Requests that may change the device are omitted and counted, unless `writes`; repeated writes to a cell in `wearing`
-    (EEPROM) are always omitted. Raises `ConnectionLost`.
+    Requests that may change the device are omitted and counted, unless `writes`; repeated writes to a register or bit in
+    `wearing` (EEPROM) are always omitted. Raises `ConnectionLost`.
 
-    The verdict does not depend on how often the device was read before: its dialogue may continue the recorded one
-    anywhere, see `aligning`.
+    The verdict does not depend on how often the device was read before: its values may continue the recorded ones at any
+    position, see `aligning`.
     """
     dialogue = Dialogue()
     try:
@@ -105,13 +106,13 @@ async def _ask_all(
 
 
 class _Kept(Tap):
-    """A tap that keeps the frames on the bus, as (ns, frame)."""
+    """An observer that stores the frames on the bus as (ns, frame), up to `MAX_FRAMES`."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[int, CanFrame]] = []
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        """Ignore bytes: a CAN bus has none."""
+        """Ignore bytes: a CAN bus transfers only frames."""
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
         if len(self.frames) < MAX_FRAMES:
@@ -119,7 +120,7 @@ class _Kept(Tap):
 
 
 def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
-    """Yield the SDO transfers of a log, of `node` or of all."""
+    """Yield the SDO transfers in the frames of a log, of `node` or (None) of all nodes."""
     wire = CanopenBusDecoder("can", ())
     for t_ns, frame in frames:
         for exchange in wire.feed(frame, t_ns)[1]:
@@ -128,7 +129,7 @@ def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
 
 
 def uploads_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
-    """Yield the transfers that only read."""
+    """Yield the SDO uploads in the frames of a log: the transfers that only read."""
     return (exchange for exchange in transfers_of(frames, node) if exchange.service == TRANSFERS[0])
 
 

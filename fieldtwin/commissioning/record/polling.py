@@ -1,8 +1,8 @@
 """Record a live device by polling it, round by round: the tags of a profile, or the requests of another recording.
 
-Nothing is written to the device. Rounds begin on a grid of their period; a missed one is skipped and counted, and not
-repeated. A lost connection is opened again, after growing pauses. This module must not depend on files or displays:
-exchanges go to a sink.
+Nothing is written to the device. Rounds begin on a fixed time grid; a missed round is skipped and counted, and not repeated.
+A lost connection is opened again, after growing pauses. This module must not depend on files or displays: it passes exchanges
+to a function, the sink.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Sink = Callable[[RecordedExchange], None]
 
 @dataclass(slots=True)
 class PollCounters:
-    """The progress of the polling."""
+    """The counts of rounds, exchanges and lost connections of a polling."""
 
     rounds: int = 0
     missed: int = 0
@@ -47,7 +47,7 @@ class PollCounters:
 
 
 class Round(Protocol):
-    """The interface of a source of requests for each round."""
+    """The interface of a round of requests. Calling it sends the requests through `asker` and passes the exchanges to `sink`."""
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
@@ -58,7 +58,9 @@ class Round(Protocol):
 
 
 class ProfileRound:
-    """All readable tags of a profile, in the fewest reads; a refused read is recorded, and then repeated in parts."""
+    """A round that reads all readable tags of a profile, or of some of its poll groups, in the fewest reads. A refused read
+    is recorded, and then repeated in parts.
+    """
 
     def __init__(self, profile: DeviceProfile, unit: int, groups: Iterable[str] = ()) -> None:
         self._unit = unit
@@ -82,7 +84,9 @@ class ProfileRound:
             plan.pass_ended()
 
     async def _read(self, plan: GroupPlan, read: Read, asker: RecordingClient, sink: Sink) -> tuple[Read, ...]:
-        """Return the reads that replace this one."""
+        """Send a read and record it. Return the reads that replace it, if the device refused it and it can be divided; else
+        none.
+        """
         exchange = await asker.ask(self._unit, _request(read))
         if exchange is None:
             return ()
@@ -102,9 +106,9 @@ def _request(read: Read) -> bytes:
 
 
 class SameRequests:
-    """The requests of another recording, each different one once a round, in order.
+    """A round with the different requests of another recording, each once, in order.
 
-    `left_out` counts requests that may change the device, or that cannot be sent.
+    `left_out` counts requests that may change the device, and those beyond `MAX_REQUESTS`.
     """
 
     def __init__(self, exchanges: Iterable[RecordedExchange], unit: int | None = None) -> None:
@@ -145,7 +149,7 @@ async def record_polls(
 ) -> None:
     """Poll until `stop` is set, or `rounds` are done (0: no limit).
 
-    Raises `Unreachable` only if the first connection fails.
+    Raises `Unreachable` only if the first connection fails. Later failures are counted, and the connection is opened again.
     """
     clock = clock or WallClock()
     zero_ns = clock.monotonic_ns()
@@ -225,7 +229,7 @@ async def _rounds(
 
 
 async def _reopened(work: Callable[[], Awaitable[None]], counters: PollCounters, stop: asyncio.Event) -> None:
-    """Run `work`, and run it again when its connection is lost."""
+    """Run `work`, and run it again after a pause when its connection is lost."""
     pause_s = FIRST_PAUSE_S
     while True:
         done = counters.rounds
@@ -261,7 +265,8 @@ async def follow_bus(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> int:
-    """Write every frame of a CAN bus to `sink` until `stop`, and return the number of frames lost here by overload.
+    """Write every frame of a CAN bus to `sink` until `stop`; return the number of frames that were lost because this computer was
+    too slow.
 
     Nothing is sent. Raises `Unreachable` if the bus cannot be opened, `ConnectionLost` when it is lost.
     """

@@ -1,7 +1,8 @@
-"""Listen to a line between other devices with one adapter: requests and replies come in one stream, and nothing is sent.
+"""Listen with one adapter to a serial line between other devices. Requests and replies arrive in one stream, and nothing is
+sent.
 
-`Directions` distinguishes them by their shape and order, so that the capture has a direction for each frame. Limit: a
-client that repeats a write (function 05 or 06) after no reply sends a frame that looks like the reply.
+`Directions` distinguishes them by their shape and order, so that the capture has a direction for each frame. Limit: a client
+that repeats a write (function 05 or 06) after no reply sends a frame that looks like the reply.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from fieldtwin.gateway.wallclock import WallClock
 class Directions:
     """A splitter of one stream into frames that finds each frame's direction: SENT is towards a device.
 
-    `framing` is rtu or ascii. Pure.
+    `framing` is rtu or ascii. The class does no I/O.
     """
 
     def __init__(self, framing: str) -> None:
@@ -39,13 +40,15 @@ class Directions:
         return found + [self._told(frame) for frame in self._splitter.feed(data, t_ns)]
 
     def settle(self, now_ns: int) -> list[tuple[Direction, ModbusFrame]]:
-        """Return the frames that a silence before `now_ns` has ended; an incomplete frame stays incomplete."""
+        """Return the frames that have ended because the line was silent until `now_ns`; an incomplete frame is returned as
+        damaged.
+        """
         if self._last_ns is None or now_ns - self._last_ns <= SETTLE_NS:
             return []
         return self.flush()
 
     def flush(self) -> list[tuple[Direction, ModbusFrame]]:
-        """Return the remaining bytes as frames at the end."""
+        """Return the remaining bytes as frames, at the end of the stream."""
         return [self._told(frame) for frame in self._splitter.flush()]
 
     def _told(self, frame: ModbusFrame) -> tuple[Direction, ModbusFrame]:
@@ -60,7 +63,7 @@ class Directions:
 
 
 class LineSniffer:
-    """A passive listener at `port` that passes every frame with its direction to `sink`."""
+    """A passive listener at the serial port `port` that passes every frame with its direction to `sink`."""
 
     def __init__(
         self, port: Endpoint, sink: LineSink, *, on_message: OnMessage = lambda text: None,
@@ -76,7 +79,7 @@ class LineSniffer:
     async def run(self, stop: asyncio.Event) -> None:
         """Listen until `stop` is set.
 
-        Raises `Unreachable` where the port cannot be opened, `ConnectionLost` when it is lost.
+        Raises `Unreachable` if the port cannot be opened, `ConnectionLost` when it is lost.
         """
         connection = await self._connector.open_bytes(self._port)
         self._on_message(f"listening at {self._port}; nothing is sent")

@@ -1,7 +1,7 @@
 """Relay the bytes between a Modbus client and its devices unchanged, and record them with time and direction.
 
-`near` is where the client connects: a serial port, a virtual one that is made there, or a TCP port that is listened on.
-`far` is the device's side. The bytes are not interpreted; that is done afterwards.
+`near` is the endpoint to which the client connects: a serial port, a pseudo-terminal that this module creates, or a TCP port
+on which it listens. `far` is the endpoint of the device. The bytes are not interpreted while they are recorded.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ OnMessage = Callable[[str], None]
 
 
 class LineTap:
-    """A relay between `near` and `far` that reports to `sink`. `on_message` is called with messages for the user.
+    """A relay between `near` and `far` that records the bytes in `sink`. `on_message` is called with messages for the user.
 
-    A TCP client that disconnects is not an error. A device that cannot be reached for a client is not an error either: the next
-    client may connect.
+    A TCP client that disconnects is not an error. If the device cannot be reached, the TCP client is disconnected; this is not an
+    error either, and the next client may connect.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class LineTap:
     async def run(self, stop: asyncio.Event) -> None:
         """Relay until `stop` is set.
 
-        Raises `Unreachable` where a side cannot be opened, `ConnectionLost` when a line is lost, `FileInvalid` when
+        Raises `Unreachable` if an endpoint cannot be opened, `ConnectionLost` when a serial line is lost, `FileInvalid` when
         writing fails.
         """
         self._failed = asyncio.get_running_loop().create_future()
@@ -84,7 +84,7 @@ class LineTap:
         return await PtyEnd.open(path, serial)
 
     async def _serve(self, client: SocketEnd) -> None:
-        """Serve one TCP client after the other."""
+        """Connect one TCP client to the device, and relay its bytes until either side closes the connection."""
         try:
             far = await self._connector.open_bytes(self._far)
         except Unreachable as e:
@@ -102,7 +102,7 @@ class LineTap:
             await far.aclose()
 
     async def _carry(self, near: ByteConnection, far: ByteConnection) -> None:
-        """Carry bytes both ways until the first connection is lost."""
+        """Relay bytes in both directions until one of the connections is lost."""
         ways = [
             asyncio.ensure_future(self._one_way(near, far, Direction.SENT)),
             asyncio.ensure_future(self._one_way(far, near, Direction.RECEIVED)),

@@ -1,1 +1,1 @@
-"""Find the devices on a bus, and the causes of a silent one. It listens before it sends."""
+"""Find the devices on a bus, and the causes of a silent bus. The commands listen before they send."""

@@ -1,7 +1,6 @@
-"""Observe a CAN bus passively: the nodes with heartbeats, the SDO traffic, and everything else. Pure.
+"""Observe a CAN bus passively: the nodes with heartbeats, the SDO traffic, and all other frames. The module does no I/O.
 
-Identifiers are interpreted by the predefined connection set of CiA 301, 7.3.3. The caller must not feed frames that it
-sent.
+Identifiers are interpreted by the predefined connection set of CiA 301, 7.3.3. The caller must not feed frames that it sent.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from fieldtwin.gateway.protocols.canopen.nmt.states import NmtState
 from fieldtwin.gateway.protocols.canopen.pdo.sync_watch import SyncWatch
 
 _STUFF = 1.1
-"""Number of bits on the bus for each bit of a frame, with the stuff bits that usual data need."""
+"""Estimated number of transmitted bits for each data bit of a frame, including stuff bits."""
 
 
 @dataclass(slots=True)
 class ObservedNode:
-    """A node ID in the traffic.
+    """The messages of one node ID in the observed traffic.
 
-    `state` is from its heartbeat; `period_s` is the time between two heartbeats; `pdos` are by the predefined
-    identifiers, which a node need not keep.
+    `state` is from its heartbeat; `period_s` is the time in seconds between two heartbeats; `pdos` counts frames with the
+    predefined PDO identifiers of this node, which may belong to a different node if the identifiers were configured.
     """
 
     state: NmtState | None = None
@@ -36,7 +35,7 @@ class ObservedNode:
 
     @property
     def certain(self) -> bool:
-        """Return whether the node itself was seen, not only its identifiers."""
+        """Return whether the node certainly exists: messages were seen that only this node can send, and not only PDOs."""
         return bool(self.heartbeats or self.boot_ups or self.sdo_replies or self.emergencies)
 
 
@@ -53,7 +52,7 @@ class ObservedBus:
     """The time (ns) of the last SDO request that another master sent to each node."""
     nmt_commands: int = 0
     commands: int = 0
-    """The observed RPDOs, by the predefined identifiers."""
+    """Number of frames with a predefined RPDO identifier."""
     syncs: int = 0
     sync_producers: str = ""
     """The reason to assume more than one SYNC producer; empty without evidence."""
@@ -68,12 +67,14 @@ class ObservedBus:
         return bool(self.sdo_masters or self.nmt_commands or self.lss_requests or self.commands)
 
     def load(self, seconds: float, bitrate: int) -> float:
-        """Return the share of the bus that the frames took; 0 if the bit rate is not known."""
+        """Return the share of the bus capacity (0 to 1) that the frames took in `seconds`; 0 if `bitrate` (bit/s) is 0, not
+        known.
+        """
         return self.bits / (seconds * bitrate) if seconds > 0 and bitrate else 0.0
 
 
 class BusListener:
-    """A listener that is fed every received frame, and keeps the totals of the observation."""
+    """A listener that is fed every received frame and counts the observed messages in `heard`."""
 
     def __init__(self) -> None:
         self.heard = ObservedBus()

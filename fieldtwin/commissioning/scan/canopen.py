@@ -1,8 +1,8 @@
 """`scan` of a CANopen bus: listen, then read 1000h from each node, then LSS fastscan for nodes without an ID.
 
-The reads are limited in rate. Nothing is sent before the bus has been observed. Nothing is sent at all if traffic was
-heard and the user did not allow sharing the bus. No SDO is sent to a node that exchanges SDOs with another master: two clients
-on one SDO channel disturb each other's transfers.
+The rate of the reads is limited. Nothing is sent before the bus has been observed. Nothing is sent at all if traffic was
+received and the user did not allow sharing the bus. No SDO is sent to a node that exchanges SDOs with another master: two
+clients on one SDO channel disturb each other's transfers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ADAPTER_RATES = (125_000, 250_000, 500_000, 1_000_000, 50_000, 20_000, 100_000, 
 """The bit rates (bit/s) of CiA 301, 5.3, likely ones first."""
 RATE_LISTEN_S = 1.0
 QUIET_S = 0.5
-"""Time in seconds that another master's SDO must have been silent before the scan sends one."""
+"""Time in seconds without an SDO request of another master, after which the scan sends one."""
 PATIENCE_S = 5.0
 FASTSCAN_S = 13.5
 MOST_UNCONFIGURED = 16
@@ -41,7 +41,7 @@ MOST_UNCONFIGURED = 16
 
 @dataclass(frozen=True, slots=True)
 class CanScanOptions:
-    """The limits of a scan. `per_s`: SDO reads a second at most. `lss`: look for nodes without a node ID."""
+    """The options of a scan. `per_s`: maximum number of SDO reads per second. `lss`: look for nodes without a node ID."""
 
     bitrate: int = 0
     nodes: tuple[int, ...] = ALL_NODES
@@ -78,7 +78,7 @@ class CanScan:
 
 
 class _ListenerTap(Tap):
-    """A tap that passes received frames to the listener while the scan sends."""
+    """An observer that passes received frames to the listener, also while the scan sends."""
 
     def __init__(self, listener: BusListener) -> None:
         self._listener = listener
@@ -92,7 +92,7 @@ class _ListenerTap(Tap):
 
 
 class CanScanner:
-    """One scan of `url`; `run` it once. `stop` as in `ModbusScanner`."""
+    """One scan of `url`; `run` it once. `stop` is called often: when it returns True, `run` ends and the findings are kept."""
 
     def __init__(
         self,
@@ -118,7 +118,9 @@ class CanScanner:
         self.result = CanScan(url, heard=self._listener.heard)
 
     async def run(self) -> CanScan:
-        """Run the scan. Raises `Unreachable` where the bus cannot be joined, `UsageError` if its bit rate is different."""
+        """Run the scan. Raises `Unreachable` if the bus cannot be opened, `UsageError` if its bit rate differs from the
+        requested one.
+        """
         began_ns = self._clock.monotonic_ns()
         try:
             self.result.facts = self._facts(self._endpoint)
@@ -153,9 +155,9 @@ class CanScanner:
             result.notes.append(f"the interface runs at {facts.bitrate} bit/s, not at {options.bitrate}")
 
     async def _try_rates(self) -> None:
-        """Listen at one bit rate after another, for an adapter without a set bit rate.
+        """Listen at one bit rate after another, for an adapter whose bit rate is not set.
 
-        Garbage never forms a frame, so frames prove the rate.
+        At a wrong bit rate no valid frame is received, so received frames prove the rate.
         """
         result = self.result
         for rate in ADAPTER_RATES:
@@ -188,7 +190,7 @@ class CanScanner:
             result.listened_s += (clock.monotonic_ns() - began_ns) / NS_PER_S
 
     def _silent_endpoint(self) -> Endpoint:
-        """Return the endpoint for listening: if possible the adapter does not even acknowledge frames."""
+        """Return the endpoint for listening: in listen-only mode, without acknowledging frames, if the adapter has that mode."""
         facts = self.result.facts
         if facts is None or not facts.can_listen_only or self._endpoint.param("listen"):
             return self._endpoint
@@ -239,7 +241,9 @@ class CanScanner:
                 await self._look_for_unconfigured(master, len(options.nodes) * each_s, total_s)
 
     def _met_master(self) -> bool:
-        """Return whether another master, silent during the listening, has begun to send."""
+        """Return whether another master, from which nothing was received before, has begun to send and the bus may not be
+        shared.
+        """
         if self._options.share_bus or not self._listener.heard.has_master:
             return False
         note = "another master started to send, so the scan stopped; --share-bus continues, one node at a time"
@@ -260,7 +264,9 @@ class CanScanner:
         await clock.sleep_until_ns(began_ns + round(each_s * NS_PER_S))
 
     async def _sdo_is_free(self, node: int) -> bool:
-        """Wait until no other master uses SDO. Return False if another master uses this node, or does not stop in time."""
+        """Wait until no other master has sent an SDO request for `QUIET_S`. Return False if another master exchanges SDOs
+        with this node, or if the others do not stop in time.
+        """
         clock, masters = self._clock, self._listener.heard.sdo_masters
         deadline_ns = clock.monotonic_ns() + round(PATIENCE_S * NS_PER_S)
         while masters:

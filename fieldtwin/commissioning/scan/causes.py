@@ -1,7 +1,7 @@
-"""Find the causes of a silent or garbled line, most likely first. Pure: evidence in, a ranked list out.
+"""Find the causes of a silent or garbled line, most likely first. The functions do no I/O: they rank causes by evidence.
 
-A weight is not a probability: it orders the causes, and a weight of 0 is omitted. Each cause states its evidence and
-the remedy; if nothing is wrong, the list is empty.
+A weight is not a probability: it orders the causes, and a cause with a weight of 0 is omitted. Each cause states its evidence
+and the remedy; if nothing is wrong, the list is empty.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from fieldtwin.gateway.connections.serial.line_counters import UartCounters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2
-"""A share of errors above this cannot be chance."""
+"""Share (0 to 1) of errors, or of bytes in good frames, above which they cannot be due to chance."""
 HEALTHY = 0.97
 ENOUGH_TEXT = 12
-"""If fewer readable bytes than this arrived, they may be readable by chance."""
+"""Number of received text characters below which they may be text by chance."""
 _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 """The bytes that a receiver gets when the bits of the sender are many times longer than those of the receiver."""
 
@@ -40,7 +40,7 @@ class LikelyCause:
 
 @dataclass(frozen=True, slots=True)
 class ScanProbe:
-    """One question that was sent: its echo, and its answer.
+    """The result of one request that was sent: its echo, and its answer.
 
     `echo`: ``none``, ``whole`` or ``damaged``. `answer`: ``none``, ``good`` or ``damaged``.
     """
@@ -53,9 +53,9 @@ class ScanProbe:
 
 @dataclass(frozen=True, slots=True)
 class SerialEvidence:
-    """The evidence about a serial line. `errors` None: the port has no counters.
+    """The evidence about a serial line. `errors` is None if the port has no error counters.
 
-    `verdict`: the settings that traffic proved.
+    `verdict` holds the settings that the traffic shows, None without evidence.
     """
 
     settings: SerialSettings
@@ -80,7 +80,7 @@ def ranked(causes: Iterable[LikelyCause]) -> list[LikelyCause]:
 
 
 def serial_causes(e: SerialEvidence) -> list[LikelyCause]:
-    """Return the causes of silence, of garbage, and of an unanswered question on a serial line."""
+    """Return the causes of silence, of garbled bytes, and of an unanswered request on a serial line."""
     found: list[LikelyCause] = []
     if e.ignored:
         found.append(
@@ -111,7 +111,7 @@ def serial_causes(e: SerialEvidence) -> list[LikelyCause]:
 
 
 def _elsewhere(e: SerialEvidence) -> bool:
-    """Return whether the traffic proves that the line has different settings."""
+    """Return whether the traffic proves settings that differ from the present ones."""
     return e.verdict is not None and e.verdict.sure and e.settings not in (e.verdict.settings, *e.verdict.others)
 
 
@@ -393,7 +393,11 @@ def can_causes(facts: CanFacts, heard: ObservedBus, load: float) -> list[LikelyC
 
 
 def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[LikelyCause]:
-    """Return the causes for a host that cannot be reached (`problem` is the operating system's error), or that misbehaves."""
+    """Return the causes if a host cannot be reached or misbehaves.
+
+    `problem` is the operating system's error ("" if connected), `heard` the unrequested data, and `hung_up` whether the host
+    closed the connection.
+    """
     text = problem.lower()
     table: list[tuple[Callable[[], bool], list[LikelyCause]]] = [
         (lambda: "refused" in text, [

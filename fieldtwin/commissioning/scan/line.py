@@ -1,8 +1,8 @@
-"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. This module collects the evidence;
-`causes` finds the causes.
+"""The command `line`: observe a line before anything is sent, and explain why it is silent or garbled. This module collects
+the evidence; `causes` finds the causes.
 
-Nothing is sent, except one question if the user requested a probe: only a probe can show an echo. A probe is not sent
-into foreign traffic without permission.
+Nothing is sent, except one request if the user asked for a probe: only a probe can show an echo. A probe is not sent into the
+traffic of other devices without permission.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONNECT_S = 5.0
 
 @dataclass(slots=True)
 class LineReport:
-    """The observations on a line. `facts` are named lines of text for the user; the rest is for programs."""
+    """The observations on a line. `facts` are pairs of a name and a text for the user; the other attributes are for programs."""
 
     url: str
     kind: str
@@ -57,13 +57,15 @@ class LineReport:
 
     @property
     def healthy(self) -> bool:
-        """Return whether no evidence points to a fault; silence is no such evidence."""
+        """Return whether no evidence points to a fault. A silent line alone counts as healthy."""
         return not [c for c in self.causes if c.weight >= 50 and not c.harmless]
 
 
 @dataclass(frozen=True, slots=True)
 class LineCheckOptions:
-    """The options of an observation: its duration, and the unit of a probe, `probe_unit` (None: nothing is sent)."""
+    """The options of an observation: its duration in seconds, and the unit ID to which a probe is sent (None: nothing is
+    sent).
+    """
 
     listen_s: float = 5.0
     probe_unit: int | None = None
@@ -84,8 +86,8 @@ async def look_at_line(
 ) -> LineReport:
     """Observe the line or bus at `url` and return the report.
 
-    Raises `Unreachable` for a serial port or CAN bus that cannot be opened (an unreachable host is explained in the
-    report instead), `NotAllowed` for a probe into foreign traffic.
+    Raises `Unreachable` for a serial port or CAN bus that cannot be opened (an unreachable host is explained in the report
+    instead), `NotAllowed` for a probe on a line with traffic unless `share_bus` is set.
     """
     endpoint = Endpoint.parse(url)
     looker = _Looker(endpoint, look or LineCheckOptions(), on_progress, stop, taps, connector, clock or WallClock())
@@ -150,7 +152,7 @@ class _Looker:
             return connection.control_lines(), ignored, connection.counters() is not None
 
     async def _probe(self, settings: SerialSettings, unit: int, *, quiet: bool) -> ScanProbe:
-        """Send one question and return its echo, its answer and the bytes after it."""
+        """Send one request, without repetition, and return the classification of the bytes received after it."""
         sweep = UnitSweep(
             framing_of(self._endpoint),
             (unit,),
@@ -262,7 +264,7 @@ class _Looker:
 
 
 def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> ScanProbe:
-    """Classify the bytes received after a question: its echo, an answer, both, or other bytes."""
+    """Classify the bytes received after a request: its echo, an answer, both, or other bytes."""
     if heard.startswith(sent):
         echo, rest = "whole", heard[len(sent) :]
     elif len(heard) >= len(sent) - 1 and _alike(sent, heard) and not answered:
@@ -274,7 +276,7 @@ def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> ScanPro
 
 
 def _alike(sent: bytes, heard: bytes) -> bool:
-    """Return whether the bytes `heard` equal the bytes `sent`, apart from some changed bytes."""
+    """Return whether at least half of the bytes in `heard` equal those in `sent` at the same position."""
     same = sum(a == b for a, b in zip(sent, heard, strict=False))
     return same * 2 >= len(sent)
 

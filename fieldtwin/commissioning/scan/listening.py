@@ -1,8 +1,8 @@
-"""Find the settings of a serial line by listening at one setting after another. Nothing is sent. Pure.
+"""Find the settings of a serial line by listening at one setting after another. Nothing is sent. The module does no I/O.
 
-A line that carries traffic yields bytes at every setting, so listening at one setting is enough to detect a silent line. The
-setting at which the bytes form whole frames is the right one. The parity is known if the port counts parity errors; an
-additional stop bit cannot be detected, because a receiver checks only one.
+A line with traffic yields bytes at every setting, so listening at one setting is enough to detect a silent line. The setting
+at which the bytes form whole frames is the correct one. The parity is known if the port counts parity errors; an additional
+stop bit cannot be detected, because a receiver checks only one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 SHORTEST_S, LONGEST_S = 1.5, 6.0
-"""Time limits for one setting: longer where the line is silent for long between bursts."""
+"""Shortest and longest time in seconds to listen at one setting. The time is longer if the line has long pauses between
+frames.
+"""
 
 ENOUGH_BYTES = 400
 """Number of bytes without a good frame after which a setting is rejected."""
@@ -25,8 +27,8 @@ ENOUGH_BYTES = 400
 
 @dataclass(frozen=True, slots=True)
 class Audition:
-    """The result of listening at `settings`: the bytes received, and the errors that the port counted meanwhile (None: it has
-    no counters).
+    """The result of listening at `settings`: the received bytes, and the errors that the port counted at the same time (None:
+    it has no counters).
     """
 
     settings: SerialSettings
@@ -36,7 +38,7 @@ class Audition:
 
 @dataclass(frozen=True, slots=True)
 class LineVerdict:
-    """The settings of the line.
+    """The settings that the traffic on a line shows.
 
     `sure`: whether they are proved; `why` gives the reason as a sentence; `others` are settings that fit as well.
     """
@@ -55,7 +57,7 @@ class LineVerdict:
 
 
 def dwell_over(heard: Heard, elapsed_s: float) -> bool:
-    """Return whether this setting has been observed for long enough."""
+    """Return whether the line has been observed for long enough at the present setting."""
     if heard.sure or elapsed_s >= LONGEST_S:
         return True
     if heard.bytes >= ENOUGH_BYTES and not heard.good_bytes:
@@ -65,7 +67,7 @@ def dwell_over(heard: Heard, elapsed_s: float) -> bool:
 
 
 def line_verdict(auditions: Iterable[Audition]) -> LineVerdict | None:
-    """Return the setting at which most bytes form frames; None if they form frames at no setting."""
+    """Return the setting that fits the received bytes best; None if the bytes form frames at no setting."""
     good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
     if not good:
         return None
@@ -96,7 +98,7 @@ def worth_hearing(first: SerialSettings, candidates: Sequence[SerialSettings]) -
 
 
 def siblings(settings: SerialSettings) -> list[SerialSettings]:
-    """Return the same baud rate with the other parities, which may fit as well as a plausible setting."""
+    """Return the settings with the same baud rate and the other parities, which may fit as well as `settings`."""
     bits = settings.frame[0]
     return [SerialSettings(settings.baudrate, bits + p + "1") for p in "NEO" if p != settings.parity]
 

@@ -1,7 +1,7 @@
-"""`scan` of a Modbus endpoint: listen, then the likely settings, then every unit.
+"""`scan` of a Modbus endpoint: listen, then try the likely settings, then every unit ID.
 
-Pure modules decide which questions are sent; this module sends them. Nothing is sent before the line has been observed, and
-nothing at all if traffic was heard and the user did not allow sharing the bus.
+Other modules without I/O decide which requests are sent; this module sends them. Nothing is sent before the line has been
+observed, and nothing at all if traffic was received and the user did not allow sharing the bus.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from fieldtwin.gateway.protocols.modbus.frames.selection import Framing, framing
 from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
-"""Silence in ns before each question on a line with another client."""
+"""Silence in ns before each request on a line with another client."""
 QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
-"""Default timeout of each reply, in seconds.
+"""Default timeouts of a reply in seconds: for the quick pass on a serial line, for other passes, and for TCP and UDP.
 
-A server of libmodbus takes any frame that arrives within 500 ms after a question to another unit for the answer of that unit.
-Only a sweep that asks more slowly finds such servers.
+A server of libmodbus takes any frame that arrives within 500 ms after a request to another unit for the answer of that unit.
+Only a scan with a longer timeout finds such servers.
 """
 MANY_FAILURES = 3
 MOST_BREAKS = 3
-"""Number of consecutive disconnections by the server during one unit's question after which the unit is skipped."""
+"""Number of consecutive disconnections by the server during the request to one unit, after which the unit is skipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """The limits of a scan. None: derived from the endpoint.
+    """The options of a scan. An option that is None is derived from the endpoint.
 
     `every_setting`: try all settings even after units were found.
     """
@@ -67,9 +67,7 @@ class ScanOptions:
 
 @dataclass(frozen=True, slots=True)
 class FoundUnit:
-    """A unit that was found, and the settings at which it answers. `doubtful`: it did not answer when it was asked a second
-    time.
-    """
+    """A unit that answered, and the settings at which it answers. `doubtful`: it did not answer a second request."""
 
     answer: UnitAnswer
     settings: SerialSettings | None
@@ -134,7 +132,7 @@ class ModbusScanner:
     async def run(self) -> ModbusScan:
         """Run the scan.
 
-        Raises `Unreachable` where the endpoint cannot be opened; after later errors `result` has the findings.
+        Raises `Unreachable` if the endpoint cannot be opened; after later errors `result` has the findings.
         """
         began_ns = self._clock.monotonic_ns()
         try:
@@ -149,8 +147,8 @@ class ModbusScanner:
         return self.result
 
     def _doubt(self) -> None:
-        """Mark doubtful units: the scan counts every exception as an answer of a unit, but a single exception does not prove
-        that the unit exists.
+        """Add a note if several units answer only with exception 04h: the scan counts every exception as an answer of a unit,
+        but some servers send this one for units that do not exist.
         """
         failures = [f.answer.unit for f in self.result.units if f.answer.exception == 4]
         if len(failures) >= MANY_FAILURES:
@@ -160,11 +158,11 @@ class ModbusScanner:
 
     @property
     def _ended(self) -> bool:
-        """Return whether the scan must send no more questions."""
+        """Return whether the scan must send no more requests."""
         return self._met_master or self._stop()
 
     def planned(self) -> list[tuple[str, list[ScanStep]]]:
-        """Return the questions of `run` after listening, phase by phase, for the case that no unit answers."""
+        """Return the steps of `run` after listening, as pairs of phase and steps, for the case that no unit answers."""
         if not self._endpoint.is_serial:
             first = spread_over(self._units)
             rest = [u for u in self._units if u not in first]
@@ -195,7 +193,7 @@ class ModbusScanner:
             await self._search_all([self._pace.step(here, self._units)])
 
     async def _search(self) -> None:
-        """Search for the settings of a silent line, the likely ones first."""
+        """Search for units on a silent line whose settings are not known, the likely settings first."""
         steps = plan.quick_pass(self._quick, plan.likely_settings(self._endpoint), self._units, self._options.quick_s)
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:
@@ -216,7 +214,9 @@ class ModbusScanner:
         await self._steps(steps, "every setting", until_found=not self._options.every_setting)
 
     async def _listen(self, said: SerialSettings | None) -> bool:
-        """Listen to the line, and return whether questions may follow."""
+        """Listen to the line, and return whether requests may follow. `said` are the settings that the user stated (None: not
+        stated).
+        """
         options, result = self._options, self.result
         likely = [*plan.likely_settings(self._endpoint), *plan.likely_settings(replace(self._endpoint, params=()))]
         first = said or likely[0]  # the settings that the user stated may be wrong, which traffic shows
@@ -262,7 +262,7 @@ class ModbusScanner:
         return True
 
     async def _audition(self, settings: SerialSettings, listen_s: float, *, whole: bool = False) -> Audition:
-        """Listen at `settings`: for `listen_s` with `whole`, else until the result is clear."""
+        """Listen at `settings` until the result is clear; with `whole`, for at least `listen_s` seconds."""
         listener = LineListener(self._framing)
         url = str(plan.with_settings(self._endpoint, settings))
         async with bytes_at(url, taps=self._taps, connector=self._connector, clock=self._clock) as connection:
@@ -328,7 +328,7 @@ class ModbusScanner:
         ]
 
     async def _drive(self, sweep: UnitSweep, endpoint: Endpoint, on_question: Callable[[], None]) -> None:
-        """Run the sweep until all units were asked, reopening the connection whenever the server closes it."""
+        """Run the sweep until a request was sent to each unit, reopening the connection whenever the server closes it."""
         breaks, last_asked = 0, -1
         while True:
             url = str(endpoint)
@@ -366,7 +366,9 @@ class ModbusScanner:
                 return
 
     async def _confirm(self, sweep: UnitSweep, endpoint: Endpoint) -> set[int]:
-        """Ask the first and the late units again, because a good check sum may be chance; return those that do not answer."""
+        """Send a second request to the first unit and to those that answered late, because a valid check sum may be due to
+        chance. Return the units that do not answer.
+        """
         first = {next(iter(sweep.found)), *(u for u, a in sweep.found.items() if a.late)}
         again = sweep.another(first)
         await self._drive(again, endpoint, lambda: None)
@@ -391,7 +393,9 @@ class ModbusScanner:
     # -- a host ---------------------------------------------------------------------------------------------------
 
     async def _scan_socket(self) -> None:
-        """Ask a few units spread over all IDs first: if all answer with the same bytes, one device serves all IDs."""
+        """Scan a TCP or UDP endpoint. A sample of unit IDs is tried first: if all answer with the same bytes, one device
+        serves all IDs, and the scan ends unless `every_setting` is set.
+        """
         first = spread_over(self._units)
         if len(first) < SPREAD:
             await self._steps([self._pace.step(None, self._units)], "every unit")
@@ -411,8 +415,8 @@ class ModbusScanner:
         self.result.units.sort(key=lambda f: f.answer.unit)
 
     async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> SharedUnitIds | None:
-        """Ask again all units whose answers differed. This shows whether one device with a changing register answered, or many
-        devices.
+        """Send a second request to all units, if their answers differed. This shows whether one device with a changing
+        register answered, or several devices.
         """
         sweep = UnitSweep(
             self._framing, units, timeout_ns=round(self._pace.timeout_s * NS_PER_S),

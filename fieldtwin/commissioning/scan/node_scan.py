@@ -1,4 +1,4 @@
-"""Scan a CAN bus of this computer for nodes: the public interface of the CANopen master's node scan. It only reads."""
+"""Scan a CAN bus at this computer for nodes: the public interface of the CANopen master's node scan. The scan only reads."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ async def scan_can_bus(
 ) -> tuple[FoundNode, ...]:
     """Return the nodes on the bus at `url` by node ID: state, identity, and whether they answer SDO requests.
 
-    `url` is ``can:socketcan/can0`` or ``can:fieldtwin/HOST:PORT``. Joins the bus at `bitrate` bit/s (0: the bus's
-    current rate, where the medium knows it), listens for `listen_s` seconds, then queries each of `nodes` at a limited
-    rate: 17 s for all of them. `on_progress` is called with each node ID before its query. Raises `UsageError` for a
-    URL that is not a CAN bus, and `Unreachable` or `ConnectionLost` where the bus cannot be reached.
+    `url` is ``can:socketcan/can0`` or ``can:fieldtwin/HOST:PORT``. The function joins the bus at `bitrate` bit/s (0: the present
+    rate of the bus, if the adapter or simulated bus knows it), listens for `listen_s` seconds, then queries each of `nodes` at a
+    limited rate: 17 s for all of them. `on_progress` is called with each node ID before its query. Raises `UsageError` for a URL
+    that is not a CAN bus, and `Unreachable` or `ConnectionLost` if the bus cannot be reached.
     """
     endpoint = Endpoint.parse(url)
     if not endpoint.is_can:

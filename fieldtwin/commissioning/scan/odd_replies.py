@@ -1,4 +1,6 @@
-"""Replies of a scan that do not fit its question, and their possible causes on a serial line and on TCP. Pure."""
+"""Replies of a scan that do not fit their requests, and their possible causes on a serial line and on TCP. The module
+does no I/O.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 @dataclass(frozen=True, slots=True)
 class OddReply:
-    """A reply that does not fit its question, and the units (one or many) that sent it. `pdu` is empty if it was not a whole
+    """A reply that does not fit its request, and the units (one or many) that sent it. `pdu` is empty if it was not a whole
     frame.
     """
 
@@ -21,7 +23,7 @@ class OddReply:
 
     @property
     def advice(self) -> str:
-        """Return a description of the reply and its possible cause on an endpoint of this kind."""
+        """Return a description of the reply and its possible cause, which differs between a serial line and TCP."""
         if not self.pdu:
             if self.settings is not None:
                 return "damaged each time: two devices with the same unit ID, or a bad line"
@@ -39,7 +41,7 @@ class OddReply:
 def gathered(
     known: Sequence[OddReply], damaged: Mapping[int, bytes], settings: SerialSettings | None
 ) -> list[OddReply]:
-    """Add the replies `damaged` (unit -> PDU), received at `settings`, to `known`.
+    """Add the replies `damaged` (unit ID -> PDU), received at `settings`, to `known`, and return the result.
 
     The same reply from many units is one finding.
     """

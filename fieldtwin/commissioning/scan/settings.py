@@ -1,4 +1,4 @@
-"""Serial settings and unit IDs in the order in which a scan tries them, and the time that this takes. Pure arithmetic."""
+"""Serial settings and unit IDs in the order in which a scan tries them, and the time that this takes. The module does no I/O."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def name_of(settings: SerialSettings) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ScanStep:
-    """One part of a scan: the unit IDs that are asked with one setting of the serial line (None: not a serial line).
+    """One part of a scan: the unit IDs that are tried with one setting of the serial line (None: not a serial line).
+
     `request_chars` is the length of a request in characters, from which `seconds` follows.
     """
 
@@ -82,7 +83,7 @@ def seconds_of(steps: Iterable[ScanStep]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """The time for each question: `timeout_s`, and at least `interval_s` from one to the next."""
+    """The timing of requests: the timeout `timeout_s`, and at least `interval_s` from one request to the next, in seconds."""
 
     timeout_s: float
     interval_s: float
@@ -95,7 +96,10 @@ class Pace:
 def quick_pass(
     pace: Pace, candidates: Sequence[SerialSettings], units: Sequence[int], budget_s: float = 30.0
 ) -> list[ScanStep]:
-    """Return steps for likely units at likely settings, as many as `budget_s` allows: some units at every setting first."""
+    """Return steps for likely units at likely settings, as many as `budget_s` seconds allow.
+
+    The most likely units are tried at every setting first, then the next ones.
+    """
     steps: list[ScanStep] = []
     left_s = budget_s
     for first, last in ((0, 5), (5, 10), (10, 18), (18, len(UNITS))):
@@ -112,7 +116,7 @@ def quick_pass(
 def full_pass(
     pace: Pace, candidates: Sequence[SerialSettings | None], units: Sequence[int], done: Iterable[ScanStep] = ()
 ) -> list[ScanStep]:
-    """Return steps for every unit at every one of `candidates`, without those in `done`."""
+    """Return steps for every unit at every one of `candidates`, without the combinations in `done`."""
     asked: dict[SerialSettings | None, set[int]] = {}
     for step in done:
         asked.setdefault(step.settings, set()).update(step.units)
@@ -133,7 +137,7 @@ def all_settings(endpoint: Endpoint) -> list[SerialSettings]:
 
 
 def likely_settings(endpoint: Endpoint) -> list[SerialSettings]:
-    """Return the settings that a quick pass tries for those that `endpoint` leaves open."""
+    """Return the settings that a quick pass tries. Values that `endpoint` states are kept."""
     if endpoint.scheme != "ascii":
         return _open(endpoint, LIKELY)
     return _open(endpoint, [SerialSettings(b, f) for f in ("7E1", "8N1") for b in (9600, 19200, 38400, 115200, 4800)])

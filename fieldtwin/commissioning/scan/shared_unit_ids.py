@@ -1,8 +1,8 @@
-"""Detect one device behind many unit IDs: a device on TCP often answers any unit ID. Pure.
+"""Detect one device behind many unit IDs: a device on TCP often answers any unit ID. The module does no I/O.
 
-Units may be one device if they answer the same request with the same bytes. Equal answers of a few units prove little, because
-all new meters read 0. Equal answers of IDs over the whole range are conclusive, because no installation has 32 devices at such
-IDs.
+Units may be one device if they answer the same request with the same bytes. Equal answers of a few units prove little,
+because all new meters read 0. Equal answers of IDs over the whole range are conclusive, because no installation has 32
+devices at such IDs.
 """
 
 from __future__ import annotations
@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from fieldtwin.commissioning.scan.sweep import UnitAnswer
 
 SPREAD = 32
-"""If this many IDs, spread over the whole range, give the same answer, they are taken for one device."""
+"""Number of IDs, spread over the whole range, from which on IDs with the same answer are taken for one device."""
 
 
 @dataclass(frozen=True, slots=True)
 class SharedUnitIds:
-    """The `units` that give the same answer. `one_device`: they are certainly one device; if it is False, they may be one
-    device.
-    """
+    """The `units` that may be one device. `one_device`: this is certain; `why` is the reason."""
 
     units: tuple[int, ...]
     one_device: bool
@@ -30,9 +28,10 @@ class SharedUnitIds:
 def detect_shared_unit_ids(
     answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()
 ) -> SharedUnitIds | None:
-    """Return whether the units that answered, out of `asked` IDs, are certainly or possibly one device.
+    """Return the units that are certainly or possibly one device; None if they are several devices, or fewer than three.
 
-    `again` are their answers to a second round. None if they are several devices, or fewer than three units.
+    `asked` is the number of unit IDs that were tried: all of them must have answered. `again` are the answers to a second
+    request.
     """
     if len(answers) < 3 or len(answers) < asked:
         return None

@@ -1,7 +1,8 @@
-"""Find the units that answer on one connection: one short question each, one after the other. Pure: no I/O and no clock.
+"""Find the units that answer on one connection: one short request to each, one after the other. The module has no I/O and no
+clock.
 
-Unlike the plant's client, a sweep does not wait after a missing reply. Every reply contains its unit ID, so a late reply is
-still attributed to the right unit. So 247 silent units take 247 timeouts and not twice that. A question with a damaged reply
+Unlike the gateway's client, a sweep does not wait after a missing reply. Every reply contains its unit ID, so a late reply is
+still attributed to the correct unit. So 247 silent units take 247 timeouts and not twice that. A request with a damaged reply
 is repeated once, at the end.
 """
 
@@ -25,10 +26,10 @@ A device without it answers with an exception, which shows that it is present.
 """
 
 NOBODY = (0x0A, 0x0B)
-"""Exceptions by which a gateway reports that no device answers behind it (AP 7)."""
+"""Exceptions by which a gateway reports that it cannot reach the unit or gets no answer from it (AP 7)."""
 
 REST_NS = 30 * NS_PER_MS
-"""Time for the rest of a reply that has begun: a USB adapter delivers bytes every 16 ms."""
+"""Time in ns that a sweep waits for the rest of a reply that has begun: a USB adapter delivers bytes every 16 ms."""
 MAX_REPLY_CHARS = 256
 MAX_REMEMBERED = 256
 NEVER_SILENT_NS = 5_000 * NS_PER_MS
@@ -36,7 +37,7 @@ NEVER_SILENT_NS = 5_000 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True)
 class UnitAnswer:
-    """A unit that answered. `exception` is its code, 0 where it answered with data; `reply` is the PDU."""
+    """The answer of a unit. `exception` is its exception code, 0 for an answer with data; `reply` is the PDU."""
 
     unit: int
     reply: bytes
@@ -48,7 +49,7 @@ class UnitAnswer:
 
 @dataclass(frozen=True, slots=True)
 class SendRequest:
-    """A step of a sweep: write `data`, which is the request to `unit`, now; then call `handed_over`."""
+    """A step of a sweep: write `data`, which is the request to `unit`, now; then call `UnitSweep.handed_over`."""
 
     unit: int
     data: bytes
@@ -70,7 +71,7 @@ class _Asked:
     limit_ns: int
     noise: bool = False
     odd: bytes = b""
-    """The PDU of a whole reply that does not fit the question."""
+    """The PDU of a whole reply that does not fit the request; empty if there was none."""
 
 
 def expected_s(
@@ -83,8 +84,8 @@ def expected_s(
 class UnitSweep:
     """A sweep over `units` in order.
 
-    `interval_ns` is the least time between two questions (the rate limit), `quiet_ns` the silence before each,
-    `char_time_ns` a character's time on a serial line, else 0. Drive it with `poll`, `handed_over` and `feed`; `found`,
+    `interval_ns` is the least time between two requests (the rate limit), `quiet_ns` the silence before each, `char_time_ns` the
+    time of a character on a serial line, else 0. The caller runs the sweep with `poll`, `handed_over` and `feed`; `found`,
     `damaged` and the other results can be read at any time.
     """
 
@@ -105,11 +106,11 @@ class UnitSweep:
         self.behind_gateway: set[int] = set()
         """Units that a gateway reported as not answering."""
         self.echo = False
-        """Whether the bytes that are sent come back (an echo)."""
+        """Whether the line returns the sent bytes (an echo)."""
         self.foreign = 0
-        """Number of good frames of another client or its units."""
+        """Number of good frames that do not belong to the sweep: those of another client and of the units that answer it."""
         self.other_requests = 0
-        """Number of good requests of another client."""
+        """Number of good requests that another client sent."""
         self.noise_bytes = 0
         self.never_silent = False
         self.asked = 0
@@ -133,16 +134,16 @@ class UnitSweep:
 
     @property
     def left(self) -> int:
-        """Return the number of remaining questions, including the current one."""
+        """Return the number of remaining requests, including the current one."""
         return len(self._todo) + len(self._again) + (self._now is not None)
 
     @property
     def asking(self) -> int | None:
-        """Return the unit that is asked now."""
+        """Return the unit to which the current request was sent; None if no request is open."""
         return self._now.unit if self._now is not None else None
 
     def poll(self, now_ns: int) -> SendRequest | WaitForBytes | None:
-        """Return the next step; None when all units have been asked."""
+        """Return the next step; None when the sweep is complete or the line is never silent."""
         if self._now is not None:
             if now_ns < self._now.deadline_ns:
                 return WaitForBytes(self._now.deadline_ns)
@@ -166,7 +167,7 @@ class UnitSweep:
         return SendRequest(unit, data)
 
     def handed_over(self, now_ns: int) -> None:
-        """Record that the driver has accepted the question, whose characters are sent from now on."""
+        """Record that the request was passed to the operating system at `now_ns`; its characters are sent from that time on."""
         if self._now is not None:
             gone_ns = now_ns + len(self._now.sent) * self._char_ns
             self._now.deadline_ns = gone_ns + self._timeout_ns
@@ -174,7 +175,7 @@ class UnitSweep:
             self._not_before_ns = self._now.began_ns + self._interval_ns
 
     def feed(self, data: bytes, now_ns: int) -> None:
-        """Add received bytes."""
+        """Add bytes received at `now_ns`."""
         for frame in self._splitter.feed(data, now_ns):
             self._judge(frame, now_ns)
         asked = self._now
@@ -196,14 +197,16 @@ class UnitSweep:
         )
 
     def ask_again(self) -> None:
-        """Repeat the current unit first, because the connection broke during its question."""
+        """Make the current unit the next one again, because the connection broke during its request."""
         if self._now is not None:
             self._todo.appendleft(self._now.unit)
             self._now = None
         self._splitter.flush()
 
     def skip(self) -> int | None:
-        """Skip the next unit, which breaks the connection each time, and return it."""
+        """Skip the next unit, because the server closes the connection at each request to it, and return it; None if there is
+        none.
+        """
         return self._todo.popleft() if self._todo else None
 
     # -- received bytes ------------------------------------------------------------------------------------------

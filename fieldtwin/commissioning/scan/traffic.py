@@ -1,8 +1,9 @@
-"""Observe a serial line passively: frames, requests and replies. Pure: it is given bytes and the times at which they arrived.
+"""Observe a serial line passively: frames, requests and replies. The module does no I/O: the caller gives the bytes and their
+times.
 
-Both directions share one pair of wires, so requests and replies are distinguished by their shape and order. A frame
-counts if its check sum is right. This module does not know the baud rate at which it listens: `baud` compares the
-results at several.
+Both directions share one pair of wires, so requests and replies are distinguished by their shape and order. A frame counts if
+its check sum is correct. This module does not know the baud rate at which it listens: `listening` compares the results at
+several.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.modbus.frames.selection import Framing
 
 SETTLE_NS = 40 * NS_PER_MS
-"""A silence after which no bytes belong to earlier ones, even with a USB adapter."""
+"""A silence in ns after which new bytes do not belong to earlier ones, even with a USB adapter."""
 
 SURE_FRAMES = 3
-"""Number of good frames that cannot be chance: one of 65,536 random four-byte sequences has a right check sum."""
+"""Number of good frames that cannot be due to chance: one of 65,536 random four-byte sequences has a correct check sum."""
 
 
 @dataclass(slots=True)
 class ObservedUnit:
-    """A unit ID that was observed on the line. The unit is live if it answered."""
+    """The traffic of a unit ID that was observed on the line. The unit is live if it answered."""
 
     requests: int = 0
     replies: int = 0
@@ -36,7 +37,7 @@ class ObservedUnit:
 
 @dataclass(slots=True)
 class Heard:
-    """The totals of the observed traffic. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence
+    """The totals of the observed traffic. `good_bytes` are the bytes of good frames; `longest_gap_ns` is the longest silence
     between chunks.
     """
 
@@ -52,11 +53,11 @@ class Heard:
     """Number of pieces of one or two bytes next to frames, caused by a transceiver that switches too early or late."""
     longest_gap_ns: int = 0
     values: dict[int, int] = field(default_factory=dict)
-    """The count of each byte value."""
+    """How often each byte value was received."""
 
     @property
     def share(self) -> float:
-        """Return the share of good bytes."""
+        """Return the share of bytes that belong to good frames, 0 to 1."""
         return self.good_bytes / self.bytes if self.bytes else 0.0
 
     @property
@@ -66,7 +67,7 @@ class Heard:
 
     @property
     def silent(self) -> list[int]:
-        """Return the units that were asked and did not answer."""
+        """Return the units that received requests and did not answer."""
         return sorted(u for u, h in self.units.items() if h.requests and not h.live and u)
 
     @property
@@ -141,7 +142,7 @@ def is_reply(frame: ModbusFrame, asked: ModbusFrame | None) -> bool:
 
 
 def _request_shape(pdu: bytes) -> str:
-    """Return whether a PDU can only be a request, only a reply, or either."""
+    """Return ``request`` or ``reply`` if a PDU can only be that, else ``either``."""
     function, size = pdu[0], len(pdu)
     if function in (0x01, 0x02):
         return "either" if size == 5 and pdu[1] == 3 else "request" if size == 5 else "reply"

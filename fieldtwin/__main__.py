@@ -1,4 +1,4 @@
-"""``python -m fieldtwin`` is the command."""
+"""Run the command line of fieldtwin as ``python -m fieldtwin``."""
 
 import sys
 

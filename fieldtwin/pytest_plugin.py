@@ -120,8 +120,8 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
-    """Add a section to the text of a failure, which JUnit files also contain. If pytest has made no such text, add the section
-    after it.
+    """Add a section to the text of a failure, which JUnit files also contain. If pytest has produced no text that takes
+    sections, add the section to the report after the text.
     """
     add = getattr(report.longrepr, "addsection", None)
     if add is None:  # --tb=native, or a plugin with a text of its own
@@ -145,7 +145,7 @@ def _runner(config: pytest.Config) -> WorkerProcess:
 
 
 def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return the arguments of the test's markers; those of the test precede those of its class and module."""
+    """Return the arguments of the test's markers; markers of the test take precedence over those of its class and module."""
     said: dict[str, Any] = {}
     for marker in request.node.iter_markers(MARKER):
         for key, value in marker.kwargs.items():
@@ -170,7 +170,7 @@ def _or_fail(make: Callable[[], Any]) -> Any:
 
 @pytest.fixture
 def emulate(request: pytest.FixtureRequest) -> Iterator[Callable[..., DeviceHandle]]:
-    """Makes devices: ``emulate("ctd-reference", on="tcp", unit=3)``. They end with the test."""
+    """A function that emulates devices: ``emulate("ctd-reference", on="tcp", unit=3)``. The devices end with the test."""
     runner, made = _runner(request.config), list[int]()
 
     def make(device: str, **more: Any) -> DeviceHandle:
@@ -221,7 +221,7 @@ def prototype(request: pytest.FixtureRequest) -> Iterator[PrototypeHandle]:
 
 @pytest.fixture
 def wire(request: pytest.FixtureRequest) -> RecordedTraffic:
-    """Record the traffic on the bus of `device`, or on all buses of `prototype`."""
+    """The recorded traffic on the bus of `device`, or on all buses of `prototype`."""
     if "system" in _said(request) or "prototype" in request.fixturenames:
         whole: PrototypeHandle = request.getfixturevalue("prototype")
         return whole.wire
@@ -231,8 +231,10 @@ def wire(request: pytest.FixtureRequest) -> RecordedTraffic:
 
 @pytest.fixture
 def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
-    """The program that ``@pytest.mark.fieldtwin(plc=...)`` names: a source as in a system file, beside the test; with
-    ``system=``, a program of that system. Without ``plc=``, the gateway and PLC of `prototype`, as they run."""
+    """The program that ``@pytest.mark.fieldtwin(plc=...)`` names: a source as in a system file, with a path relative to the
+    test's folder; with ``system=``, a program of that system. Without ``plc=``, the gateway and PLC of `prototype`, as they
+    run.
+    """
     from fieldtwin.testing.handles import Plc
     from fieldtwin.testing.running_plc import RunningPlc
 
@@ -256,7 +258,7 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
 
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Callable[..., ScenarioOutcome]:
-    """Runs scenario files, beside the test: ``assert scenario("pump.scenario.yaml", seed=3)``."""
+    """A function that runs scenario files of the test's folder: ``assert scenario("pump.scenario.yaml", seed=3)``."""
 
     def run(path: str | Path, seed: int | None = None, target: str = "") -> ScenarioOutcome:
         from fieldtwin.testing.outcome import run_scenario

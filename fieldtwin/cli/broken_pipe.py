@@ -1,5 +1,5 @@
-"""Broken pipes: the program that read our output has ended, as in `fieldtwin ... | head`, or because the log of a service was
-restarted.
+"""Broken pipes: the program that reads the output of fieldtwin has ended, as in `fieldtwin ... | head`, or because the log
+of a service was restarted.
 
 A run continues when the reader of stderr goes away, and keeps its exit code. The loss of stdout's reader does not change a
 verdict either. Only a command that lists something ends when its reader goes away.
@@ -16,7 +16,7 @@ VERDICTS = frozenset({"run", "simulate", "test", "check", "compare", "doctor", "
 
 
 class _Pipe(io.FileIO):
-    """stdout or stderr: output is dropped after the reader has closed its end."""
+    """The file of stdout or stderr: it drops output after the reader of the pipe has closed its end."""
 
     def write(self, data: object) -> int:
         try:
@@ -49,7 +49,10 @@ def survive_broken_stdout() -> None:
 
 
 def _wrapped(stream: object, number: int) -> io.TextIOWrapper | None:
-    """Return None if the stream does not belong to the process: in tests, or in a program that imports fieldtwin."""
+    """Return a stream that drops output after the reader has closed its end.
+
+    Return None if `stream` does not belong to the process: in tests, or in a program that imports fieldtwin.
+    """
     try:
         if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != number:
             return None

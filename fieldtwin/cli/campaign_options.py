@@ -21,7 +21,7 @@ def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[s
 
 @dataclass(frozen=True)
 class SeedOptions:
-    """The seeds of several runs, as text such as ``1..200`` or empty, and the number of runs at a time."""
+    """The options for the seeds of several runs, as text such as ``1..200`` or empty, and for the number of runs at a time."""
 
     seeds: str = option(
         "--seeds",
@@ -34,7 +34,7 @@ class SeedOptions:
 
 @dataclass(frozen=True)
 class FaultChoice:
-    """The faults from which a seed chooses. `fault_every` is in seconds; None: the default interval."""
+    """The options for the faults from which a seed chooses. `fault_every` is in seconds; None: the default interval."""
 
     fault_every: float | None = option(
         "--fault-every",
@@ -77,7 +77,7 @@ class FaultChoice:
 
 @dataclass(frozen=True)
 class _ScenarioRuns(SeedOptions):
-    """The runs of a campaign of scenarios: their faults, and their length in seconds, 0 for the default."""
+    """The options for the runs of a campaign of scenarios: their faults, and their length in seconds, 0 for the default."""
 
     faults: str | None = option(
         "--faults",

@@ -64,7 +64,7 @@ def _wrong_arguments(
 
 
 def _index_of(words: Sequence[str], at: int, error: click.UsageError, value: str = "") -> int:
-    """Return the index of the word that an error is about, or that of the command."""
+    """Return the index of the word that an error is about, or 0, the index of the command."""
     names = tuple(getattr(getattr(error, "param", None), "opts", ())) or (getattr(error, "option_name", ""),)
     for index, word in enumerate(words[at:], at):
         if word.partition("=")[0] in names or (value and word == value):

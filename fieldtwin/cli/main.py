@@ -136,7 +136,7 @@ RENAMED = {"shore": "topside"}
 INTERRUPTED = 130
 BUG = 70
 HOST_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM)
-"""The disk is full or broken, or the user has no permission to write: not a bug of fieldtwin."""
+"""Error numbers that mean that the disk is full or broken, or that the user may not write: not a bug of fieldtwin."""
 
 
 class LazyGroup(click.Group):
@@ -169,7 +169,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Suggest similar command names: click suggests only options."""
+        """Find the command; the error for an unknown command suggests similar names, because click suggests only options."""
         if args[0] in RENAMED:
             raise click.UsageError(f"{args[0]!r} is now called {RENAMED[args[0]]!r}", ctx)
         near = nearest(args[0], COMMANDS)

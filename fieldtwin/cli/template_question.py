@@ -1,4 +1,4 @@
-"""Ask before code from a template runs. A plant asks as well, so this module does not import emulators."""
+"""Ask before code from a template runs. `fieldtwin run --plant` asks as well, so this module does not import emulators."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TemplateSearchOptions:
 
 
 def shown(what: tuple[str, ...], between: str = ", ") -> str:
-    """Return the first few names, and the number of the rest."""
+    """Return the first `SHOWN` names, and the number of the rest, as text."""
     more = f"{between}and {len(what) - SHOWN} more" if len(what) > SHOWN else ""
     return escape(between.join(what[:SHOWN])) + more
 

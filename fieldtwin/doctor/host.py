@@ -1,4 +1,4 @@
-"""Properties of this computer for `fieldtwin doctor`: numbers without verdicts. A property that cannot be read is None."""
+"""Properties of this computer for `fieldtwin doctor`: values without verdicts. A property that cannot be read is None."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _IFF_UP = 0x1  # linux/if.h
 
 
 def may_realtime() -> tuple[bool, str]:
-    """Return whether the user and its limits allow SCHED_FIFO, and the message for it. Nothing is tried."""
+    """Return whether the user's rights and limits allow SCHED_FIFO, and a message about it. The function does not try it."""
     try:
         import resource
     except ImportError:
@@ -33,7 +33,7 @@ def may_realtime() -> tuple[bool, str]:
 
 
 def most_open_files() -> int | None:
-    """Return the hard limit of open files; None for no limit."""
+    """Return the hard limit of open files; None for no limit, or if this system has no such limit."""
     try:
         import resource
     except ImportError:
@@ -43,7 +43,7 @@ def most_open_files() -> int | None:
 
 
 def kernel_number(name: str) -> int | None:
-    """Return a number of /proc/sys."""
+    """Return the number in the file `name` in /proc/sys; None if it cannot be read."""
     with suppress(OSError, ValueError):
         return int((Path("/proc/sys") / name).read_text())
     return None
@@ -67,7 +67,9 @@ def cpu_count() -> int:
 
 
 def cgroup_quota() -> float | None:
-    """Return the smallest quota of this cgroup and its parents (v2), or of cgroup v1, in processors."""
+    """Return the smallest CPU quota of this cgroup and its parents (v2), or that of cgroup v1, in processors; None without
+    one.
+    """
     found: list[float] = []
     with suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():

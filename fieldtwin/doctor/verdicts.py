@@ -1,4 +1,6 @@
-"""Judge a computer's properties for a plant's controller, with remedies. Pure: `checks` reads the computer."""
+"""Judge a computer's properties for a plant's controller, with remedies. The properties are arguments: `checks` reads them
+from the computer.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ class ClockState:
 
 
 def clock_verdict(state: ClockState | None) -> DoctorCheck:
-    """Judge the clock.
+    """Judge the clock; `state` is None if the kernel's clock state cannot be read.
 
     Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
     """
@@ -73,7 +75,7 @@ def can_interface_verdict(interfaces: Mapping[str, bool]) -> DoctorCheck:
 
 
 def watches_verdict(instances: int | None) -> DoctorCheck:
-    """Judge the inotify limit.
+    """Judge the inotify limit; `instances` is the limit per user, None if this system has no inotify.
 
     fieldtwin does not use inotify; udev, journald and systemd need it to announce ports and start services.
     """
@@ -88,7 +90,7 @@ def watches_verdict(instances: int | None) -> DoctorCheck:
 def processor_verdict(cpus: int, quota: float | None) -> DoctorCheck:
     """Judge the processors. `quota`: the processors that a cgroup allows, None for no limit.
 
-    A quota stops all processes until its period is over.
+    When a quota is used up, the kernel stops all processes of the cgroup until the next period begins.
     """
     if quota is None:
         return DoctorCheck("processors", HostVerdict.OK, f"{cpus}, no quota")
@@ -100,7 +102,10 @@ def processor_verdict(cpus: int, quota: float | None) -> DoctorCheck:
 
 
 def quota_of(text: str) -> float | None:
-    """Return the number of processors in cgroup v2's ``cpu.max``, ``QUOTA PERIOD`` or ``max PERIOD`` in microseconds."""
+    """Return the number of processors in cgroup v2's ``cpu.max``: ``QUOTA PERIOD`` in microseconds, or ``max PERIOD``.
+
+    Return None for no quota.
+    """
     words = text.split()
     if len(words) != 2 or not all(w.isascii() and w.isdigit() for w in words) or int(words[1]) == 0:
         return None

@@ -18,7 +18,7 @@ LISTS: tuple[tuple[str, str, Sequence[About]], ...] = (
     ("canopen", "a CANopen node", CANOPEN_DEVICES),
     ("canopen-master", "a CANopen master", [case.about for case in CANOPEN_MASTERS]),
 )
-"""The lists of test cases: the command that runs them, what they test, and the cases."""
+"""The lists of test cases: the command that runs them, the tested thing as text, and the cases."""
 WEIGHT = {
     Basis.STANDARD: "The standard requires it: a failure is a deviation.",
     Basis.ROBUSTNESS: "No clause requires it: a failure means less tolerance than possible, not a deviation.",
@@ -48,7 +48,7 @@ def spelled_out(sources: str) -> str:
 
 
 def _weight(case: About) -> str:
-    """Return the weight of a failure, with the transports on which the weight is different."""
+    """Return the weight of a failure as text, with the transports on which the weight is different."""
     others = [f"On {other.wire}: {WEIGHT[other.basis]}" for other in case.elsewhere if other.basis is not case.basis]
     return " ".join([WEIGHT[case.basis], *others])
 

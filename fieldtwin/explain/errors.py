@@ -77,11 +77,11 @@ _MEANINGS: dict[type[e.FieldtwinError], str] = {
     e.UnknownCommand: "The command is not in the device's command list.",
     e.FileInvalid: "A file that a user wrote or recorded cannot be used as it is.",
 }
-"""The meanings of kinds whose docstring is written for programmers."""
+"""The meanings of the kinds of errors whose docstring is written for programmers."""
 
 
 def _meaning(kind: type[e.FieldtwinError]) -> str:
-    """Return what an error of this kind means: the first paragraph of its docstring, if users can read it."""
+    """Return what an error of this kind means: its text in `_MEANINGS`, else the first paragraph of its docstring."""
     return _MEANINGS.get(kind) or " ".join((kind.__doc__ or "").partition("\n\n")[0].split())
 
 

@@ -1,4 +1,4 @@
-"""The faults that can be injected, from their classes."""
+"""The explanations of the faults that can be injected, made from the faults' classes."""
 
 from __future__ import annotations
 

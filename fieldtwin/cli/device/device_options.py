@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """The device at an endpoint: its unit or node ID, profile, bit rate and timeout. None: the default."""
+    """The options for one device at an endpoint: its unit or node ID, profile, bit rate and timeout. None: the default."""
 
     unit: int | None = option(
         "--unit", type=click.IntRange(0, 255), help="Modbus unit ID; default: the profile's, else 1."
@@ -66,7 +66,7 @@ class DeviceOptions:
 
 @dataclass(frozen=True)
 class RawOptions:
-    """How values at raw addresses are decoded."""
+    """The options that state how values at raw addresses are decoded."""
 
     kind: str | None = option(
         "--type", type=click.Choice(TYPES), help="Type of raw addresses; default: uint16, for bits bool."
@@ -97,13 +97,13 @@ frames_option = click.option("--dry-run", is_flag=True, help="Print the frames t
 
 
 def words() -> str:
-    """Return this command line, for a log."""
+    """Return the command line of this process, for a log."""
     return shlex.join(["fieldtwin", *sys.argv[1:]])
 
 
 @contextmanager
 def logged(path: Path | None) -> Iterator[list[Tap]]:
-    """Return the taps of a command: the log at `path`, or none."""
+    """Yield the observers of a command's frames: the log at `path`, or none."""
     if path is None:
         yield []
         return

@@ -111,7 +111,7 @@ def _is_dump(path: Path) -> bool:
 
 
 def _named(dump: Dump, name: str, folders: tuple[Path, ...]) -> DeviceProfile | None:
-    """Return the requested profile, else the profile that the dump was made with, if it is installed."""
+    """Return the requested profile, else the installed profile with which the dump was made, None if there is neither."""
     if name:
         return load_profile(find("devices", name, extra=folders))
     known = dump.header.get("profile")

@@ -187,7 +187,7 @@ def _described(found: Dump, out: Path) -> dict[str, Any]:
 
 @contextmanager
 def _bar(name: str) -> Iterator[Report]:
-    """Show a progress bar on a terminal; elsewhere nothing."""
+    """Yield the function that reports the progress; on a terminal it shows a progress bar, elsewhere nothing."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -23,11 +23,11 @@ FUNCTION_NAMES = {
 
 
 LONG_S = 60.0
-"""A dump that can take longer than this number of seconds is announced with what makes it shorter."""
+"""In seconds. The estimate of a dump that can take longer also states how to make the dump shorter."""
 
 
 def estimate_text(estimate: Estimate, passes: int, rate: float) -> str:
-    """Return one line that estimates the dump before anything is sent, and for a long one, what makes it shorter."""
+    """Return one line that estimates a dump before anything is sent; for a long dump it also states how to make it shorter."""
     low, high = estimate.least_requests, estimate.most_requests
     requests = f"{low}" if low == high else f"{low} to {high}"
     text = f"{requests} requests, {_time(estimate.least_s)}"
@@ -48,7 +48,7 @@ def _time(seconds: float) -> str:
 
 
 def summary(dump: Dump) -> list[Table | Text]:
-    """Print the tables of a finished dump."""
+    """Return the tables and texts that describe a finished dump."""
     shown: list[Table | Text] = []
     if dump.protocol == "modbus":
         shown += [_maps(dump), _functions(dump)]
@@ -63,7 +63,7 @@ def summary(dump: Dump) -> list[Table | Text]:
 
 
 def notes(dump: Dump) -> list[str]:
-    """Return notes for the user and for the profile."""
+    """Return notes about a dump for the user, including the gaps to copy into a profile."""
     lines: list[str] = []
     gaps = profile_gaps(dump)
     if gaps:
@@ -107,7 +107,7 @@ def _lengths_text(line: dict[str, Any]) -> str:
 
 
 def _objects(dump: Dump) -> str:
-    """Return how many objects are in each state."""
+    """Return as text how many objects are in each state."""
     if (line := dump.maps.get("objects")) is None:
         last = dump.passes[-1]
         return f"{len(last.cells)} objects read, {len(set(last.refused) - set(last.cells))} refused"
@@ -128,7 +128,7 @@ def object_indexes(dump: Dump) -> list[str]:
 
 
 def profile_gaps(dump: Dump) -> list[str]:
-    """Return the ranges between readable registers that a read must not include, in the form of a profile."""
+    """Return the ranges between readable registers that a read must not include, as a profile writes them (`gaps`)."""
     gaps = []
     for line in dump.maps.values():
         readable = [resolve_gap(text, "sent") for text in line.get("readable", [])]
@@ -139,7 +139,10 @@ def profile_gaps(dump: Dump) -> list[str]:
 
 
 def mirrored(dump: Dump) -> int | None:
-    """Return how many addresses are equal in both register tables, if all common addresses are and one is not 0."""
+    """Return how many addresses both register tables have, if all their values are equal and not all 0; else None.
+
+    Fewer than 8 common addresses also give None.
+    """
     cells = dump.passes[0].cells if dump.passes else {}
     both = [(v, cells[("input", a)]) for (t, a), v in cells.items() if t == "holding" and ("input", a) in cells]
     if len(both) < 8 or not any(any(v) for v, _ in both) or any(v != w for v, w in both):
@@ -188,7 +191,7 @@ def state_rows(line: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def short(text: str) -> str:
-    """Return a range without the table's name."""
+    """Return a range such as ``holding:0..9`` without the table's name."""
     return text.partition(":")[2]
 
 
@@ -207,7 +210,7 @@ def _functions(dump: Dump) -> Table:
 
 
 def _table_access(line: dict[str, Any]) -> str:
-    """Return the result of the function that reads a table."""
+    """Return as text whether the device answers the function that reads a table."""
     if line["readable"]:
         return "answers"
     if line["codes"]:
@@ -241,7 +244,9 @@ def _latency(latency: dict[str, Any]) -> Table:
 
 
 def _bars(buckets: list[tuple[int | None, int]], width: int = 35) -> str:
-    """Draw a histogram with `width` characters of two buckets each."""
+    """Return a histogram as a line of block characters, each for two buckets; the one at position `width` is for all larger
+    values.
+    """
     heights = [0] * (width + 1)
     for bound, count in buckets:
         place = width if bound is None else min(width, round((len(str(bound)) - 2) * 5 + _fifth(bound)))
@@ -252,6 +257,6 @@ def _bars(buckets: list[tuple[int | None, int]], width: int = 35) -> str:
 
 
 def _fifth(bound: int) -> float:
-    """Return the position of a bound in its decade, 0 to 4."""
+    """Return in which fifth of its decade a bound lies, 0 to 4, on a logarithmic scale."""
     lead = bound / 10.0 ** (len(str(bound)) - 1)
     return min(4.0, float(sum(lead >= step for step in (1.5, 2.4, 3.9, 6.2))))

@@ -186,7 +186,7 @@ def _show_candidate(candidate: Candidate) -> None:
 
 
 def _told(result: ModbusIdentity | CanIdentity) -> list[tuple[str, str]]:
-    """Return the device's answers line by line, and the requests that it did not answer."""
+    """Return the device's answers line by line, and the requests that the device did not answer."""
     rows: list[tuple[str, str]] = []
     if isinstance(result, ModbusIdentity):
         clues = result.clues

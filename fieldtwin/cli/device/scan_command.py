@@ -129,7 +129,7 @@ def _end(found: bool, stopped: bool, took_s: float) -> int:
 
 
 def _plan_of_modbus(endpoint: str, search: SearchOptions, bus: BusOptions) -> Iterator[str]:
-    """Return the phases, settings and frames for `--dry-run`."""
+    """Yield lines with the phases, settings and frames of the scan, for `--dry-run`."""
     made = _modbus_options(search, bus)
     if Endpoint.parse(endpoint).is_serial:
         yield f"listen for {duration(made.listen_s)}; if there is traffic, nothing is sent" + (

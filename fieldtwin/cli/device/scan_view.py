@@ -21,7 +21,7 @@ MANY = 8
 
 
 def show_modbus(scan: ModbusScan) -> None:
-    """Print the units, then the notes."""
+    """Print a table of the units on stdout, and what else the scan found on stderr."""
     heard = scan.heard
     if heard is not None and heard.bytes:
         stderr.print(f"heard {heard.bytes} bytes, {heard.frames} whole frames", markup=False)

@@ -111,7 +111,7 @@ def command(
 
 
 class _Watch:
-    """Take samples and show them: as one table on a terminal, elsewhere one line per sample."""
+    """The samples of a device and their display: one table on a terminal, elsewhere one line per sample."""
 
     def __init__(self, target: DeviceTarget, tags: Sequence[Tag], *, as_json: bool) -> None:
         self.histories = {t.name: History() for t in tags}
@@ -123,7 +123,8 @@ class _Watch:
     async def run(self, every_s: float, most: int | None, for_s: float | None, log: Path | None) -> None:
         """Take samples for `for_s` seconds, and abandon a sample that is incomplete then.
 
-        Raises `Unreachable` if no sample was complete: each tag of a silent device takes a whole reply timeout.
+        Raises `Unreachable` if no sample was complete, as with a silent device: each of its tags takes a whole reply
+        timeout.
         """
         try:
             async with asyncio.timeout(for_s) as limit:

@@ -33,7 +33,7 @@ RESTART_COMMUNICATIONS = 1
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """Additional writes, the confirmation, and the restoring of old values after `hold_s` seconds."""
+    """The options for more writes at once, the confirmation, and the restoring of old values after `hold_s` seconds."""
 
     behaviours: tuple[str, ...] = option(
         "--behaviour", multiple=True, metavar="NAME", help="Make the named writes of the profile (`behaviours`)."
@@ -158,7 +158,7 @@ async def _carry_out(
 
 
 async def _put_back(point: Point, done: list[Written]) -> list[Written]:
-    """Restore the values in reverse order; a failure does not stop the rest."""
+    """Restore the old values in reverse order; a failure does not stop the rest, and the first one is raised at the end."""
     back: list[Written] = []
     failed: FieldtwinError | None = None
     for written in reversed(done):

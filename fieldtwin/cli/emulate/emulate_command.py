@@ -139,7 +139,10 @@ def _emulate_one(kind: str, path: Path, device: OneDeviceOptions, replay: Record
 def _extras(
     kind: str, path: Path, endpoints: tuple[str, ...], device: OneDeviceOptions, recording: Path | None
 ) -> ModbusExtras | None:
-    """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
+    """Return the initial values, faults and other extras of a Modbus device, None without any.
+
+    Raises `UsageError` and `FileInvalid`.
+    """
     from fieldtwin.emulators.device_faults import check_device
     from fieldtwin.emulators.faults.frames import framing_of
     from fieldtwin.emulators.faults.schema import load_faults

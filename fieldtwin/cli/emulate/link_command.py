@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.emulate.fault_counts import effect_text
 
 BITRATE = 125_000
-"""The bit rate of a bus that the link runs itself, if its endpoint has no ``bitrate=``."""
+"""Bit rate of a software CAN bus that the link itself runs, if its endpoint has no ``bitrate=``."""
 
 
 @click.command("link")

@@ -105,7 +105,7 @@ def command(
 
 
 def _headed(recording: Path, other: str, live: bool, device: DeviceOptions) -> dict[str, Any]:
-    """Add the header that names the device and the reference: `fieldtwin report` reads it."""
+    """Return the header of the JSON result, which names the device and the recording: `fieldtwin report` reads it."""
     can = recording.suffix == ".log"
     address = device.node if can else device.unit
     if address is None and not can:
@@ -115,7 +115,7 @@ def _headed(recording: Path, other: str, live: bool, device: DeviceOptions) -> d
 
 
 def _dry(recording: Path, url: str, device: DeviceOptions, sending: LiveOptions) -> int:
-    """Print the frames that would be sent, with their repetitions."""
+    """Print the frames that would be sent, with their repetitions. Return the exit code."""
     target = device.target(url)
     asked = 0
     if recording.suffix == ".log":
@@ -220,7 +220,7 @@ def _expect_exchanges(path: Path) -> None:
 
 
 def _allow_writes(recording: Path, url: str, sending: LiveOptions) -> None:
-    """Ask once before writing to a plant, and show what would be written."""
+    """Show the recorded writes and ask for confirmation before they are sent to a device. Raises `NotAllowed` without it."""
     writes = [e for e in exchanges_of(recording) if changes(e.request)]
     dangerous = [e for e in writes if e.unit == 0 or e.request[0] == 8]
     if dangerous and not sending.i_know:
@@ -234,13 +234,13 @@ def _allow_writes(recording: Path, url: str, sending: LiveOptions) -> None:
 
 
 def _limited_write_cycles(profile: DeviceProfile | None) -> set[tuple[str, int]]:
-    """Return the items with a limited number of write cycles. Each is written once, and never repeatedly."""
+    """Return (table, address) of the cells with a limited number of write cycles. Each is written once, and never repeatedly."""
     tags = profile.tags.values() if profile is not None else ()
     return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}
 
 
 def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:
-    """Run until the comparison is done or a signal ends it. The result then covers the exchanges that were compared so far."""
+    """Run `work` until the comparison is done or a signal ends it. The result then covers the exchanges compared so far."""
 
     async def main() -> None:
         stop = stop_signal()

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 @dataclass(frozen=True)
 class RuleOptions:
-    """The options that state by how much the two sides may differ, as texts."""
+    """The options that state by how much the two compared sides may differ, as texts."""
 
     tolerances: tuple[str, ...] = option(
         "--tolerance",

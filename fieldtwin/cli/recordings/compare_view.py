@@ -55,7 +55,9 @@ def print_comparison(result: Comparison, recording: Path, other: str, everything
 
 
 def _show_shifts(result: Comparison) -> None:
-    """Print at which positions the live dialogue continued the recorded one, and which exchanges the recording does not cover."""
+    """Print the registers that were read before the comparison, so that their recorded values are compared from a later
+    position on, and the number of exchanges for which the recording therefore has no values.
+    """
     for shift in result.shifts[:SHOWN]:
         stdout.print(
             f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",

@@ -121,7 +121,7 @@ def _stem(file: Path) -> str:
 
 
 class _bar:
-    """Show a progress bar on a terminal."""
+    """A progress bar, shown on a terminal only."""
 
     def __init__(self, file: Path) -> None:
         self._bar = Progress(

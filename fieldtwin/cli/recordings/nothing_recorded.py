@@ -7,7 +7,7 @@ different causes.
 from __future__ import annotations
 
 NOTHING_RECORDED = 1
-"""Exit code, as that of a scan that finds no device."""
+"""Exit code if nothing was recorded. A scan that finds no device ends with the same code."""
 
 OF_BUS = (
     "check the bit rate, the wiring with its termination, and whether a node sends: most nodes are silent until a master asks "
@@ -22,5 +22,5 @@ OF_POLLING = "check that the profile has readable tags, and let the recording ru
 
 
 def nothing_recorded(what: str, where: str, seconds: float, check: str) -> str:
-    """Return the message: `what` happened at `where` within `seconds`, and `check` says what to do."""
+    """Return the message: `what`, such as ``no byte passed``, `where`, and in how many seconds; `check` says what to do."""
     return f"nothing was recorded: {what} at {where} in {seconds:.1f} s; {check}"

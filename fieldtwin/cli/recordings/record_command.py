@@ -255,7 +255,12 @@ class _Job:
         there: str,
         back: str,
     ) -> int:
-        """Write the bytes as they arrive, then convert them to a recording of exchanges."""
+        """Write the bytes to a file as they arrive, then convert them to a recording of exchanges. Return the exit code.
+
+        `listening` returns the function that receives the bytes. `how` (``tapped``, ``sniffed``) becomes part of the
+        device's name, `check` is the advice if nothing arrived, `there` and `back` name the two directions in the status
+        line.
+        """
         if self._out.exists():
             raise UsageError(f"{self._out} exists already", expected="another name")
         started = self._now()
@@ -294,13 +299,17 @@ class _Job:
         return datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
 
     def _missing(self, file: RotatingFile, what: str, where: str, check: str) -> None:
-        """Note that nothing was recorded, if so, and remove the empty file: its name is free for the next attempt."""
+        """If `file` is empty, keep the message that nothing was recorded, and remove the file: its name is free for the
+        next attempt.
+        """
         if not file.lines:
             self._note = nothing_recorded(what, where, self._seconds, check)
             file.path.unlink()
 
     def _run(self, work: Callable[[asyncio.Event], Coroutine[Any, Any, None]], status: Callable[[], str]) -> None:
-        """Run until the recording ends, a signal arrives, or --for has passed."""
+        """Run `work` until the recording ends, a signal arrives, or the time of --for has passed; `status` gives the status
+        line.
+        """
 
         for_s = self._polling.for_s
 
@@ -372,7 +381,7 @@ class _Job:
 
 @contextmanager
 def _status() -> Iterator[Status | None]:
-    """Show a status line on a terminal."""
+    """Yield a status line on a terminal, None elsewhere."""
     if not stderr.is_terminal:
         yield None
         return

@@ -13,7 +13,7 @@ from fieldtwin.cli.options import Duration
 
 @dataclass(frozen=True)
 class RecordingSourceOptions:
-    """The source of a recording that replaces polling a device by the tags of its profile."""
+    """The options for a recording that does not poll a device by the tags of its profile."""
 
     taps: tuple[str, str] | None = option(
         "--tap", nargs=2, metavar="A B", help="Connect a client (A) with its devices (B), and record all traffic."
@@ -38,7 +38,7 @@ class RecordingSourceOptions:
 
 @dataclass(frozen=True)
 class PollOptions:
-    """The polling rounds, and the end of a recording. None: no limit."""
+    """The options for the polling rounds, and for the end of a recording. None: no limit."""
 
     groups: tuple[str, ...] = option("--group", multiple=True, help="With a Modbus profile: only this poll group.")
     every_s: float = option(
@@ -56,7 +56,7 @@ class PollOptions:
 
 @dataclass(frozen=True)
 class FileOptions:
-    """The file of a recording and its parts. None: no limit."""
+    """The options for the file of a recording and the parts into which it is split. None: no limit."""
 
     out: Path = option(
         "-o",

@@ -10,7 +10,7 @@ from fieldtwin.cli.options import Duration
 
 @dataclass(frozen=True)
 class ToleranceOptions:
-    """Tolerances of values as texts, of times in seconds, and the names to ignore."""
+    """The options for tolerances of values (as texts) and of times (in seconds), and the names to ignore."""
 
     tolerances: tuple[str, ...] = option(
         "--tolerance",

@@ -51,7 +51,7 @@ def judged(system: System, old: Path, new: Path, allowed: Allowed) -> RunCompari
 
 
 def show(verdict: RunComparison, old: Path, *, as_json: bool) -> int:
-    """Print the comparison and return the exit code."""
+    """Print the comparison and return the exit code: 0 if the runs are the same, else 1."""
     if as_json:
         json.dump(
             {
@@ -96,7 +96,8 @@ def show(verdict: RunComparison, old: Path, *, as_json: bool) -> int:
 def write_scenario(
     system: System, run: Path, out: Path, named: str, *, allowed: Allowed, seed: int | None, values: bool
 ) -> int:
-    """Write the run in `run` as a scenario; `named` is the system as the user named it.
+    """Write the run in the file `run` as a scenario to `out`; `named` is the system as the user named it. Return the exit
+    code.
 
     Raises `UsageError` if the file exists.
     """

@@ -1,4 +1,4 @@
-"""A run on the terminal: a live table, or one line a second where stderr is not a terminal.
+"""The display of a run on the terminal: a live table, or one line per second where stderr is not a terminal.
 
 Everything comes from the session's statuses; this module only formats text.
 """
@@ -30,7 +30,7 @@ MAX_TROUBLES = 5
 
 
 def print_mapping(session: RunSession) -> None:
-    """Print once which endpoint replaces each endpoint of the plant."""
+    """Print which endpoint replaces each endpoint of the plant; for a plant, whether writes are allowed."""
     if not session.options.prototype:
         leave = "writes allowed" if session.options.allow_writes else "read-only"
         stderr.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
@@ -52,12 +52,12 @@ def print_mapping(session: RunSession) -> None:
 
 
 def print_studio(url: str) -> None:
-    """Print once the address of the page."""
+    """Print the address of the Studio page."""
     stderr.print(f"  studio  →  {url}", soft_wrap=True, markup=False, highlight=False)
 
 
 def print_metrics(url: str) -> None:
-    """Print once the address of the metrics."""
+    """Print the address of the metrics, if they are served."""
     if url:
         stderr.print(f"  metrics  ←  {url}", soft_wrap=True)
 
@@ -116,7 +116,11 @@ class LiveView:
             stderr.print(line(self._session), soft_wrap=True, markup=False)
 
     def _tell_once(self, told: set[str]) -> set[str]:
-        """Print once where the gateway listens (a prototype takes free ports), and report recovered simulated devices."""
+        """Print new texts only: where the gateway listens (a prototype takes free ports), and which simulated devices have
+        recovered.
+
+        `told` are the texts printed before; return the present ones.
+        """
         now = set(ports(self._session))
         if (back := self._session.field_return) is not None and back.news:
             now.add(back.news)
@@ -126,7 +130,7 @@ class LiveView:
 
 
 def ports(session: RunSession) -> list[str]:
-    """Return where the gateway serves tags and lets clients reach units."""
+    """Return where the gateway serves tags (`serve`) and lets clients reach units (`bridge`), as texts."""
     return [f"{kind} {name}  ←  {front.listening}" for kind, name, front in fronts_of(session) if front.listening]
 
 
@@ -164,7 +168,7 @@ def _p99(plc: PlcStatus) -> str:
 
 
 def render(session: RunSession) -> RenderableType:
-    """Return the live table in the terminal's width."""
+    """Return the live table, fitted to the terminal's width."""
     kind = "prototype" if session.options.prototype else "plant"
     left = session.options.duration_s
     clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")

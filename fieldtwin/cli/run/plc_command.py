@@ -34,7 +34,7 @@ def _one_instance(ctx: click.Context, parameter: click.Parameter, named: str) ->
 
 
 def instance_argument(function: Callable[..., int]) -> Callable[..., int]:
-    """Add the argument INSTANCE, as that of `fieldtwin reload`, and --instance with the same meaning."""
+    """Add the argument INSTANCE, which `fieldtwin reload` also has, and the option --instance with the same meaning."""
     argument = click.argument("named_instance", metavar="[INSTANCE]", default="", is_eager=True)
     option = click.option(
         "--instance", default="", metavar="NAME", callback=_one_instance, help="The same as INSTANCE."
@@ -93,7 +93,9 @@ def _call(instance: str, command: str, **args: Any) -> Any:
 
 
 def _act(instance: str, command: str, **args: Any) -> Any:
-    """Send a command that changes the PLC. The PLC records it with the user's name."""
+    """Send a command that changes the PLC's state, and return the PLC's answer. The PLC records the command with the user's
+    name.
+    """
     import getpass
 
     return _call(instance, command, by=getpass.getuser(), **args)

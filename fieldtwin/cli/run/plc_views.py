@@ -54,7 +54,9 @@ async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[
 
 
 async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
-    """Read rows of tags, inputs before outputs, in pieces, so that no scan is delayed."""
+    """Read rows of tags from the PLC, a few at a time, so that no scan is delayed; return rows of inputs before those of
+    outputs.
+    """
     rows: list[Row] = []
     for at in range(0, len(names), MAX_AT_ONCE):
         rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
@@ -68,7 +70,8 @@ async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row
 def tags_as_data(rows: list[Row]) -> dict[str, Row]:
     """Return tags as JSON data, by name.
 
-    A tag that is read back is in both regions: the entry has the commanded value, and the value read as `input`.
+    An output that is read back from its device is also an input: its entry has the commanded value, and the value read as
+    `input`.
     """
     found: dict[str, Row] = {}
     for row in rows:
@@ -102,12 +105,12 @@ def tag_table(rows: list[Row]) -> Table:
 
 
 def _named(row: Row, value: Any) -> str:
-    """Return a value by its name if it has one, such as a state's."""
+    """Return the name of a value if it has one, such as that of a state, else the value as text."""
     return str(row["words"].get(str(value), value_text(value)))
 
 
 def _limits(limits: list[float] | None) -> str:
-    """Return the limits; nothing if they only state the width of an integer."""
+    """Return the limits as text; an empty string if they only state the range of an integer type."""
     if limits is None or tuple(limits) in _WHOLE_TYPES:
         return ""
     return f"{limits[0]:.6g}..{limits[1]:.6g}"
@@ -126,7 +129,7 @@ def print_tags(rows: list[Row]) -> None:
 
 
 def _width() -> int:
-    """Return the number of columns: the terminal's, and unlimited in a pipe, so that nothing is cut off."""
+    """Return the number of columns: the terminal's; for a pipe so many that nothing is cut off."""
     return stdout.width if stdout.is_terminal else IN_A_PIPE
 
 
@@ -222,8 +225,8 @@ def without_texts(started_without: Mapping[str, Mapping[str, str]]) -> list[str]
 
 
 def is_now(rows: list[Row], tag: str) -> str:
-    """Return the present value of a tag that is about to be forced, with unit and limits. For a tag that is read back this is
-    the commanded value.
+    """Return the present value of a tag that is about to be forced, as text with unit and limits. For an output that is
+    read back from its device this is the commanded value.
     """
     if not rows:
         raise UsageError(f"no tag {tag!r}", expected="a tag without *")
@@ -238,7 +241,10 @@ def acts_text(acts: dict[str, int]) -> str:
 
 
 def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
-    """Print the reason of a tag's value. `waits_for`: what the program that writes the tag waits for before it starts."""
+    """Print which program last changed a tag, and from which inputs.
+
+    `waits_for`: what the program that writes the tag waits for before it starts.
+    """
     if waits_for:
         stdout.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
     elif not changes:

@@ -43,7 +43,7 @@ MOVED = (
 
 @dataclass(frozen=True)
 class PlaceOptions:
-    """The kind of a run: either `prototype` or `plant`. `duration_s` 0 means until stopped."""
+    """The options for the kind of a run: either `prototype` or `plant`. `duration_s` 0 means until stopped."""
 
     prototype: bool = option(
         "--prototype", is_flag=True, help="Emulate the field devices as defined in NAME.prototype.yaml."
@@ -70,7 +70,7 @@ class PlaceOptions:
 
 @dataclass(frozen=True)
 class EmulationOptions:
-    """Where the devices of a prototype are emulated, and the file of their faults, empty for none."""
+    """The options that state where the devices of a prototype are emulated, and the file of their faults, empty for none."""
 
     can: str = option(
         "--can",
@@ -98,7 +98,7 @@ class EmulationOptions:
 
 @dataclass(frozen=True)
 class ThreadOptions:
-    """The plant's end of a digital thread, as in `RunOptions`."""
+    """The options for the plant's side of a digital thread, as in `RunOptions`."""
 
     thread: str = option(
         "--thread",
@@ -121,7 +121,7 @@ class ThreadOptions:
     )
 
     def check(self) -> None:
-        """Raise `UsageError` for options of a thread without a thread."""
+        """Raise `UsageError` for options of a digital thread if no thread was requested."""
         if (self.thread_store or self.thread_every_s is not None) and not self.thread:
             raise UsageError("--thread-store and --thread-every need --thread")
 

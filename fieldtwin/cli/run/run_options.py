@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """The prototype file, and the recordings (files by device) that its devices replay. `speed` is a factor; 0: the file's."""
+    """The options for the prototype file, and for the recordings (files by device) that its devices replay. `speed` is a
+    factor; 0: that of the prototype file.
+    """
 
     prototype_file: Path | None = option(
         "--prototype-file",
@@ -40,7 +42,7 @@ class ReplayOptions:
     speed: float = option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
 
     def given(self) -> dict[str, object]:
-        """Return the values that the user gave, by option."""
+        """Return the values of these options, by the option's name."""
         return {"--recording": self.recordings, "--speed": self.speed, "--prototype-file": self.prototype_file}
 
 

@@ -27,7 +27,7 @@ OF_A_GROUP = "--for, --seed, --seeds, --jobs, --ledger, --commands, --faults, --
 
 @dataclass(frozen=True)
 class ManyRuns(SeedOptions):
-    """The seeds of several runs, and the file that records each run."""
+    """The options for the seeds of several runs, and for the file that records each run."""
 
     ledger: Path | None = option(
         "--ledger",
@@ -134,7 +134,7 @@ def command(
 
 
 def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
-    """Run, then compare the run with the trace `old`; return the worse of the two exit codes."""
+    """Run, then compare the run with the trace in the file `old`; return the worse of the two exit codes."""
     from fieldtwin.cli.recordings.regression_view import judged, show
     from fieldtwin.scenarios.regression.comparing import Allowed
     from fieldtwin.twin.site.system import load_system

@@ -19,7 +19,7 @@ from fieldtwin.service.studio_child import READY
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """Where the page is served, and how it is protected."""
+    """The options that state where the page is served, and how it is protected."""
 
     listen: str = option(
         "--listen", default="127.0.0.1:0", metavar="HOST:PORT", help="Where to serve; port 0: a free one."
@@ -66,7 +66,7 @@ class TraceOptions:
     )
 
     def check(self, trace: Path | None) -> None:
-        """Raise `UsageError` for options of a trace without one."""
+        """Raise `UsageError` for options of a trace if no trace was given."""
         if trace is None and (self.at_s is not None or self.system):
             raise UsageError("--at and --system need a trace", expected="fieldtwin studio TRACE --at 12.5s")
 

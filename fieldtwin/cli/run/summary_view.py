@@ -114,7 +114,10 @@ def _thread_text(thread: dict[str, Any]) -> str:
 
 
 def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
-    """Return the gaps that were learnt about a device. The last line is ready to be copied into its profile."""
+    """Return as text what was learnt about a device: missing addresses, and where it accepts fewer registers per read.
+
+    The last part is ready to be copied into the device's profile.
+    """
     parts = []
     if learnt["missing"]:
         parts.append(f"does not have {', '.join(learnt['missing'])}")

@@ -20,7 +20,7 @@ READ_ONLY = "read-only"
 
 
 def fronts_of(session: RunSession) -> list[tuple[str, str, FrontStatus]]:
-    """Return kind, name and status of each server and bridge."""
+    """Return kind (``serve`` or ``bridge``), name and status of each server and bridge of the gateway."""
     gateway = session.gateway_status
     if gateway is None:
         return []
@@ -85,7 +85,7 @@ def interference(session: RunSession) -> list[str]:
 
 
 def waiting_once(session: RunSession) -> list[str]:
-    """Return the waiting programs without the seconds, so that a log reports each once."""
+    """Return the programs that wait for their start, without the time that they have waited, so that a log reports each once."""
     waiting = session.plc_status.waiting if session.plc_status is not None else {}
     return [f"program {program} has not started; missing {start.reason}" for program, start in waiting.items()]
 

@@ -89,7 +89,8 @@ def run_many(
 ) -> int:
     """Run once for each seed and return the exit status: 0 if all passed.
 
-    With a ledger, seeds that it contains are not repeated, and each run is recorded when it ends.
+    `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
+    with their recorded result.
     """
     from fieldtwin.run.campaigns.ledger import Ledger
     from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
@@ -168,7 +169,11 @@ def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
 
 
 def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
-    """Write the smallest part of the first failing schedule as a scenario into the working directory, once it is confirmed."""
+    """Reduce the faults of a failed seed to those that the failure needs, and write them as a scenario into the working
+    directory.
+
+    Nothing is written if the seed does not fail again with the same faults.
+    """
     from fieldtwin.run.campaigns.confirming import confirm_run
     from fieldtwin.run.campaigns.many_seeds import shrunk
     from fieldtwin.run.campaigns.shrink import as_scenario
@@ -193,7 +198,7 @@ def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
 
 
 def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
-    """Return sentences that name the faults which are needed for the failure of a seed, and the result of a run without
+    """Return sentences that state how many faults of its schedule a seed needs to fail, and the result of a run without
     faults.
     """
     if not count:
@@ -213,14 +218,14 @@ def _plain(result: SeedResult) -> dict[str, Any]:
 
 
 def shown_time(seconds: float) -> str:
-    """Return a length of virtual time as text."""
+    """Return a duration of virtual time, in seconds, as text."""
     if seconds >= 2 * 3600:
         return f"{seconds / 3600:g} h"
     return f"{seconds / 60:g} min" if seconds >= 120 else f"{seconds:g} s"
 
 
 class progress_bar:
-    """Show a progress bar on stderr if that is a terminal. ``with progress_bar(60.0) as at: at(12.0)``."""
+    """A progress bar on stderr, shown on a terminal only. ``with progress_bar(60.0) as at: at(12.0)``."""
 
     def __init__(self, total: float, unit: str = "s") -> None:
         columns = (

@@ -53,7 +53,10 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[P
 
 
 def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_json: bool) -> int:
-    """Write the drawing to the file or to stdout. Raises `UsageError` for a file that cannot be written."""
+    """Write the drawing to `output` or to stdout: `text`, the SVG if `output` is a file, or `facts` as JSON.
+
+    Raises `UsageError` for a file that cannot be written.
+    """
     if as_json:
         text = json.dumps(facts, indent=2) + "\n"
     elif output is not None:
@@ -69,5 +72,5 @@ def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_
 
 
 def _room() -> tuple[int, ...]:
-    """Return the terminal's width; a pipe takes whole lines."""
+    """Return the terminal's width in columns as a tuple, empty for a pipe, in which lines are not shortened."""
     return (shutil.get_terminal_size().columns,) if sys.stdout.isatty() else ()

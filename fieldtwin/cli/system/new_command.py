@@ -24,7 +24,7 @@ CIS = ("github", "gitlab", "none")
 
 @dataclass(frozen=True)
 class DeviceChoices:
-    """The devices: named by profile, or found by a scan."""
+    """The options for the devices of the site: named by profile, or found by a scan."""
 
     devices: tuple[str, ...] = option(
         "--device",
@@ -42,7 +42,7 @@ class DeviceChoices:
 
 @dataclass(frozen=True)
 class FileChoices:
-    """The parts of the site in addition to its devices. None: ask, or use the default."""
+    """The options for the parts of the site in addition to its devices. None: ask, or use the default."""
 
     control: str | None = option(
         "--control",
@@ -119,7 +119,7 @@ def _say(text: str) -> None:
 
 
 def _ask(what: str, choices: tuple[str, ...], asking: bool) -> str:
-    """Ask the user for one of `choices`; the first is the default."""
+    """Ask the user for one of `choices`; the first is the default, also if `asking` is False."""
     if not asking:
         return choices[0]
     answer: str = click.prompt(what, type=click.Choice(choices), default=choices[0], err=True)
@@ -157,7 +157,7 @@ def _ask_for_devices(profiles: tuple[Path, ...]) -> list[DeviceWish]:
 
 
 def _scanned(text: str, profiles: tuple[Path, ...], asking: bool) -> list[DeviceWish]:
-    """Return the devices at ``ENDPOINT[#LIST]``. Raises `Unreachable` if nothing answers."""
+    """Scan ``ENDPOINT[#LIST]`` and return the devices found there. Raises `Unreachable` if no device answers."""
     from fieldtwin.cli.device.identify_command import known_profiles
     from fieldtwin.cli.device.scan_command import numbers
     from fieldtwin.cli.device.scan_progress import ScanProgress

@@ -52,7 +52,7 @@ def run_scenario_campaign(
 
 
 def _words(options: CampaignOptions) -> tuple[str, ...]:
-    """Return the options that define a seed's run, without the seed."""
+    """Return the options that define a seed's run, without the seed, as words of a command line."""
     said = {
         "--faults": options.faults or "",
         "--for": f"{options.duration_s:g}s" if options.duration_s else "",
@@ -91,7 +91,11 @@ def _show_whole(whole: ScenarioResult) -> None:
 
 
 def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[ScenarioResult]:
-    """Write the smallest failing schedule as a scenario into the working directory, and confirm it."""
+    """Reduce the faults of a failed seed to those that the failure needs, write them as a scenario into the working
+    directory, and run this scenario to confirm it.
+
+    Return the result of the confirmed scenario in a list, empty if there is none. `told`: print the findings.
+    """
     stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrink_seed(campaign, failed)
     if not small.result.verdict.bad:

@@ -37,7 +37,7 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$
 
 
 class _CheckGroup(click.Group):
-    """The group of checks. It names the new command to users of an old name."""
+    """The group of checks. An old name of a command raises an error that names the new one."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -58,7 +58,7 @@ def command() -> None:
 
 @dataclass(frozen=True)
 class ClientOptions:
-    """The published values of the client or master under test, and its times."""
+    """The options for the published values of the client or master under test, and for its timeouts."""
 
     probe: str = option(
         "--probe",

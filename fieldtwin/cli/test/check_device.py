@@ -40,7 +40,7 @@ INTERRUPTED = 130
 
 @dataclass(frozen=True)
 class CareOptions:
-    """The limits of a check of a device, and the name of the tester."""
+    """The options that limit a check of a device, and the name of the tester."""
 
     allow: str | None = option(
         "--allow", type=click.Choice(IMPACTS), help="Highest impact level to run.  [default: read; write with --write]"
@@ -61,7 +61,7 @@ class CareOptions:
 
 
 class DeviceCheck:
-    """The common parts of the two commands: the plan, the confirmation, the files."""
+    """The common parts of `check modbus` and `check canopen`: the plan, the confirmation, the files."""
 
     def __init__(
         self, protocol: str, endpoint: str, address: int, care: CareOptions, choice: CaseOptions, files: ResultOptions
@@ -126,7 +126,8 @@ class DeviceCheck:
     def play(self, most: int, check: Callable[..., Any]) -> Checked:
         """Run ``check(taps, go_on, print_line, on_result)`` with a progress bar, and with a log if requested.
 
-        Ctrl-C ends it after the present test case, a second one at once; changed values are restored in any case.
+        The first Ctrl-C ends the check after the present test case, the second one at once; changed values are restored in
+        both cases.
         """
         from fieldtwin.cli.test.check_view import CheckProgress
         from fieldtwin.commissioning.access.frame_log import FrameLog
@@ -175,7 +176,7 @@ class DeviceCheck:
         )  # fmt: skip
 
     def estimate(self, dry_run_result: Checked) -> None:
-        """Print the number of cases, and the time that they take if the device answers at once."""
+        """Print the number of cases, and how long they take if the device answers at once, both known from a dry run."""
         from fieldtwin.console import stderr
 
         played = sum(bool(result.spoken) for result in dry_run_result.results)

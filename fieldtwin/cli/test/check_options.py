@@ -36,7 +36,7 @@ _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class CaseOptions:
-    """The choice of test cases, and the failures that count."""
+    """The options that choose test cases, and the failures that affect the exit code."""
 
     only: str | None = option(
         "--only", metavar="IDS", help="Run only these test cases or rows, separated by commas: MB-013,MB-015a."

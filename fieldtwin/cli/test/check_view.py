@@ -132,7 +132,7 @@ def _print_each(results: Sequence[CaseResult]) -> None:
 
 
 def print_not_counted(results: Sequence[CaseResult], fail_on: frozenset[Basis]) -> None:
-    """Print that failures are not counted, if there are any."""
+    """Print that the exit code does not count some failures, if there are any that `fail_on` does not contain."""
     if any(r.verdict.bad and not counts_as_failed(r, fail_on) for r in results):
         stderr.print(
             "The standard does not require what robustness and field problem cases ask. "
@@ -180,7 +180,7 @@ def listed(case: About) -> dict[str, Any]:
 
 
 def print_dry_run(checked: Checked, *, as_json: bool) -> None:
-    """Print the frames that a check would send, case by case, without the cases that are not run."""
+    """Print the frames that a check would send, case by case. Cases that would not be run are left out."""
     played = [r for r in checked.results if r.spoken]
     if as_json:
         cases = [
@@ -215,7 +215,7 @@ def _sent(spoken: Sequence[Spoken]) -> list[str]:
 
 
 def _print_sent(frames: Sequence[str]) -> None:
-    """Print one frame per line; equal consecutive frames once, with their number."""
+    """Print one frame per line; equal consecutive frames are printed once, with their number."""
     for text, same in groupby(frames):
         times = len(list(same))
         stdout.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)

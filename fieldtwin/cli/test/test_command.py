@@ -223,10 +223,7 @@ def command(
 
 
 def _counts(results: Sequence[ScenarioResult], of: str) -> str:
-    """Return the last line, such as ``3 passed, 1 failed``.
-
-    It leaves out the results of a campaign and of its shrunk scenario.
-    """
+    """Return the last line of the output, such as ``3 passed, 1 failed``; `of` is the text before the numbers."""
     counts = Counter(result.verdict.value for result in results)
     return of + ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
 
@@ -371,7 +368,7 @@ def _plain(result: object) -> dict[str, object]:
 
 
 def _machines(systems: list[System]) -> dict[SystemKey, tuple[Machine, ...]]:
-    """Return the state machines of each system; its programs are created once."""
+    """Return the state machines of each system's programs. Equal systems are evaluated once."""
     from fieldtwin.reports.run.machines import machines_of
     from fieldtwin.results.model import key_of
 

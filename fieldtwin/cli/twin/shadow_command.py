@@ -26,8 +26,8 @@ STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "ye
 
 
 class ShadowOutput:
-    """The console output of a shadow: each verdict as it is reached, and each change of the state on which plant and model
-    agree.
+    """The console output of a shadow: each finding of the comparison as it is reached, and each change of the state on
+    which plant and model agree.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -47,7 +47,7 @@ class ShadowOutput:
         stderr.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
 
     def trouble(self, where: str, text: str) -> None:
-        """Print each problem of the thread or the store once, and its end."""
+        """Print a problem of the digital thread or of its store, or that it has recovered if `text` is empty."""
         if not self._quiet:
             self.line(f"[bold yellow]{where:10}[/]", text or "recovered")
 
@@ -130,7 +130,7 @@ def why_nothing(seen: dict[str, Any], place: str) -> str:
 
 
 def variables_text(variables: dict[str, Any], undeclared: int) -> str:
-    """Return how many of the model's variables were received, and how many of them can be trusted."""
+    """Return as text how many variables the model has, how many of them were received, and how many of these are good."""
     heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
     good = sum(variable["quality"] == "good" for variable in heard)
     more = f"; {undeclared} values of tags that it does not declare" if undeclared else ""

@@ -1,7 +1,7 @@
-"""Checks that cases share: pure functions of an `Observation`.
+"""Checks that test cases share. Each is a function of an `Observation` alone.
 
-The first ones apply to every client in every case: the client continues, does not flood the device, sends only valid requests,
-and never publishes the value of a bad frame. The other checks are specific to cases.
+The first ones apply to every client in every case: the client continues, does not flood the device, sends only valid
+requests, and never publishes the value of a bad frame. The other checks are specific to cases.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import Verdict
 
 FLOOD_FACTOR = 5.0
-"""A rate of requests that is this many times the usual rate is a flood. A client that tries four times and polls on stays
-below it.
+"""A client whose request rate exceeds this many times its usual rate floods the device. A client that sends a request four
+times and then continues to poll stays below it.
 """
 FLOOD_FLOOR = 30
-"""Number of requests within the case that is not a flood, however low the usual rate is."""
+"""Number of requests in a test case up to which a client does not count as flooding the device, however low its usual rate is."""
 NEEDS_PROBE = "only its published values show this: give --probe"
 UNSEEN = "its published values were not observed: no --probe"
 
@@ -36,7 +36,7 @@ Rule = Callable[[Observation], Finding | None]
 
 
 def all_of(*rules: Rule) -> CheckFunction:
-    """Return the first finding that is not a pass, else the first pass with a reason."""
+    """Return a check that applies `rules`: it gives the first finding that is not a pass, else the first pass with a reason."""
 
     def check(seen: Observation) -> Finding:
         good: Finding | None = None
@@ -54,7 +54,7 @@ def all_of(*rules: Rule) -> CheckFunction:
 
 
 def goes_on(seen: Observation) -> Finding | None:
-    """Check that the client still runs, and asks again once the device replies correctly."""
+    """Check that the client still runs, and sends requests after the device has begun to reply correctly again."""
     for ended in seen.of(Ended, seen.begun_ns):
         return failed(
             f"the client ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first faulty answer"
@@ -128,7 +128,10 @@ def needs_probe(seen: Observation) -> Finding | None:
 
 
 def owes(*rules: Rule) -> CheckFunction:
-    """Return a check of the duties of every client, followed by `rules`. It passes only if the probe saw all published values."""
+    """Return a check that applies `DUTIES`, which every client has to fulfil, and then `rules`.
+
+    It passes only if the probe has classified all published values.
+    """
     return all_of(*DUTIES, *rules, sees_all_values)
 
 
@@ -142,7 +145,9 @@ survives = owes()
 
 
 def took_odd_answer(seen: Observation) -> Finding | None:
-    """Check that the client took the value from the faulty answers, before the correct ones came again."""
+    """Check that the client published the value of the unusual but permitted answers before it received ordinary answers
+    again.
+    """
     if not seen.probed:
         return skipped(NEEDS_PROBE)
     first = next((s for s in seen.of(ValuePublished, seen.begun_ns) if s.word is seen.after), None)
@@ -157,8 +162,8 @@ def took_odd_answer(seen: Observation) -> Finding | None:
 def keeps_waiting(seen: Observation) -> Finding | None:
     """Check that the client waits long enough for a reply.
 
-    On a line, a frame after the next request answers the first one: a client that has asked again gave up waiting for
-    it.
+    On a serial line a client has one open request at a time. If a reply arrives only after the client's next request, the
+    client gave up waiting for this reply.
     """
     for told in seen.of(ReplySent, seen.begun_ns):
         if told.good or not told.asked_ns:
@@ -184,11 +189,11 @@ either = owes(needs_probe)
 
 
 def answers_at_once(seen: Observation) -> Finding | None:
-    """Check that a short frame is noticed on arrival: the next request comes sooner than after silence.
+    """Check that the client notices a short frame on arrival: its next request comes sooner than after no reply.
 
-    A client may also see it at once and then back off for about as long as it waits for silence. Therefore the second
-    frame is sent later than the first: a client that waits out its timeout asks again at the same time after both
-    requests.
+    A client may also notice the frame at once and then pause for about as long as its timeout. Therefore the second short
+    frame is sent later than the first: a client that waits for its timeout sends its next request at the same time after
+    both requests.
     """
     gaps_s = [
         (delay_s, gap_s) for told in seen.of(ReplySent, seen.begun_ns) for delay_s, gap_s in _gap_after(seen, told)
@@ -215,9 +220,9 @@ def answers_at_once(seen: Observation) -> Finding | None:
 
 
 def _gap_after(seen: Observation, told: ReplySent) -> Iterator[tuple[float, float]]:
-    """Yield the delay of a faulty answer after its request, and the time from it to the next request.
+    """For a faulty answer, yield its delay after the request and the time from it to the next request, both in seconds.
 
-    Nothing is yielded if that request came before.
+    Yield nothing for a correct answer, or if the next request was sent before the answer.
     """
     if told.good:
         return
@@ -245,9 +250,9 @@ def backs_off(seen: Observation) -> Finding | None:
 def quarantines(seen: Observation) -> Finding | None:
     """Check that the client waits before it repeats a request that timed out.
 
-    After a timeout, a late reply of the same shape cannot be distinguished from a prompt reply to the same question. If
-    a probe saw the late value, another check has already decided; otherwise it is a failure only if the user stated the
-    timeout.
+    After a timeout, a late reply cannot be distinguished from a prompt reply to the repeated request. With a probe, the
+    check of the published values decides, and this check finds nothing; without a probe, a repetition before the late reply
+    is inconclusive.
     """
     late = next((t for t in seen.of(ReplySent, seen.begun_ns) if not t.good), None)
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
@@ -263,8 +268,8 @@ def quarantines(seen: Observation) -> Finding | None:
 
 
 def late_is_not_data(seen: Observation) -> Finding | None:
-    """Apply the check `publishes_nothing_bad`. The result is inconclusive if the client's timeout is unknown, because the
-    client may accept a reply within this time.
+    """Apply the check `publishes_nothing_bad`. A failure becomes inconclusive if the user has not stated the client's
+    timeout, because the client may still have been waiting for the late reply.
     """
     bad = publishes_nothing_bad(seen)
     if bad is not None and not seen.timeout_s:
@@ -289,7 +294,11 @@ late_other = all_of(another_shape_came, *DUTIES, needs_probe, sees_all_values)
 
 
 def checks_echo_of_write(seen: Observation) -> Finding | None:
-    """Check that the client notices a differing echo of a write: it repeats it, reads it back, or reports it."""
+    """Check that the client notices an echo that differs from its write: it repeats the write or reads the value back.
+
+    The result is inconclusive otherwise, because the client may have reported the error in a way that the test does not
+    see.
+    """
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if first is None:
         return inconclusive("no write was seen")

@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 TURNAROUND_MS = 100
 """SL 2.4.1: the turnaround delay is typically 100 to 200 ms; it has to be long enough for any unit to process the request."""
 NO_DELAY_MS = 10
-"""A pause shorter than this is not a turnaround delay."""
+"""In milliseconds: a pause after a broadcast that is shorter than this is not a turnaround delay."""
 MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
 """The largest number of bits or registers in a request of each function (AP 6)."""
 MOST_CONNECTIONS = 4

@@ -61,7 +61,10 @@ class Classifier:
         self.latest = ""
 
     def learn(self, word: Word) -> bool:
-        """Learn the latest reading as `word`. Raises `UsageError` if both words look the same."""
+        """Take the latest reading as the representation of `word`.
+
+        Return False if there is no reading yet, or if it is already known to represent a different word.
+        """
         if not self.latest or self.latest in self._none:
             return False
         known = self._known.get(self.latest)
@@ -81,9 +84,10 @@ class Classifier:
 
 
 class RegisterProbe:
-    """Registers of a Modbus TCP server, polled: the client's own, or those of an HMI behind it.
+    """A probe that polls registers of a Modbus TCP server: the client's own server, or that of an HMI that shows its
+    values.
 
-    An exception is not a value.
+    An exception response is not a value.
     """
 
     def __init__(self, text: str, connector: Connector, clock: Clock, classifier: Classifier) -> None:
@@ -177,7 +181,7 @@ class OutputProbe:
         return self._latest_line
 
     def feed(self, text: str, log: bool = False) -> None:
-        """Add text of the output or of the log."""
+        """Add text of the program's output, or of its log (standard error) if `log` is True."""
         for line in self._lines.feed(text, log):
             self._line(line, log)
 
@@ -228,7 +232,7 @@ class MarkedOutputProbe:
         return self._latest_line
 
     def feed(self, text: str, log: bool = False) -> None:
-        """Add text of the output or of the log."""
+        """Add text of the program's output, or of its log (standard error) if `log` is True."""
         for line in self._lines.feed(text, log):
             if not log and line.strip():
                 self._latest_line = line.strip()[:SHOWN_CHARACTERS]

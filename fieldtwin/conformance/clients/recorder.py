@@ -1,5 +1,5 @@
-"""The recorder of a run's events, and the polling behaviour of the client that they show. Bounded: the oldest events are
-dropped and counted.
+"""The recorder of a run's events, and the polling behaviour of the client that they show. The number of events is limited:
+the oldest ones are dropped and counted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MOST_EVENTS = 200_000
 
 
 class Recorder:
-    """The events of a run in order. `marks` gives names to moments, which limit the windows that are examined."""
+    """The events of a run in order, at most `MOST_EVENTS`."""
 
     def __init__(self) -> None:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
@@ -44,7 +44,9 @@ class Recorder:
         return tuple(reversed(found))
 
     def habit(self, since_ns: int, until_ns: int, silent_gap_s: float = 0.0) -> Habit:
-        """Return the polling behaviour of the client between two moments."""
+        """Return the polling behaviour of the client between two moments; `silent_gap_s` is measured elsewhere and only
+        passed on.
+        """
         asked = [e for e in self._events if isinstance(e, RequestSeen) and since_ns <= e.t_ns <= until_ns]
         gaps = [(b.t_ns - a.t_ns) / NS_PER_S for a, b in itertools.pairwise(asked)]
         times: dict[bytes, list[int]] = {}

@@ -40,9 +40,9 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 POLL_S = 0.01
 STEADY = 3
-"""Number of polls that show the client's usual behaviour."""
+"""Number of polls in which the client's usual behaviour is measured."""
 MANY = 1_000_000
-"""Maximum number of strikes of a case that continues until its value was seen."""
+"""Maximum number of wrong replies of a case that continues until the client has published the value of these replies."""
 
 
 class Playable(Protocol):
@@ -71,7 +71,9 @@ C_contra = TypeVar("C_contra", bound=Playable, contravariant=True)
 
 
 class HostileDevice(Protocol[C_contra]):
-    """The simulated device with which the cases run: see `HostileServer` and `HostileNode`. Times are its `now_ns`."""
+    """The simulated device with which the cases run: see `HostileServer` and `HostileNode`. All times are those of its
+    `now_ns`.
+    """
 
     recorder: Recorder
     timeout_s: float
@@ -84,16 +86,16 @@ class HostileDevice(Protocol[C_contra]):
     def begin(self, case: C_contra, strikes: int) -> None: ...
     def end(self) -> None: ...
     def hold(self, word: Word) -> int:
-        """Let the register hold this word from now on, and return the number of the word."""
+        """Let the device hold the correct value that `word` names, from now on; return this value."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ClientPlan(CasePlan):
-    """The plan of a run against a client.
+    """The plan of a run against a client. Times are in seconds.
 
-    `timeout_s` is the client's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
-    the time until the client's first request.
+    `timeout_s` is the client's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s` the
+    longest time to wait for the client's first request.
     """
 
     at_most: Impact = Impact.DISRUPT
@@ -106,8 +108,8 @@ class ClientPlan(CasePlan):
 class ClientRun(Generic[C]):
     """One conformance test of a client.
 
-    `traits` are the features of the endpoint, for `framings` of cases; `silent` is a case that leaves a request
-    unanswered, which measures the client's timeout. `on_result` is called with each result.
+    `traits` are the features of the endpoint: a case runs if its `framings` contain one of them. `silent` is a case that
+    leaves a request unanswered, which measures the client's timeout. `on_result` is called with each result.
     """
 
     stage: HostileDevice[C]
@@ -235,7 +237,7 @@ class ClientRun(Generic[C]):
         return ""
 
     async def _well(self) -> bool:
-        """Wait until the client received correct answers and published their word; return whether both happened."""
+        """Wait until the client has received correct answers and published their value; return whether both happened in time."""
         since_ns = self.stage.now_ns()
         return await self._good_again(since_ns)
 
@@ -326,7 +328,7 @@ class ClientRun(Generic[C]):
         return await self._until(lambda: self.stage.recorder.count(ReplySent, since_ns) >= count, within_s)
 
     async def _until(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Wait for `condition` and return whether it holds; also end when the client has ended."""
+        """Wait at most `within_s` seconds for `condition`, or until the client has ended; return whether the condition holds."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + within_s
         while not condition():

@@ -36,9 +36,11 @@ LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:P
 class Options:
     """The options of a run.
 
-    `words`: the two correct ones and the poison. `probe`: as `RegisterProbe` reads it, ``output``, ``output:TEXT``, or
-    empty. `ascii`: the line carries Modbus ASCII. The fields from `objects` on are for CANopen only: fixed objects, the
-    size in bytes of all others, nodes that boot by themselves.
+    `words`: the values of the registers or objects: two correct ones, and one that the client must never publish (the
+    poison word). `probe`: an address for `RegisterProbe`, ``output``, ``output:TEXT``, or empty for no probe. `ascii`: the
+    line carries Modbus ASCII. The fields from `objects` to `bitrate` are for CANopen only: fixed objects, the size in bytes
+    of all others, the node IDs that send a boot-up message at the start, the heartbeat period, the bit rate. `command` is
+    the program under test.
     """
 
     listen: Endpoint
@@ -115,7 +117,10 @@ async def check_canopen_master(options: Options, listener: Listener) -> list[Cas
 async def _judged(
     run: ClientRun[C], options: Options, theirs: Endpoint, on_text: OnText, listener: Listener
 ) -> list[CaseResult]:
-    """Run the cases, with the program under test if there is one."""
+    """Run the cases, together with the program under test if the options name one.
+
+    `theirs` is the endpoint that the client opens, `on_text` receives the program's output.
+    """
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
@@ -155,7 +160,7 @@ async def _open(
 
 
 def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, OnText]:
-    """Return the probe, and the function that receives the program's output."""
+    """Return the probe, None if the options name none, and the function that receives the program's output."""
     if not options.probe:
         return None, lambda text, log: None
     kind, _, mark = options.probe.partition(":")

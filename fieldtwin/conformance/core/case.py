@@ -14,7 +14,7 @@ from fieldtwin.conformance.core.observation import Observation
 from fieldtwin.results.model import Verdict
 
 TRAIL_S = 0.3
-"""Default time that a case continues after the client has recovered, so that late effects are seen."""
+"""Default time in seconds that a case continues after the client has recovered, so that late effects are seen."""
 
 
 class Impact(Enum):
@@ -92,7 +92,7 @@ def inconclusive(reason: str) -> Finding:
 
 
 CheckFunction = Callable[[Observation], Finding]
-"""A function that checks a case. It is pure: the same observation always gives the same finding."""
+"""A function that checks a case. It depends on nothing else: the same observation always gives the same finding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +116,12 @@ class About:
 
     @property
     def row(self) -> str:
-        """Return the ID of the entry in the test-case list."""
+        """Return the ID of the entry in the test-case list: `id` without its letter."""
         return self.id.rstrip("abcdefgh")
 
     @property
     def role(self) -> str:
-        """Return the tested role."""
+        """Return the tested role: ``client``, or ``device`` for a case for devices."""
         return "client"
 
     @property

@@ -49,7 +49,10 @@ class Line:
 
 
 def lines(events: Iterable[Event], begun_ns: int) -> tuple[Line, ...]:
-    """Return all events of a case, the oldest first; beyond `MOST_LINES` the middle is replaced by one line."""
+    """Return all events of a case, the oldest first; beyond `MOST_LINES` one line replaces those in the middle.
+
+    The times of the lines count from `begun_ns`.
+    """
     found = [Line(round((e.t_ns - begun_ns) / NS_PER_MS, 3), *line_of(e)) for e in events]
     if len(found) <= MOST_LINES:
         return tuple(found)
@@ -95,7 +98,7 @@ def _request(asked: RequestSeen) -> str:
 
 
 def _abort(data: bytes) -> str:
-    """Return an SDO abort in words; "" for anything else. Some clients leave the multiplexer 0."""
+    """Return an SDO abort in words; "" for any other frame. Some clients send the multiplexer 0 for the open transfer."""
     if len(data) != 8 or data[0] != ABORT:
         return ""
     code = int.from_bytes(data[4:8], "little")

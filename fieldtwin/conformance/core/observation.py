@@ -1,4 +1,4 @@
-"""The observations of a case about the client under test: frames and times, and the published values. Plain values.
+"""The observations of a case about the client under test: frames, times, and the published values.
 
 Checks receive only an `Observation`, so that they can be tested without a connection.
 """
@@ -17,9 +17,8 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 class RequestSeen:
     """A whole request of the client.
 
-    `target` is the shape of a request: equal for one that is repeated (Modbus: unit ID and PDU; SDO: node ID and the
-    eight bytes). `tag` is the transaction ID, 0 where there is none. `frame` is the whole frame, in hex or in candump
-    format.
+    Requests with an equal `target` are repetitions of each other (Modbus: unit ID and PDU; SDO: node ID and the eight
+    bytes). `tag` is the transaction ID, 0 where there is none. `frame` is the whole frame, in hex or in candump format.
     """
 
     t_ns: int
@@ -49,7 +48,7 @@ class ReplySent:
 class Sent:
     """A frame of the client that expects no answer: NMT, SYNC, a PDO, an SDO abort.
 
-    `data` is two bytes of identifier (big-endian), then the frame's.
+    `data` is the CAN identifier in two bytes (big-endian), followed by the data bytes of the frame.
     """
 
     t_ns: int
@@ -68,8 +67,8 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class ObservedConnection:
-    """A connection of the client, numbered from 1. A serial line and a bus have one connection, which always exists. `by_us`:
-    the case removed the port and restored it.
+    """A connection of the client, numbered from 1. A serial line and a bus have one connection, which always exists.
+    `by_us`: the test case removed the port and restored it, so the client did not cause the new connection.
     """
 
     t_ns: int
@@ -137,12 +136,12 @@ class Habit:
 
 @dataclass(frozen=True)
 class Observation:
-    """One case.
+    """All that was observed in one test case. Times are in nanoseconds on the clock of the simulated device.
 
-    `begun_ns`: the first request that received a wrong reply; `over_ns`: the end of the device's last fault, after
-    which it replied correctly; `until_ns`: the end of the observation. `before` is the word that was held before,
-    `after` the one from `begun_ns` on, also in faulty frames if the client is to accept them, `last` the one from
-    `over_ns` on. `timeout_s`: the client's response timeout as stated by the user, 0 if not stated.
+    `begun_ns`: the first request that received a wrong reply; `over_ns`: the end of the device's last fault, after which it
+    replied correctly; `until_ns`: the end of the observation. `before` is the word that was held before, `after` the one
+    from `begun_ns` on, also in faulty frames if the client is to accept them, `last` the one from `over_ns` on.
+    `timeout_s`: the client's response timeout as stated by the user, 0 if not stated.
     """
 
     events: tuple[Event, ...]

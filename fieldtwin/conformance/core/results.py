@@ -140,7 +140,10 @@ def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, s
 def as_scenario(
     result: CaseResult, target: str, again: str, fail_on: frozenset[Basis], wire: str = "", evidence: Sequence[str] = ()
 ) -> ScenarioResult:
-    """Return a result for a build's test report. `again` is the command that repeats the case, `wire` its frames."""
+    """Return a result for a build's test report.
+
+    `again` is the command that repeats the case, `wire` are its frames as text, `evidence` its frames and events as lines.
+    """
     case = result.case
     verdict, reason = for_build(result, fail_on)
     checks = [CheckResult("1", f"{case.does}: {case.must}", verdict, expected=case.must, got=reason)]

@@ -11,8 +11,8 @@ from fieldtwin.conformance.devices.device_case import DeviceResult, Spoken
 class Checked:
     """The result of a check.
 
-    `identity` is the device's own identification, name to text; `before` are the frames before the first case, `took_s`
-    is the duration of the whole check.
+    `identity` is the device's own identification, name to text; `before` are the frames before the first case, `took_s` is
+    the duration of the whole check in seconds.
     """
 
     identity: dict[str, str]

@@ -1,4 +1,4 @@
-"""A case for a device, the frames exchanged in it, and its finding. It depends on no protocol.
+"""A case for a device, the frames exchanged in it, and its finding. This module does not depend on a protocol.
 
 A device is tested from outside, through its replies and its silence, as its client or master sees it.
 """
@@ -22,8 +22,8 @@ CaseProcedure = Callable[[W], Awaitable[Finding]]
 class DeviceCase(About, Generic[W]):
     """A case for devices.
 
-    `wires`: the transports on which the case applies; empty for all. `needs`: inputs that the user has to give for it
-    (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
+    `play` runs the case. `wires`: the transports on which the case applies; empty for all. `needs`: inputs that the user
+    has to give for it (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
     """
 
     play: CaseProcedure[W]
@@ -48,14 +48,14 @@ class Spoken:
 
 @dataclass(frozen=True, slots=True)
 class DeviceResult(CaseResult):
-    """The finding, and all frames of the case."""
+    """The finding of a device case, and all frames of the case."""
 
     spoken: tuple[Spoken, ...] = ()
 
 
 class NotHere(Exception):
-    """Raised inside a case if the device lacks the tested feature. The case is skipped with this reason."""
+    """Raised inside a case if the device lacks the tested feature. The case is skipped, with the message as the reason."""
 
 
 class Unsaid(Exception):
-    """Raised inside a case that cannot be decided from outside. The case is inconclusive for this reason."""
+    """Raised inside a case that cannot be decided from outside. The case is inconclusive, with the message as the reason."""

@@ -1,7 +1,7 @@
 """A dry run of a check, `--dry-run`, which shows the frames that would be sent.
 
-The check runs on a simulated device in memory, in virtual time. Nothing is opened. With a real device some frames differ,
-because the answers of the device decide how a case continues.
+The check runs on a simulated device in memory, in virtual time. No port, socket or bus is opened. With a real device some
+frames differ, because the answers of the device decide how a case continues.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def canopen_dry_run(options: CanopenOptions) -> Checked:
 
 
 def _sheet(options: CanopenOptions) -> str:
-    """Return the data sheet of a node with the mandatory objects, and those that may be written, as numbers."""
+    """Return the text of an EDS for a node with the mandatory objects, and with the objects that may be written, as numbers."""
     text = "[DeviceInfo]\nVendorName=paper\n"
     text += _var("1000", 7, "ro", "0x0") + _var("1001", 5, "ro", "0") + _var("1017", 6, "rw", "0")
     text += _var("1008", 9, "const", "a node of the dry run")

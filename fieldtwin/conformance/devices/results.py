@@ -15,11 +15,11 @@ from fieldtwin.results.subject import Subject
 
 KIND = "fieldtwin check"
 VERSION = 2
-"""2: each case has its `basis`, and `findings` counts the failures of each basis."""
+"""Version of the JSON document. 2: each case has its `basis`, and `findings` counts the failures of each basis."""
 
 
 def as_json(subject: Subject, results: Sequence[DeviceResult]) -> dict[str, Any]:
-    """Return the whole check; ``fieldtwin report`` reads it."""
+    """Return the whole check as data for JSON, which ``fieldtwin report`` reads."""
     cases = [case_json(r, "sent", wire=[_spoken_json(s) for s in r.spoken]) for r in results]
     return document(KIND, VERSION, subject.as_json(), results, cases)
 
@@ -35,7 +35,7 @@ def _spoken_json(spoken: Spoken) -> dict[str, Any]:
 def as_report(
     subject: Subject, results: Sequence[DeviceResult], reproduce: str, fail_on: frozenset[Basis] = ONLY_REQUIRED
 ) -> Report:
-    """Return the results as a JUnit report: a scenario for each case, with its bytes in the output."""
+    """Return the results as a JUnit report: a scenario for each case, with the bytes sent and received in its output."""
     scenarios = []
     for r in results:
         wire = "; ".join(f"{'>' if s.direction is Direction.SENT else '<'} {s.text}" for s in r.spoken)

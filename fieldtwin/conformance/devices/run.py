@@ -1,6 +1,7 @@
-"""Run the cases on a device, one after the other: before each the device must answer normally, and its recovery is checked.
+"""Run the cases on a device, one after the other. Before each case the device must answer normally; otherwise the case is
+inconclusive.
 
-This module depends on no protocol; a connection can be settled, and states its current impact level.
+This module does not depend on a protocol; it uses a connection through the interface `Settling`.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_SPOKEN = 400
-"""Maximum number of chunks or frames that are kept of a case; later ones are dropped."""
+"""Maximum number of chunks or frames of a case that are kept; later ones are dropped."""
 MOST_BYTES = 512
-"""Maximum number of bytes that are kept of one piece of received data."""
+"""Maximum number of bytes of one sent or received chunk that are kept."""
 MOST_LOST = 3
-"""Number of cases before which the device could not be recovered; then the run stops."""
+"""Number of consecutive cases before which the device could not be recovered; the remaining cases are then inconclusive."""
 
 
 class Settling(Protocol):
-    """The interface of a connection that a run of cases needs."""
+    """The interface of a connection that a run of cases needs: the permitted impact level, the features of the transport,
+    and `settle`, which restores normal operation and returns whether that succeeded.
+    """
 
     impact: Impact
     traits: frozenset[str]

@@ -53,7 +53,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, check: CheckFunction,
 RESTART_S = 2.0
 """Time within which a master has to notice that a node booted, and to start it."""
 SILENT = _case("CO-000", "no reply", ROBUST, "", READ, plays.nothing, checks.rejects, "is silent", "")
-"""A pseudo case, which is not in the test-case list: it measures the master's timeout."""
+"""A test case outside the test-case list: the node does not answer, which measures the master's SDO timeout."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
 DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 

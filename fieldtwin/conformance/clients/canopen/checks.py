@@ -1,4 +1,4 @@
-"""Checks that are specific to CANopen: aborts, NMT, SYNC. Pure functions of an `Observation`."""
+"""Checks that are specific to CANopen: aborts, NMT, SYNC. Each is a function of an `Observation` alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ BLOCK_UPLOAD = 5
 
 
 def aborts_with(code: int, *others: int) -> CheckFunction:
-    """Check that the master ends the transfer by the abort code `code` or one of `others`, which informs the node."""
+    """Return a check that the master ends the transfer with an SDO abort with `code` or one of `others`, which informs the
+    node.
+    """
 
     def aborted(seen: Observation) -> Finding | None:
         codes = [
@@ -47,7 +49,10 @@ completes = owes(_block_ended)
 
 
 def _noticed(seen: Observation) -> Finding | None:
-    """Check that a missing heartbeat has an effect on the published value or causes a command."""
+    """Check that the master notices a missing heartbeat: it publishes no value meanwhile, or sends an NMT command.
+
+    The result is inconclusive otherwise, because a master need not monitor heartbeats.
+    """
     if any(shown.word is Word.NONE for shown in seen.of(ValuePublished, seen.begun_ns, seen.over_ns)):
         return passed("it published no value meanwhile")
     if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
@@ -59,7 +64,9 @@ notices = owes(_noticed)
 
 
 def _unmoved(seen: Observation) -> Finding | None:
-    """Check that a heartbeat that is slightly late has no effect: no command is sent and no value disappears."""
+    """Check that a heartbeat that is slightly late has no effect: the master sends no command and continues to publish the
+    value.
+    """
     moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
     if moved or any(shown.word is Word.NONE for shown in seen.of(ValuePublished, seen.begun_ns)):
         return inconclusive("it treated the node as lost: correct only if its consumer time is shorter")
@@ -70,7 +77,10 @@ is_unmoved = owes(_unmoved)
 
 
 def _waits_for_each(seen: Observation) -> Finding | None:
-    """Check that the master repeated no request before its answer. Every answer came within the timeout of its own request."""
+    """Check that the master did not repeat a request before the answer to it arrived.
+
+    In this test case every answer arrives within the timeout of its request.
+    """
     asked = list(seen.of(RequestSeen, seen.begun_ns, seen.over_ns))
     for one, following in pairwise(asked):
         told = next(seen.of(ReplySent, one.t_ns, seen.over_ns), None)
@@ -90,10 +100,10 @@ waits_for_each = owes(_waits_for_each)
 
 
 def takes_the_switch(seen: Observation) -> Finding:
-    """Apply the check `accepts` if the client allows the change from a block upload to an ordinary one.
+    """Apply the check `accepts` if the client permits the node to answer a block upload request with an ordinary upload.
 
-    A client that sends a protocol switch threshold of 0 forbids it (7.2.4.3.13). It may refuse each such reply; only a
-    wrong value would be a failure.
+    A client that sends a protocol switch threshold of 0 forbids this (7.2.4.3.13). It may then refuse each such reply; only
+    a wrong published value is a failure.
     """
     found = accepts(seen)
     first = next(seen.of(RequestSeen, seen.begun_ns), None)
@@ -118,7 +128,7 @@ def _one_a_block(seen: Observation) -> Finding | None:
 
 BLOCK_ACKNOWLEDGED = 0xA2
 _OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
-"""First bytes of the node's frames that are not segments of a block upload: an initiate, an end and an abort."""
+"""First bytes of the node's block upload frames that are not segments: the initiate response, the end and the abort."""
 one_a_block = owes(_one_a_block)
 
 

@@ -1,7 +1,8 @@
-"""The correct CANopen nodes, from which the hostile node derives its replies. Every object exists and holds one word, and
-every node answers SDO.
+"""The correct CANopen nodes, from whose replies the hostile node derives its own. Every object exists and reads as the same
+test value (a word), except for a few fixed objects; every node has an SDO server.
 
-Pure: frames and `now` in, frames out. A node is created by the first request or command to it.
+The module does no I/O and reads no clock: its functions receive frames and the present time, and return frames. The first
+request or command to a node ID creates the node.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from fieldtwin.emulators.canopen.sdo.server import SdoServer
 
 TIMEOUT_NS = 2_000_000_000
 LONG_BYTES = 1000
-"""Number of bytes of a block upload, which repeat the word. They need two sub-blocks."""
+"""Length in bytes of the value of a block upload: the word is repeated to fill it. It needs two sub-blocks."""
 BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x00, 0x7F, 0x05, 0x04
 _STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
 _RESETS = frozenset({0x81, 0x82})
@@ -50,19 +51,21 @@ class HonestNode:
         self._server = SdoServer(self.objects, TIMEOUT_NS)
 
     def answer(self, request: bytes, now_ns: int) -> list[bytes]:
-        """Return the SDO replies, several for a sub-block; none while STOPPED."""
+        """Return the SDO replies to a request: several frames for a sub-block of a block upload, none while the node is
+        STOPPED.
+        """
         if self.state == STOPPED:
             return []
         self.objects.long = request[0] >> 5 == 5
         return self._server.request(request, now_ns)
 
     def acknowledge(self, now_ns: int) -> list[bytes]:
-        """Return the acknowledgement of the received part of a sub-block of a block download before its end."""
+        """Return the acknowledgement of the segments received so far, before the sub-block of a block download is complete."""
         return self._server.tick(now_ns + TIMEOUT_NS // 2)
 
     @property
     def receiving(self) -> bool:
-        """Return whether frames are segments of a block download now, whatever their content."""
+        """Return whether a sub-block of a block download is in progress, so that every SDO frame is a segment of it."""
         return self._server.in_sub_block
 
     def poisoned(self, request: bytes, poison: int) -> bytes:
@@ -74,7 +77,7 @@ class HonestNode:
         )
 
     def command(self, specifier: int) -> bool:
-        """Execute an NMT command; return True when a boot-up message is due."""
+        """Execute the NMT command `specifier`; return True if the node then has to send a boot-up message."""
         if specifier in _RESETS:
             self.state = PRE_OPERATIONAL
             self._server.reset()

@@ -1,6 +1,6 @@
-"""The bus that a CANopen master under test joins: correct nodes, until a case begins.
+"""The simulated CANopen nodes with which a master under test communicates. They answer correctly until a test case begins.
 
-It records everything without a verdict.
+The module records all frames and gives no verdict.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ MASTER = 1
 
 
 class HostileNode:
-    """The CANopen counterpart of `fieldtwin.conformance.clients.modbus.hostile_server.HostileServer`.
+    """All simulated nodes of a test: the counterpart of
+    `fieldtwin.conformance.clients.modbus.hostile_server.HostileServer`.
 
-    `size` is the number of bytes of an object, `heartbeat_s` the heartbeat period of known nodes (0: none), `nodes` are
-    those that boot by themselves.
+    `size` is the number of bytes of an object, `heartbeat_s` the heartbeat period in seconds (0: no heartbeat). `nodes` are
+    the node IDs that exist from the start and send a boot-up message; the first request to any other node ID creates that
+    node.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class HostileNode:
         return round(self._loop.time() * NS_PER_S)
 
     def hold(self, word: Word) -> int:
-        """Make all objects hold that word from now on; return its number."""
+        """Let all objects hold the correct value that `word` names, from now on; return this value."""
         self._word = self._words[0] if word is Word.FIRST else self._words[1]
         for node in self._nodes.values():
             node.objects.word = self._word
@@ -79,7 +81,7 @@ class HostileNode:
         self._case = None
 
     async def serve(self, connection: CanConnection) -> None:
-        """Serve until the bus is lost."""
+        """Serve the nodes on a CAN bus until the bus is lost."""
         self._connection = connection
         async with Nursery() as nursery:
             self._nursery = nursery
@@ -140,7 +142,7 @@ class HostileNode:
         self._send(case.play(scene), now_ns)
 
     def _missed(self, segment: bytes) -> bool:
-        """Return whether the node ignores this segment of a block download."""
+        """Return whether the test case makes the node ignore this segment of a block download, as if it were lost."""
         case, memory = self._playing, self._memory
         if case is None or memory is None or not (case.misses or case.early):
             return False
@@ -151,7 +153,9 @@ class HostileNode:
         return memory["segments"] == case.misses
 
     def _early(self, server: HonestNode, now_ns: int) -> list[bytes]:
-        """Return the acknowledgement of a sub-block before its end."""
+        """Return the acknowledgement that the test case sends before the end of a sub-block; empty if none is due after
+        this segment.
+        """
         case, memory = self._playing, self._memory
         if case is None or memory is None or not case.early or memory.get("segments") != case.early:
             return []
@@ -159,10 +163,11 @@ class HostileNode:
         return server.acknowledge(now_ns)
 
     def _word_for(self, played: bool) -> int:
-        """Return the word for a transfer.
+        """Return the value that the objects hold during a transfer; `played` tells whether the transfer belongs to the test
+        case.
 
-        While faulty frames hold the correct word, other transfers keep the previous one, so that only the faulty ones
-        provide it.
+        In a test case whose faulty frames carry the new correct value (`holds_good`), all other transfers still carry the
+        previous value, so that the client can know the new value only from the faulty frames.
         """
         if self._case is not None and self._case.holds_good and not played:
             return self._words[1] if self._word == self._words[0] else self._words[0]
@@ -171,7 +176,8 @@ class HostileNode:
     def _begun(self, node: int, request: bytes, now_ns: int) -> dict[str, int] | None:
         """Begin a transfer.
 
-        Return the memory of its replies if it belongs to the case, which continues to the transfer's end.
+        If the transfer belongs to the test case, return the memory for its replies, which lasts until the transfer ends;
+        otherwise return None.
         """
         self._playing = case = self._case
         if case is None or self.struck >= self.strikes:
@@ -284,7 +290,7 @@ class HostileNode:
 
 
 def _opens(request: bytes) -> bool:
-    """Return whether a request begins a transfer that a case may use."""
+    """Return whether a request begins an SDO transfer on which a test case may act."""
     command = request[0] >> 5
     if command == BLOCK_UPLOAD:
         return request[0] & 3 == 0

@@ -1,4 +1,7 @@
-"""The replies of a hostile CANopen node (CiA 301 v4.2, 7.2.4 for SDO). Pure: a request in, frames out."""
+"""The replies of a hostile CANopen node (CiA 301 v4.2, 7.2.4 for SDO).
+
+Each function takes a request (`SdoRequestContext`) and returns the frames to send. It does no I/O.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ PRE_OPERATIONAL = 0x7F
 LATE = 1.5
 STORM = range(100, 120)
 SLOW = 0.35
-"""The part of a timeout that each step of a slow transfer takes. No single step exceeds the timeout, but all steps together
-do.
+"""Delay of each step of a slow transfer, as a fraction of the client's timeout. No single step exceeds the timeout, but all
+steps together do.
 """
 
 
@@ -66,8 +69,8 @@ def wrong_crc(scene: SdoRequestContext) -> list[SendFrame]:
 
 
 def loses(at: int) -> SdoReplyFunction:
-    """Block upload: lose one segment once. A positive index `at` loses it from a full sub-block, a negative one from a shorter
-    last one.
+    """Return a reply function that omits one segment of a block upload once. A positive index `at` (from 0) omits it from a
+    full sub-block, a negative one, counted from the end, from a shorter last sub-block.
     """
 
     def play(scene: SdoRequestContext) -> list[SendFrame]:
@@ -101,7 +104,7 @@ def flood(scene: SdoRequestContext) -> list[SendFrame]:
 
 
 def short(scene: SdoRequestContext) -> list[SendFrame]:
-    """Send only the bytes of the reply that carry data."""
+    """Send a reply shorter than 8 bytes: without its unused bytes, or without its last byte if all are used."""
     if not scene.opens:
         return scene.honest()
     used = 4 + (4 - (scene.true[0][0] >> 2 & 3))
@@ -145,7 +148,7 @@ def extended(scene: SdoRequestContext) -> list[SendFrame]:
 
 
 def honest(scene: SdoRequestContext) -> list[SendFrame]:
-    """Reply correctly. The case consists of frames that the node ignores or does not send."""
+    """Reply correctly. The fault of the test case consists of frames that the node ignores or does not send."""
     return [scene.reply(data) for data in scene.true]
 
 
@@ -170,7 +173,7 @@ def refuses_crc(scene: SdoRequestContext) -> list[SendFrame]:
 
 
 def unanswered(scene: SdoRequestContext) -> list[SendFrame]:
-    """Lose the reply, or the request, on the bus."""
+    """Send no reply, as if the request or the reply had been lost on the bus."""
     return []
 
 

@@ -1,4 +1,4 @@
-"""The inputs of a CANopen reply function, and the CANopen test case. Pure."""
+"""The inputs of a CANopen reply function, the frames that it returns, and the CANopen test case."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SdoRequestContext:
     memory: dict[str, int] = field(default_factory=dict)
 
     def reply(self, data: bytes, after_s: float = 0.0, *, good: bool = False) -> SendFrame:
-        """Return an SDO reply of this node."""
+        """Return an SDO reply of this node, to be sent `after_s` seconds after the request; `good` marks it as correct."""
         return SendFrame(CanFrame(SDO_REPLY + self.node, data), after_s, good)
 
     def honest(self, after_s: float = 0.0) -> list[SendFrame]:
@@ -49,7 +49,7 @@ class SdoRequestContext:
         return [self.reply(data, after_s, good=True) for data in self.true]
 
     def frame(self, base: int, data: bytes) -> SendFrame:
-        """Return a frame with an identifier of the predefined connection set."""
+        """Return a frame with an identifier of the predefined connection set: `base` plus the node ID."""
         return SendFrame(CanFrame(base + self.node, data))
 
 
@@ -61,10 +61,11 @@ CanWants = Literal["upload", "download", "block upload", "block download", "guar
 class CanopenCase:
     """The CANopen counterpart of `fieldtwin.conformance.clients.modbus.setup.ModbusCase`, for SDO transfers.
 
-    `misses`: the segment of a block download that the node ignores, 0 for none; `early`: the segment after which it
-    acknowledges the sub-block although more follow; `mutes`: the messages that the node omits for `mute_s` from the
-    first strike on: ``heartbeat``, ``all``, or ``sdo``, as if STOPPED; `boots`: it boots afterwards; `beat_late_s`: the
-    delay of its next heartbeat.
+    `misses`: number of the segment of a block download that the node ignores, 0 for none; `early`: number of the segment
+    after which the node acknowledges the sub-block although more segments follow, 0 for none; `mutes`: the messages that
+    the node does not send for `mute_s` seconds, from its first faulty reply on: ``heartbeat``, ``all``, or ``sdo``, as if
+    it were STOPPED; `boots`: the node sends a boot-up message afterwards; `beat_late_s`: the delay in seconds of the node's
+    next heartbeat.
     """
 
     about: ClientCase

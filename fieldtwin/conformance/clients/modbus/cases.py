@@ -68,7 +68,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, check: CheckFunction,
 
 
 SILENT = _bad("MB-000", "no reply", ROBUST, "", line_plays.nothing, "is silent")
-"""A pseudo case, which is not in the test-case list: it measures the client's timeout."""
+"""A test case outside the test-case list: the server does not answer, which measures the client's timeout."""
 
 CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", REQUIRED, "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),

@@ -1,6 +1,7 @@
-"""The endpoint of a Modbus client under test: it replies correctly until a case begins.
+"""The simulated Modbus server to which a client under test connects. It replies correctly until a test case begins.
 
-It records everything without a verdict. It handles connections and time, and does not depend on specific cases.
+It records all requests and replies, and gives no verdict. It handles connections and time, and does not depend on specific
+cases.
 """
 
 from __future__ import annotations
@@ -40,14 +41,15 @@ from fieldtwin.gateway.core.errors import ConnectionLost
 BEHIND_S = 0.050
 """Minimum time in seconds between a faulty answer and the next correct one."""
 LINE_GAP_S = 0.060
-"""Pause that ends a frame on a line; an incomplete frame is garbage then."""
+"""Pause in seconds that ends a frame on a serial line; an incomplete frame then counts as garbage."""
 
 
 class HostileServer:
-    """A server for every client of the endpoint. `play` is the current case; None: all requests are answered correctly.
+    """The Modbus server for all clients of an endpoint. `play` is the current case; None: all requests are answered
+    correctly.
 
-    `struck` counts wrong replies, `first_ns` is the time of the first one, `last_ns` that of the last fault; `pending`
-    is the number of steps that wait for their time.
+    `struck` counts wrong replies of the case, `first_ns` is the time of the first one, `last_ns` that of the last fault;
+    `pending` is the number of steps that are scheduled but not yet executed.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class HostileServer:
         return round(self._loop.time() * NS_PER_S)
 
     def hold(self, word: Word) -> int:
-        """Make all registers and bits hold that word from now on; return its number."""
+        """Let all registers and bits hold the correct value that `word` names, from now on; return this value."""
         self.device.word = self.first_word if word is Word.FIRST else self.second_word
         return self.device.word
 
@@ -104,7 +106,7 @@ class HostileServer:
         self.on_event()
 
     def steps(self, wire: ModbusWire, request: bytes, tag: int, now_ns: int) -> list[ServerStep]:
-        """Return the steps for a request received at `now_ns`: a correct reply, or that of the case."""
+        """Return the steps for a request received at `now_ns`: those of a correct reply, or those of the test case."""
         true = self.device.answer(request[1:], now_ns)
         case = self.play
         if request[0] == 0 and not isinstance(wire, MbapWire):
@@ -161,7 +163,7 @@ class _Client:
                 self._stage.note(Garbled(now_ns, self._number, data[-garbage:]))
 
     async def _next(self) -> bytes:
-        """Return the next bytes, or none after a pause on a line, which ends an incomplete frame."""
+        """Return the next bytes; on a serial line return b'' after a pause of `LINE_GAP_S`, which ends an incomplete frame."""
         if not self._dirty or isinstance(self._wire, MbapWire):
             return await self._connection.read()
         try:

@@ -1,4 +1,7 @@
-"""The replies of the hostile device on any framing, and on serial lines. Pure: a request in, steps out."""
+"""The replies of the hostile device that are possible on any framing, and those on serial lines only.
+
+Each function takes a request (`RequestContext`) and returns the steps of the device. It does no I/O.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,13 @@ from fieldtwin.emulators.modbus.rtu.receiver import with_crc
 SPLIT_S = 0.016
 """Time in seconds between the two halves of a split frame: the latency timer of a common USB adapter."""
 OURS_AFTER_S = (0.020, 0.040, 0.010, 0.030)
-"""Delays in seconds of this unit's reply after that of another unit."""
+"""Delays in seconds between a different unit's reply and the reply of the requested unit; successive requests use them in
+turn.
+"""
 LATER = 0.5
-"""Delay in timeouts, after the request, of the second exception frame of MB-021."""
+"""Delay of the second exception frame of MB-021 after its request, as a fraction of the client's timeout."""
 LATE = 1.5
-"""Number of timeouts after the request at which a late reply is sent."""
+"""Delay of a late reply after its request, as a multiple of the client's timeout."""
 
 
 def nothing(scene: RequestContext) -> list[ServerStep]:
@@ -87,7 +92,9 @@ def other_unit(scene: RequestContext) -> list[ServerStep]:
 
 
 def other_unit_first(scene: RequestContext) -> list[ServerStep]:
-    """Reply after another unit's reply, with a changing delay, so that no pause of the client hides its reaction."""
+    """Send a different unit's reply, and after it the requested unit's reply. The delay between them changes with each
+    request, so that a fixed pause of the client cannot hide its reaction.
+    """
     after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
     return [SendBytes(scene.from_unit(scene.neighbour, scene.false)), SendBytes(scene.frame(scene.true), after_s)]
 

@@ -20,8 +20,9 @@ with suppress(ImportError):  # Windows has no pseudo-terminals
 
 
 class PtyLine:
-    """The virtual port with its server. Create it with ``line = await PtyLine.open(listen, stage)``, serve with ``await
-    line.run()`` until cancelled, and end it with ``await line.aclose()``."""
+    """The virtual port of a client under test, on which the server `stage` answers. Create it with ``line = await
+    PtyLine.open(listen, stage)``, serve with ``await line.run()`` until cancelled, and end it with ``await line.aclose()``.
+    """
 
     def __init__(self, listen: Endpoint, stage: HostileServer, port: ByteConnection, named: Endpoint) -> None:
         self.named = named
@@ -38,9 +39,9 @@ class PtyLine:
 
     @staticmethod
     def traits() -> frozenset[str]:
-        """Return the features that a case may need.
+        """Return the features of this kind of port that a case may need (see `ModbusCase.framings`).
 
-        A port that is held exclusively (tty_ioctl(4), TIOCEXCL) still opens for root.
+        Root has no ``lock``: a port that is held exclusively (tty_ioctl(4), TIOCEXCL) still opens for root.
         """
         return frozenset({"port"} if os.geteuid() == 0 else {"port", "lock"})
 
@@ -67,7 +68,7 @@ class PtyLine:
         await self._port.aclose()
 
     def _unplug(self, step: Unplug) -> None:
-        """Stop serving the client; `run` notices it."""
+        """Stop serving the client, so that `run` removes the port and restores it as `step` states."""
         self._stage.pending += 1
         self._unplugged = step
         self._closing = asyncio.get_running_loop().create_task(self._port.aclose(), name="unplugging")

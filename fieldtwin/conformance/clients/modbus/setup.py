@@ -1,4 +1,4 @@
-"""The inputs and results of a reply function: the request, correct and false answers to it, and the steps of the device. Pure."""
+"""The inputs and results of a reply function: the request, correct and false answers to it, and the steps of the device."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class HangUp:
 
 @dataclass(frozen=True, slots=True)
 class GoSilent:
-    """A step of a hostile server: leave the connection open, and send nothing on it any more."""
+    """A step of a hostile server: leave the connection open, and send nothing more on it."""
 
     after_s: float = 0.0
 
@@ -104,11 +104,11 @@ Wants = Literal["register read", "read", "write", "read of several", "request to
 class ModbusCase:
     """A case with its reply function.
 
-    `strikes` requests receive a wrong reply; `holds_good`: the faulty frames hold the correct word, and continue until
-    it was seen. `framings` lists the endpoints on which the case is possible (``rtu``, ``ascii``, ``tcp``; ``stream``
-    for those that can be closed, ``port`` for those that can be unplugged, ``lock`` for those that can be held).
-    `needs` names an option without which the case makes no sense; `trail_s` is the time that the case continues after
-    the recovery.
+    `strikes` requests receive a wrong reply; `holds_good`: the faulty frames hold the correct word, and continue until the
+    client has published it. `framings` lists the endpoints on which the case is possible (``rtu``, ``ascii``, ``tcp``;
+    ``stream`` for those that can be closed, ``port`` for those that can be unplugged, ``lock`` for those that can be held).
+    `needs` names an option without which the case makes no sense; `trail_s` is the time in seconds that the case continues
+    after the recovery.
     """
 
     about: ClientCase
@@ -120,7 +120,7 @@ class ModbusCase:
     needs: str = ""
     trail_s: float = TRAIL_S
     least: int = 1
-    """Minimum number of requests that receive a wrong reply, even if the correct word was seen before."""
+    """Minimum number of requests that receive a wrong reply, even if the client has published the correct word before."""
 
     def on(self, **changes: object) -> ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]

@@ -1,4 +1,7 @@
-"""The replies of the hostile device on TCP only. Pure: a request in, steps out."""
+"""The replies of the hostile device that are possible on TCP only.
+
+Each function takes a request (`RequestContext`) and returns the steps of the device. It does no I/O.
+"""
 
 from __future__ import annotations
 

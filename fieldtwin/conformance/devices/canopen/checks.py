@@ -16,7 +16,9 @@ def aborted(reply: SdoReply, *codes: int) -> str:
 
 
 async def verdict(wire: NodeConnection, wrong: str, good: str = "") -> Finding:
-    """Return FAILED for an error in `wrong`, or if the node does not recover afterwards; else PASSED."""
+    """Return FAILED if `wrong` describes an error or the node does not recover afterwards; else PASSED, with `good` as the
+    reason.
+    """
     if wrong:
         return failed(wrong)
     after = await wire.still_good()
@@ -32,7 +34,7 @@ async def must_abort(wire: NodeConnection, request: bytes, *codes: int) -> Findi
 
 
 async def long_object(wire: NodeConnection) -> Key:
-    """Return an object of at least two segments, after its first reply was received. Raises `NotHere`."""
+    """Return an object whose upload needs at least two segments. Raises `NotHere` if the check has found none."""
     if wire.long is None:
         raise NotHere("no object of more than 7 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
     return wire.long

@@ -1,8 +1,8 @@
-"""The connection of a check to a CAN bus. It sends any frame, receives every frame of the node, and sends SDO requests byte by
-byte.
+"""The connection of a check to a CAN bus. It sends any frame, receives every frame of the bus, and sends SDO requests byte
+by byte.
 
-It must not depend on the purpose of a case. It sends only frames that the case's impact level permits: reading means
-uploads, however unusual. Clauses are CiA 301's.
+This module does not know the purpose of a case. It sends only frames that the case's impact level permits: at the level
+READ these are uploads, however unusual. Clauses are CiA 301's.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def shown(key: Key) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SdoReply:
-    """The reply of the node's SDO server: `data` is the frame's, empty for silence."""
+    """The reply of the node's SDO server: `data` are the data bytes of the frame, empty if no reply arrived."""
 
     data: bytes = b""
 
@@ -118,7 +118,7 @@ class NodeConnection:
         raise Bug(f"a check with impact level {self.impact.value} would send {frame}")
 
     async def hear(self, cob_id: int, within_s: float | None = None, *, remote: bool = False) -> CanFrame | None:
-        """Return the next frame with that identifier, None if none came in time; other frames are kept for `seen`."""
+        """Return the next frame with that identifier, None if none arrived in time; the default of `within_s` is the timeout."""
         try:
             async with asyncio.timeout(self.timeout_s if within_s is None else within_s):
                 while True:
@@ -175,7 +175,7 @@ class NodeConnection:
         return await self.reply(within_s)
 
     async def reply(self, within_s: float | None = None) -> SdoReply:
-        """Return the next frame of the server."""
+        """Return the next frame of the node's SDO server; its data is empty if none arrives in time."""
         frame = await self.hear(SDO_REPLY + self.node, within_s)
         return SdoReply(frame.data if frame is not None else b"")
 
@@ -184,7 +184,7 @@ class NodeConnection:
         await self.send_sdo(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
     async def upload(self, key: Key) -> bytes | SdoReply:
-        """Return the value by an ordinary upload, or the reply that ended a failed upload."""
+        """Upload an object expedited or in segments; return its value, or the reply with which the upload failed."""
         reply = await self.ask(b"\x40" + mux(*key))
         if reply.specifier != 2 or reply.data[1:4] != mux(*key):
             return reply
@@ -204,7 +204,7 @@ class NodeConnection:
         return value
 
     async def download(self, key: Key, value: bytes) -> SdoReply:
-        """Make an ordinary download; return the last reply."""
+        """Download an object expedited or in segments; return the last reply."""
         if 0 < len(value) <= 4:
             return await self.ask(bytes((0x23 | (4 - len(value)) << 2,)) + mux(*key) + value)
         reply = await self.ask(b"\x21" + mux(*key) + len(value).to_bytes(4, "little"))
@@ -237,14 +237,14 @@ class NodeConnection:
     # -- normal behaviour --------------------------------------------------------------------------------------------
 
     async def still_good(self) -> str:
-        """Return an empty string when 1000h is answered as before, else a description of the reply."""
+        """Return an empty string if the node still returns the same value for object 1000h, else a description of the reply."""
         found = await self.upload((0x1000, 0))
         if found == self.device_type:
             return ""
         return str(found) if isinstance(found, SdoReply) else f"1000h is {found.hex(' ').upper()}"
 
     async def settle(self) -> bool:
-        """End any open transfer, and return whether the node answers normally."""
+        """End any open SDO transfer, and return whether the node then answers normally."""
         for attempt in range(3):
             try:
                 await self.abandon((0x1000, 0))

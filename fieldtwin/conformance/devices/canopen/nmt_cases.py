@@ -1,6 +1,6 @@
 """Cases of NMT, error control and LSS: they stop the node, restart it, or send to other nodes on the bus as well.
 
-The user who runs them has stopped the plant. A node that was OPERATIONAL is started again after each. Clauses are CiA
+The user who runs them has stopped the plant. After each case a node that was OPERATIONAL is started again. Clauses are CiA
 301's.
 """
 
@@ -32,7 +32,7 @@ NAMES = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-O
 
 @asynccontextmanager
 async def _restored(wire: NodeConnection) -> AsyncIterator[None]:
-    """Restore the node's NMT state afterwards; PRE-OPERATIONAL if it was never reported."""
+    """Restore the node's present NMT state at the end; PRE-OPERATIONAL if the node never reported its state."""
     before = wire.state
     try:
         yield

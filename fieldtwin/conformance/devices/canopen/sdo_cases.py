@@ -26,7 +26,7 @@ COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
 
 
 async def toggle_repeated(wire: NodeConnection) -> Finding:
-    """CO-001: repeat the toggle bit in the second segment; afterwards there is no transfer that could continue."""
+    """CO-001: repeat the toggle bit in the second segment. The node must abort, and must not continue the transfer afterwards."""
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
     repeated = await wire.ask(b"\x60")
@@ -124,7 +124,7 @@ async def empty_history(wire: NodeConnection) -> Finding:
 
 
 async def short_request(wire: NodeConnection) -> Finding:
-    """CO-026: send an upload request of 4 bytes, which is ignored or optionally accepted."""
+    """CO-026: send an upload request of 4 bytes. The node may ignore it or answer it."""
     wire.forget()
     await wire.send_sdo(b"\x40" + mux(0x1000))
     reply = await wire.reply()
@@ -134,7 +134,7 @@ async def short_request(wire: NodeConnection) -> Finding:
 
 
 async def extended_identifier(wire: NodeConnection) -> Finding:
-    """CO-060: send an upload request with a 29-bit identifier of the same number."""
+    """CO-060: send an upload request with a 29-bit identifier of the same value. The node must not answer."""
     wire.forget()
     await wire.send(CanFrame(SDO_REQUEST + wire.node, (b"\x40" + mux(0x1000)).ljust(8, b"\0"), extended=True))
     reply = await wire.reply()
@@ -149,7 +149,7 @@ async def _begin_block(wire: NodeConnection, key: Key, size: int, switch: int = 
 
 
 async def _must_have_blocks(wire: NodeConnection, key: Key) -> None:
-    """Check that the node uploads `key` as a block, and abandon the transfer. Raises `NotHere` otherwise."""
+    """Check that the node uploads `key` as a block, and then abort the transfer. Raises `NotHere` if the node does not."""
     reply = await _begin_block(wire, key, 127)
     if reply.specifier == 6:
         await wire.abandon(key)
@@ -197,7 +197,10 @@ async def block_size_128(wire: NodeConnection) -> Finding:
 
 
 async def _block(wire: NodeConnection, size: int) -> list[bytes] | str:
-    """Return the segments of one sub-block, or a description of the reply if it is not a segment."""
+    """Return the segments of one sub-block of at most `size` segments.
+
+    If a reply is not the expected segment, return a description of it instead.
+    """
     segments: list[bytes] = []
     while len(segments) < size:
         reply = await wire.reply()
@@ -210,10 +213,10 @@ async def _block(wire: NodeConnection, size: int) -> list[bytes] | str:
 
 
 async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool) -> tuple[bytes, str]:
-    """Make a whole block upload; return the value and any error.
+    """Make a block upload up to its end frame; return the value, and a description of any error, empty if there was none.
 
-    With `lose`, the first sub-block is acknowledged only up to its last but one segment. The upload is not ended: the server's
-    last frame was received, and the client's confirmation was not sent.
+    With `lose`, the first sub-block is acknowledged only up to its last but one segment. The client's confirmation of the
+    end frame is left to the caller.
     """
     begun = await _begin_block(wire, key, size)
     if begun.specifier != 6:

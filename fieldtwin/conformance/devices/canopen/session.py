@@ -1,4 +1,4 @@
-"""A complete check of a CANopen node: listen, learn, read its identity, run the cases."""
+"""A complete check of a CANopen node: listen to the bus, read the node's identity, find a long object, run the cases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fieldtwin.gateway.wallclock import WallClock
 NAMES = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}
 NUMBERS = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}
 LISTEN_S = 0.5
-"""Time in seconds of listening before anything is sent: a heartbeat states the node's state."""
+"""Time in seconds for which the check listens before it sends anything: a heartbeat in this time reports the node's NMT state."""
 MOST_LONG = 20
 """Largest number of objects of the EDS that are read to find one with more than one segment."""
 
@@ -33,7 +33,8 @@ MOST_LONG = 20
 class CanopenOptions:
     """The options of a check: `may_write` are objects that may be written temporarily; `go_on` as in `ModbusOptions`.
 
-    Nothing is sent if another master exchanges SDOs with the node, unless `share_bus`: its transfers would be broken.
+    Nothing is sent if another master exchanges SDOs with the node, unless `share_bus`, because the check would disturb the
+    transfers of that master.
     """
 
     endpoint: str
@@ -53,7 +54,9 @@ class CanopenOptions:
 
 
 class _OfTheNode(Transcript):
-    """A filter that passes the frames of the node, because other nodes also send on the bus."""
+    """A transcript of the frames that the check sends and of those from the node, without the frames of other nodes on the
+    bus.
+    """
 
     def __init__(self, clock: Clock, node: int) -> None:
         super().__init__(clock)
@@ -71,7 +74,7 @@ async def check_canopen(
 ) -> Checked:
     """Run the whole check.
 
-    Raises `Unreachable` without an answer, `NotAllowed` if another master exchanges SDOs with the node.
+    Raises `Unreachable` if the node does not answer, `NotAllowed` if another master exchanges SDOs with the node.
     """
     dictionary = load_dictionary(options.eds, options.node) if options.eds is not None else None
     clock = options.clock or WallClock()
@@ -98,7 +101,7 @@ async def check_canopen(
 
 
 async def learn(wire: NodeConnection) -> dict[str, str]:
-    """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
+    """Read the device type and identity, and find an object of several segments. Raises `Unreachable` if 1000h cannot be read."""
     found: bytes | SdoReply = SdoReply()
     for _ in range(2):  # a single missing answer may be caused by a lost frame
         found = await wire.upload((0x1000, 0))
@@ -129,7 +132,7 @@ async def learn(wire: NodeConnection) -> dict[str, str]:
 
 
 async def _long_by_eds(wire: NodeConnection) -> Key | None:
-    """Return an object of the EDS that holds more than 7 bytes."""
+    """Return an object of the EDS that holds more than 7 bytes, None if none was found."""
     texts = [e for e in wire.dictionary or () if e.readable and e.type_code in (0x09, 0x0A, 0x0B, 0x0F)]
     for entry in texts[:MOST_LONG]:
         key = (entry.index, entry.subindex)

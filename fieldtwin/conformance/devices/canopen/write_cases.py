@@ -1,4 +1,5 @@
-"""Cases of SDO downloads: to objects that must refuse, and to those that the user gave, whose values are restored.
+"""Cases of SDO downloads: to objects that the node must not accept, and to objects that the user named for writing, whose
+values are restored.
 
 Clauses are CiA 301's.
 """
@@ -26,7 +27,7 @@ ANY_LENGTH = frozenset({DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType
 
 @asynccontextmanager
 async def _borrowed(wire: NodeConnection, key: Key) -> AsyncIterator[bytes]:
-    """Yield the object's value, and restore it. Raises `Unsaid` where that failed."""
+    """Yield the object's value, and restore it afterwards. Raises `Unsaid` if it cannot be restored."""
     before = await present(wire, key)
     try:
         yield before
@@ -51,9 +52,10 @@ async def _unchanged(wire: NodeConnection, key: Key, before: bytes, wrong: str) 
 
 
 async def _number(wire: NodeConnection) -> tuple[Key, bytes]:
-    """Return the first given object that is a number of 1, 2 or 4 bytes; 1017h only if there is no other.
+    """Return the first of the objects to write that is a number of 1, 2 or 4 bytes, with its value; 1017h only if there is
+    no other.
 
-    Raises `NotHere` with the reason for each given object.
+    Raises `NotHere`, with the reason for each of these objects.
     """
     why_not = []
     for key in sorted(wire.may_write, key=lambda key: key == (0x1017, 0)):
@@ -69,7 +71,10 @@ async def _number(wire: NodeConnection) -> tuple[Key, bytes]:
 
 
 async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
-    """Return the first given object of more than 14 bytes: three segments. Raises `NotHere`, as `_number`."""
+    """Return the first of the objects to write that has more than 14 bytes (three segments), with its value.
+
+    Raises `NotHere`, with the reason for each of these objects.
+    """
     why_not = []
     for key in wire.may_write:
         value = await wire.upload(key)
@@ -80,7 +85,7 @@ async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
 
 
 def _instead(key: Key, value: bytes | SdoReply) -> str:
-    """Return the reason why a case cannot use an object that the user gave."""
+    """Return the reason why a case cannot use an object that the user named for writing."""
     if isinstance(value, SdoReply):
         return f"{shown(key)} could not be read ({value})"
     return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
@@ -133,7 +138,7 @@ async def too_long(wire: NodeConnection) -> Finding:
 
 
 async def too_short(wire: NodeConnection) -> Finding:
-    """CO-009: download one byte less than the object has, expedited."""
+    """CO-009: download one byte less than the object has, in an expedited transfer."""
     key, before = await _number(wire)
     if len(before) < 2:
         raise NotHere(f"{shown(key)} has one byte")
@@ -192,7 +197,7 @@ async def less_than_announced(wire: NodeConnection) -> Finding:
 
 
 async def without_size(wire: NodeConnection) -> Finding:
-    """CO-029: download expedited, without the size bit: the object's own length applies."""
+    """CO-029: download in an expedited transfer without the size bit: the object's own length applies."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
         reply = await wire.ask(b"\x22" + mux(*key) + before)
@@ -247,7 +252,9 @@ async def crc_mismatch(wire: NodeConnection) -> Finding:
 
 
 async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
-    """Download the object's present value by blocks. With `lose`, the second segment is not sent at first."""
+    """Download the object's present value by blocks. With `lose`, the second segment is omitted, and sent only after the
+    reply.
+    """
     key, before = await _text(wire)
     async with _borrowed(wire, key):
         begun = await _begin_block(wire, key, len(before))
@@ -286,7 +293,7 @@ async def one_reply_a_block(wire: NodeConnection) -> Finding:
 
 
 async def segment_lost(wire: NodeConnection) -> Finding:
-    """CO-017: lose a segment of the last sub-block; repeat it and the following ones, numbered from 1."""
+    """CO-017: omit a segment of the last sub-block; then send it and the following ones, numbered from 1."""
     return await _whole_block(wire, lose=True)
 
 

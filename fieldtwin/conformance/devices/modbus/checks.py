@@ -1,4 +1,4 @@
-"""Checks that many Modbus cases share: the correct refusal, silence, and the recovery afterwards."""
+"""Checks that many Modbus cases share: the correct exception response, no reply, and the recovery afterwards."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ def refused(pdu: bytes, answer: ReceivedReply, *codes: int) -> str:
 
 
 async def must_refuse(wire: DeviceConnection, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
-    """Send a request that the device has to refuse with one of `codes`; then it must continue to answer.
+    """Send a request that the device has to refuse with one of the exception codes `codes`.
 
-    `may_lack`: exception 01 means that the device lacks the function, and the case is skipped.
+    `may_lack`: exception 01 means that the device lacks the function, and the case is skipped. If the device does not
+    answer, the reason also states whether it answers the next request.
     """
     heard = await wire.ask(pdu)
     answer = heard.first
@@ -46,7 +47,7 @@ async def must_refuse(wire: DeviceConnection, pdu: bytes, *codes: int, may_lack:
 
 
 async def silent_then_good(wire: DeviceConnection, heard: Received) -> Finding:
-    """Require that `heard` is silence, and that a request afterwards is answered."""
+    """Return a pass if `heard` is silence and the device answers a request afterwards; else a failure."""
     if not heard.nothing:
         return failed(f"{heard} instead of silence")
     after = await wire.still_good()
@@ -56,12 +57,15 @@ async def silent_then_good(wire: DeviceConnection, heard: Received) -> Finding:
 
 
 def answers_good(wire: DeviceConnection, heard: Received, times: int) -> bool:
-    """Return whether `heard` is the usual answer `times` times, without any other bytes."""
+    """Return whether `heard` consists of the usual answer `times` times, and of nothing else."""
     return len(heard.answers) == times and all(wire.is_good(a) for a in heard.answers) and not heard.rest
 
 
 def first_table(wire: DeviceConnection, functions: Sequence[int]) -> tuple[int, int, int]:
-    """Return (function, address, count) of a read that is answered. Raises `NotHere` if none of `functions` has one."""
+    """Return (function, address, count) of a read that the device answers, by the first possible one of `functions`.
+
+    Raises `NotHere` if the device answers no read by any of them.
+    """
     for function in functions:
         if function in wire.readable:
             return function, *wire.readable[function]

@@ -1,6 +1,7 @@
-"""The connection of a check to a Modbus device. It sends any bytes, receives every byte, and knows the device's normal answers.
+"""The connection of a check to a Modbus device. It sends any bytes, receives every byte, and knows the device's normal
+answers.
 
-It must not depend on the purpose of a case. It permits only requests within the case's impact level, by a list of
+This module does not know the purpose of a case. It permits only requests within the case's impact level, by a list of
 functions: a case that would send others is a bug of fieldtwin.
 """
 
@@ -22,11 +23,13 @@ WRITES = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
 IDENTIFICATION = b"\x2b\x0e"
 """The permitted subtype of function 2B, which also carries CANopen services that may write."""
 MOST_HEARD = 8192
-"""Number of bytes that a device may send at once; more than that is babble."""
+"""Maximum number of bytes that are received after a request; the check stops receiving if the device sends more."""
 CALM_S = 0.8
-"""After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
+"""In seconds: after this silence on a serial line no receiver waits for the rest of a frame, however slow its timers are
+(libmodbus: 0.5 s).
+"""
 PATIENCE = 3
-"""Number of timeouts after which a missing answer counts as silence. It is larger than 1, because a slow device is not faulty."""
+"""A missing answer counts as silence after this number of timeouts. It is larger than 1, because a slow device is not faulty."""
 FIRST_TRANSACTION = 0x0100
 """First transaction ID of each case: the same case always sends the same bytes, whatever ran before."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
@@ -37,7 +40,9 @@ Open = Callable[[], Awaitable[ByteConnection]]
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """The data that was received: whole replies, other bytes, and whether the device closed the connection."""
+    """The received data: whole replies (`answers`), other bytes (`rest`), and whether the device closed the connection
+    (`closed`).
+    """
 
     answers: tuple[ReceivedReply, ...]
     rest: bytes = b""
@@ -82,17 +87,17 @@ class DeviceConnection:
         self.framing, self.unit, self.traits = framing, unit, traits
         self.timeout_s, self.char_s = timeout_s, char_s
         self.pause_s = max(4 * char_s, 0.005)
-        """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with a margin."""
+        """Pause in seconds that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with a margin."""
         self.impact = Impact.READ
         self.good = b""
-        """The request that tests normal operation: a read."""
+        """PDU of the request that tests normal operation: a read."""
         self.good_reply = b""
         self.readable: dict[int, tuple[int, int]] = {}
         """Function -> (address, count) of a read that is answered with values."""
         self.refused: dict[int, int] = {}
-        """Function -> the exception that it always gave instead."""
+        """Function -> the exception code with which the device refused the last read by it."""
         self.may_write: dict[str, tuple[int, int]] = {}
-        """``holding`` and ``coil`` -> (address, count) of cells that the user gave for writing."""
+        """``holding`` and ``coil`` -> (address, count) of cells that the user named for writing."""
         self._open, self.clock = open_wire, clock
         self._spacing_s = max(spacing_s, self.pause_s) if char_s else spacing_s
         self._echo = echo
@@ -162,7 +167,11 @@ class DeviceConnection:
         await self.clock.sleep_until_ns(self._quiet_since_ns + round(self._spacing_s * NS_PER_S))
 
     async def hear(self, count: int = 1, within_s: float | None = None) -> Received:
-        """Receive until there are `count` whole replies, or nothing came for the timeout; ``count=0`` receives everything."""
+        """Receive until `count` whole replies have arrived, or the time is over; with ``count=0`` receive during the whole
+        time.
+
+        The time is `within_s` seconds, by default the timeout; it is extended while a reply is arriving.
+        """
         data, closed = await self._bytes(count, self.timeout_s if within_s is None else within_s)
         answers, rest = replies(self.framing, data)
         return Received(tuple(answers), rest, closed)
@@ -194,9 +203,10 @@ class DeviceConnection:
         return chunk[same:]
 
     async def ask(self, pdu: bytes, unit: int | None = None, *, due: bool = True) -> Received:
-        """Send a request in a good frame and return the received data; without a `due` answer silence is accepted sooner.
+        """Send a request in a correct frame and return the received data.
 
-        On a connection with transaction IDs only replies to the request count.
+        `due`: an answer is expected, so the function waits for `PATIENCE` timeouts, else for one. On a connection with
+        transaction IDs, a reply to an earlier request is skipped if the reply to this request follows.
         """
         number = self.next_transaction()
         await self.send(self.frame(pdu, unit, number), pdu)
@@ -214,7 +224,7 @@ class DeviceConnection:
         await asyncio.sleep(s)
 
     async def drain(self) -> Received:
-        """Receive the unrequested bytes that have arrived."""
+        """Receive and return the bytes that have arrived without a request."""
         return await self.hear(0, self.pause_s)
 
     # -- normal behaviour -----------------------------------------------------------------------------------------
@@ -231,7 +241,7 @@ class DeviceConnection:
     async def still_good(self, *, at_once: bool = False) -> str:
         """Return an empty string when `good` is answered as usual, else a description of the received data.
 
-        On a line the request is sent after a long silence, unless `at_once`.
+        On a serial line the request is sent after a silence of `CALM_S`, unless `at_once`.
         """
         if self.serial and not at_once:
             await self.clock.sleep_until_ns(self._quiet_since_ns + round(CALM_S * NS_PER_S))
@@ -239,7 +249,10 @@ class DeviceConnection:
         return "" if len(heard.answers) == 1 and self.is_good(heard.first) and not heard.rest else str(heard)
 
     async def settle(self) -> bool:
-        """Restore normal operation: silence, at worst a new connection. Return False if that fails."""
+        """Restore normal operation: discard received bytes, and if necessary wait or open a new connection.
+
+        Return whether the device then answers normally.
+        """
         for attempt in range(3):
             try:
                 if attempt or self._connection is None or self._closed:

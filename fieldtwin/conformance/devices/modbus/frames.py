@@ -1,7 +1,8 @@
 """Modbus frames for checks: requests made by hand, including damaged ones, and replies found in the received bytes.
 
-Pure. A driver's framer discards invalid data. A check examines invalid data, so nothing is discarded here: bytes that form no
-frame are kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
+This module does no I/O. A driver's framer discards invalid data. A check examines invalid data, so nothing is discarded
+here: bytes that form no frame are kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b
+(TG).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from fieldtwin.gateway.protocols.modbus.frames.shapes import MAX_FRAME, frame_le
 
 NO_TRANSACTION = -1
 _STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]
-"""The table of the check sum for each byte value. With it the search for a reply in garbage, which starts at each byte, is
+"""The table of the check sum for each byte value. It makes the search for a reply in garbage, which starts at each byte,
 fast.
 """
 _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
@@ -62,7 +63,7 @@ def ascii_frame(body: bytes, check: int | None = None) -> bytes:
 
 
 def mbap(body: bytes, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
-    """Return an ADU of unit and PDU (TG 3.1.3), with wrong fields on request."""
+    """Return an ADU of unit and PDU (TG 3.1.3); `protocol` and `length` override the header's fields, to make it invalid."""
     said = len(body) if length is None else length
     return transaction.to_bytes(2) + protocol.to_bytes(2) + said.to_bytes(2) + body
 
@@ -92,9 +93,9 @@ def _rtu_replies(data: bytes) -> tuple[list[ReceivedReply], bytes]:
 
 
 def _rtu_length(data: bytes) -> int:
-    """Return the length of the frame at the start of `data`, 0 if there is none.
+    """Return the length of the RTU frame at the start of `data`, 0 if there is none.
 
-    A length that its function can have is preferred, else the shortest that fits.
+    If the CRC is correct for several lengths, a length that the function can have is preferred, else the shortest.
     """
     least = 5 if len(data) > 1 and data[1] & 0x80 else 4  # the CRC of 01 80 is 01 80, so an exception must be longer
     if len(data) < least:

@@ -24,7 +24,7 @@ def read_of(function: int, address: int, count: int) -> bytes:
 
 
 def values_of(answer: ReceivedReply | None, function: int, count: int) -> bytes | None:
-    """Return the data of a whole reply to such a read, or None for any other reply."""
+    """Return the data of a whole reply to a read of `count` cells by `function`, or None for any other reply."""
     size = 2 * count if function in (0x03, 0x04) else (count + 7) // 8
     if answer is None or answer.pdu[:2] != bytes((function, size)) or len(answer.pdu) != 2 + size:
         return None
@@ -32,10 +32,10 @@ def values_of(answer: ReceivedReply | None, function: int, count: int) -> bytes 
 
 
 async def learn(wire: DeviceConnection, given: dict[str, int], writable: dict[str, int] | None = None) -> None:
-    """Fill `good`, `readable` and `refused` of `wire`.
+    """Read from the device, and fill `good`, `good_reply`, `readable` and `refused` of `wire` with the results.
 
-    `given`: table -> address that can be read according to the user, `writable` the same of cells that may be written:
-    these are tried before the usual addresses. Raises `Unreachable` without an answer.
+    `given`: table -> address that can be read according to the user, `writable`: table -> address of a cell that may be
+    written; these addresses are tried before the usual ones. Raises `Unreachable` if the device answers no read.
     """
     await wire.reopen()
     refusal: tuple[bytes, bytes] | None = None
@@ -60,7 +60,10 @@ async def learn(wire: DeviceConnection, given: dict[str, int], writable: dict[st
 async def _table(
     wire: DeviceConnection, function: int, given: dict[str, int], writable: dict[str, int]
 ) -> tuple[bytes, bytes] | None:
-    """Find a readable cell of one table. Return a refused request with its reply if there is no such cell."""
+    """Find a readable cell of one table, enter it in `wire.readable`, and return None.
+
+    If there is no such cell, return the last refused request with its reply, or None if no request was refused.
+    """
     table, refusal, silent = TABLE[function], None, 0
     counts = (1, 2) if function in (0x03, 0x04) else (1,)  # some devices do not support odd counts (MB-048)
     also = [writable[table]] if table in writable else []

@@ -73,9 +73,9 @@ async def _among(wire: DeviceConnection, before: bytes, after: bytes) -> Finding
 async def _goes_on(wire: DeviceConnection, data: bytes, *, may_discard: bool) -> Finding:
     """Send a good request with noise around it, and a good request 0.1 s after the reply.
 
-    `may_discard`: silence for the first one is also right. In RTU the noise and the frame are one frame, because no
-    silence separates them, and its check sum is wrong (SL 2.5.1.1). With zeros after a frame the check sum is right
-    again, and the length is wrong: exception 03.
+    `may_discard`: no answer to the first request is also correct. In RTU the noise and the frame are one frame, because no
+    silence separates them, and its check sum is wrong (SL 2.5.1.1). With zeros after a frame the check sum is right again,
+    and the length is wrong: exception 03 is correct as well.
     """
     await wire.send(data, wire.good)
     heard = await wire.hear()
@@ -117,7 +117,7 @@ async def broadcast_read(wire: DeviceConnection) -> Finding:
 
 
 async def _silent_neighbour(wire: DeviceConnection) -> int:
-    """Return an unused unit ID. Raises `Unsaid` if a device answers each of those that were tried."""
+    """Return an unused unit ID. Raises `Unsaid` if a device answers to each of the unit IDs that were tried."""
     for unit in _neighbours(wire):
         if (await wire.ask(wire.good, unit, due=False)).nothing:
             await wire.settle()
@@ -130,7 +130,7 @@ def _neighbours(wire: DeviceConnection) -> list[int]:
 
 
 async def other_unit(wire: DeviceConnection) -> Finding:
-    """MB-029: send requests to other units. Three units that give the same answer are one device."""
+    """MB-029: send requests to other units. If three units give the same answer, one device answers to all unit IDs."""
     said = []
     for unit in _neighbours(wire):
         heard = await wire.ask(wire.good, unit, due=False)
@@ -171,7 +171,7 @@ async def neighbour_silent(wire: DeviceConnection) -> Finding:
 
 
 async def stranger_function(wire: DeviceConnection) -> Finding:
-    """MB-032: send an unknown function to another unit."""
+    """MB-032: send an unknown function code to another unit."""
     other = await _silent_neighbour(wire)
     pdu = b"\x64\x00\x01"
     await wire.send(wire.frame(pdu, other), pdu)
@@ -250,7 +250,7 @@ async def no_character(wire: DeviceConnection) -> Finding:
 
 
 def longest(wire: DeviceConnection) -> bytes:
-    """Return the PDU of the longest request that an echo can carry (SL 2.5.1: a frame of 256 bytes)."""
+    """Return the PDU of the longest FC 08 request, which the device echoes (SL 2.5.1: a frame of 256 bytes)."""
     return b"\x08\x00\x00" + b"\x5a" * 250
 
 

@@ -13,8 +13,8 @@ from fieldtwin.conformance.devices.modbus.frames import short
 from fieldtwin.conformance.devices.modbus.learn import ORDER, read_of, values_of
 
 MOST_FRAMES = 32
-"""Largest number of frames of one identification: 255 objects fit into fewer. The limit ends an identification that would
-never end.
+"""Maximum number of frames in which one identification is read: 255 objects fit into fewer. The limit ends a read that
+would otherwise never end, because the device always announces more objects.
 """
 
 
@@ -119,7 +119,9 @@ async def queue(wire: DeviceConnection) -> Finding:
 
 
 async def _objects(wire: DeviceConnection, code: int) -> tuple[dict[int, bytes], str]:
-    """Return all objects of a category, from as many frames as needed, and any error in them."""
+    """Return all objects of a category, read in as many frames as needed, and a description of the first error, empty if
+    there was none.
+    """
     objects: dict[int, bytes] = {}
     at = 0
     for _ in range(MOST_FRAMES):

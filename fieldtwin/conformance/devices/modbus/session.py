@@ -1,4 +1,4 @@
-"""A complete check of a Modbus device: open, learn, read its identity, run the cases."""
+"""A complete check of a Modbus device: connect, learn its normal answers, read its identity, run the cases."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ModbusOptions:
 
     `given` table -> address that can be read; `may_write` table -> (address, count) of cells that may be written
     temporarily; `go_on` returns the reason to stop sending, or an empty string. A serial line is first observed for
-    `listen_s` seconds: nothing is sent if it carries foreign traffic, unless `share_bus`.
+    `listen_s` seconds: nothing is sent if other devices communicate on it, unless `share_bus`.
     """
 
     endpoint: str
@@ -72,7 +72,9 @@ async def check_modbus(
     print_line: Callable[[str], None] = lambda text: None,
     on_result: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
-    """Run the whole check. Raises `Unreachable` without an answer, `NotAllowed` for foreign traffic on the line."""
+    """Run the whole check. Raises `Unreachable` if the device does not answer, `NotAllowed` if the serial line carries
+    other traffic.
+    """
     endpoint = Endpoint.parse(options.endpoint)
     clock = options.clock or WallClock()
     began_ns = clock.monotonic_ns()

@@ -1,6 +1,6 @@
 """Cases of Modbus TCP and of streams: invalid headers, several ADUs in one segment, connections that end.
 
-TG is the Messaging on TCP/IP Implementation Guide V1.0b. All PDUs in it are reads.
+TG is the Messaging on TCP/IP Implementation Guide V1.0b. The cases send only reads.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ async def several_at_once(wire: DeviceConnection) -> Finding:
 
 
 async def more_than_allowed(wire: DeviceConnection) -> Finding:
-    """MB-053: send 40 requests at once: each is answered, or refused with 06."""
+    """MB-053: send 40 requests at once. The device must answer each, or refuse it with exception 06."""
     numbers = [wire.next_transaction() for _ in range(40)]
     await wire.send(b"".join(_adu(wire, n) for n in numbers), wire.good)
     heard = await wire.hear(40)
@@ -72,7 +72,7 @@ async def other_protocol(wire: DeviceConnection) -> Finding:
 
 
 async def _wrong_length(wire: DeviceConnection, adu: bytes) -> Finding:
-    """Send an invalid ADU: it is discarded, or the connection is closed. A new connection has to be served in any case."""
+    """Send an invalid ADU: the device must discard it or close the connection, and must serve a new connection in both cases."""
     await wire.send(adu, wire.good)
     heard = await wire.hear()
     if heard.answers or heard.rest:
@@ -161,7 +161,7 @@ async def unit_0(wire: DeviceConnection) -> Finding:
 
 
 async def half_and_gone(wire: DeviceConnection) -> Finding:
-    """MB-064: send half a request and disconnect; the next client is served."""
+    """MB-064: send half a request and disconnect. The device must serve the next client."""
     frame = wire.frame(wire.good)
     await wire.send(frame[: len(frame) // 2], wire.good)
     await wire.pause(0.05)

@@ -1,7 +1,7 @@
-"""Cases that write to the cells that the user gave, and restore their values.
+"""Cases that write to the cells that the user named for writing, and restore their values.
 
-A write that the device should refuse uses a value other than the cell's, so that a write that was executed is noticed.
-AP is the Modbus Application Protocol V1.1b3.
+A write that the device should refuse uses a value other than the cell's, so that a write that was executed is noticed. AP
+is the Modbus Application Protocol V1.1b3.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _write(table: str, address: int, data: bytes) -> bytes:
 
 @asynccontextmanager
 async def _borrowed(wire: DeviceConnection, table: str) -> AsyncIterator[tuple[int, bytes]]:
-    """Yield the cell that may be written and its value, and restore it. Raises `Unsaid` where that failed."""
+    """Yield the address of the cell to write and its value, and restore the value afterwards. Raises `Unsaid` if that fails."""
     if table not in wire.may_write:
         raise NotHere(f"no address to write was given: --write {table}:ADDRESS")
     address, _ = wire.may_write[table]
@@ -59,7 +59,7 @@ async def _unchanged(wire: DeviceConnection, table: str, address: int, before: b
 
 
 def _other(before: bytes) -> bytes:
-    """Return a register value that differs from this one by one bit."""
+    """Return a register value that differs from `before` by one bit."""
     return before[:1] + bytes((before[1] ^ 1,))
 
 
@@ -99,7 +99,7 @@ async def registers_mismatch(wire: DeviceConnection) -> Finding:
 
 
 async def _length_mismatch(wire: DeviceConnection, byte_count: int, more: bytes) -> Finding:
-    """Send FC 16 of one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
+    """Send FC 16 for one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + bytes((0, 1, byte_count)) + _other(before) + more
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
@@ -164,7 +164,7 @@ async def write_before_read(wire: DeviceConnection) -> Finding:
 
 
 async def refused_as_a_whole(wire: DeviceConnection) -> Finding:
-    """MB-042: send FC 23 that reads 126 registers: nothing is written."""
+    """MB-042: send FC 23 that reads 126 registers. The device must refuse it and write nothing."""
     async with _borrowed(wire, "holding") as (address, before):
         at = address.to_bytes(2)
         pdu = b"\x17" + at + b"\0\x7e" + at + b"\0\x01\x02" + _other(before)

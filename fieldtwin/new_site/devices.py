@@ -1,4 +1,4 @@
-"""Converts the requested devices to devices on buses, with profiles, names, endpoints, addresses, supervised values and outputs.
+"""Convert the requested devices to devices on buses, with profiles, names, endpoints, addresses, supervised values and outputs.
 
 This module reads profiles and opens no connection.
 """
@@ -73,7 +73,7 @@ class SiteDevice:
 
     @property
     def in_tpdo(self) -> bool:
-        """Return whether the node can send the watched value in a TPDO, by its data sheet."""
+        """Return whether the node can send the supervised value in a TPDO, according to its data sheet."""
         eds = self.profile.eds_path
         if self.watched is None or self.watched.object is None or eds is None:
             return False
@@ -82,7 +82,7 @@ class SiteDevice:
 
     @property
     def polled(self) -> dict[str, int]:
-        """Return the periods of the poll groups in ms: 500 ms for the group of the watched value and for `fast`, 1000 ms for
+        """Return the periods of the poll groups in ms: 500 ms for the group of the supervised value and for `fast`, 1000 ms for
         the others."""
         first = self.watched.poll if self.watched is not None else ""
         groups = {

@@ -1,4 +1,4 @@
-"""Chooses the value of a device that a new site supervises, its limits, and the output that a program may command.
+"""Choose the value of a device that a new site supervises, its limits, and the output that a program may command.
 
 The numbers are placeholders that fit the tag's type: the user replaces them with those of the process.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 NEVER_POLLED = ("identity", "setup")
-"""Poll groups that the profiles read once, after the connection."""
+"""Poll groups that are read only once, after the connection is made."""
 _PERCENT = (0.0, 100.0)
 _SETPOINT = {"set", "setpoint", "wanted", "target", "reference"}
 """Parts of names that show that a value is a setpoint and not a measurement."""
@@ -107,8 +107,8 @@ def limits_of(profile: DeviceProfile, tag: Tag) -> Limits:
 def commanded(profile: DeviceProfile, watched: Tag | None) -> Output | None:
     """Return the output that a program may command without knowledge of the process; None if the device has no such tag.
 
-    That is the sampling period of a sensor that samples, or the first setpoint that is polled, has a range, is not marked as
-    dangerous and has no name of a parameter, of a device whose watched value is measured.
+    For a sensor with a sampling period, it is this period. For any other device whose supervised value is a measurement, it is
+    the first setpoint that is polled, has a range, is not marked as dangerous, and does not have the name of a parameter.
     """
     if profile.sampled is not None:
         period = profile.tags[profile.sampled.period]

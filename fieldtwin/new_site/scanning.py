@@ -1,4 +1,4 @@
-"""Finds the devices at an endpoint for a new site: scan, identify, and for an unknown Modbus unit a draft of its profile.
+"""Find the devices at an endpoint for a new site: scan, identify, and for an unknown Modbus unit a draft of its profile.
 
 It only reads. This module must not depend on a display.
 """
@@ -30,7 +30,7 @@ from fieldtwin.new_site.devices import is_shipped
 from fieldtwin.new_site.wishes import DeviceWish
 
 DRAFT_RANGES = ("input:0..499", "holding:0..499", "discrete:0..63", "coil:0..63")
-"""The addresses that a draft covers; a whole device can take an hour."""
+"""The addresses that are read for a draft; to read all addresses of a device can take an hour."""
 DRAFT_PASSES, DRAFT_EVERY_S, DRAFT_BUDGET_S = 6, 1.0, 15.0
 IDENTIFY_TIMEOUT_S = 1.0
 
@@ -137,6 +137,6 @@ def _take(found: Scanned, what: str, url: str, address: int, best: Candidate | N
 
 
 def _reference(profile: DeviceProfile) -> str:
-    """Return how a device names the profile: the name of a shipped one, else its path."""
+    """Return the name by which a system file can refer to the profile: the name of a shipped profile, else its path."""
     path = Path(profile.path)
     return path.stem if is_shipped(path) else str(path)

@@ -1,4 +1,4 @@
-"""Makes the files of a new site from the user's wishes and the templates in the folder ``templates``.
+"""Make the files of a new site from the user's choices and the templates in the folder ``templates``.
 
 `site_files` returns the text of all files and writes none of them.
 """
@@ -42,7 +42,7 @@ class ProgramFile:
 
 
 class DeviceView:
-    """A device as the templates see it: its own properties, and those that depend on the choice of a program."""
+    """The properties of a device that the templates use; some depend on whether a program controls the device."""
 
     def __init__(self, device: SiteDevice, controlled: bool) -> None:
         self.name, self.reference, self.bus, self.address = device.name, device.reference, device.bus, device.address
@@ -118,7 +118,7 @@ class DeviceView:
 
     @property
     def is_simulated(self) -> bool:
-        """Return whether a formula in the prototype file computes the watched value. No formula computes a value with named
+        """Return whether a formula in the prototype file computes the supervised value. No formula computes a value with named
         states, a bit, or a value whose scale factor is in a separate register."""
         tag, profile = self.watched, self._device.profile
         return (
@@ -127,12 +127,12 @@ class DeviceView:
 
     @property
     def silence(self) -> str:
-        """Return the fault by which the device stops answering."""
+        """Return the name of the fault that makes the device stop answering."""
         return "lost-frame" if self.is_canopen else "silence"
 
     @property
     def formulas(self) -> dict[str, str]:
-        """Return a formula for the watched value, and for every other value that the device samples."""
+        """Return, by tag, a formula for the supervised value, and for every other value that the device samples."""
         assert self.limits is not None
         swing = (self.limits.high - self.limits.usual) / 5
         usual = number(self.limits.usual)
@@ -144,7 +144,7 @@ class DeviceView:
 
     @property
     def emulated(self) -> str:
-        """Return the entry of the prototype file."""
+        """Return the device's entry in the prototype file, as YAML."""
         if self._device.profile.inbox is not None:
             return '{model: mailbox, far: "tcp://127.0.0.1:0"}'
         source = f"simulation: {self.name}" if self.is_simulated else "model: profile"
@@ -152,7 +152,7 @@ class DeviceView:
         return f"{{{source}, values: {{{values}}}}}" if values else f"{{{source}}}"
 
     def _values(self) -> str:
-        """Return the initial values of registers that no formula computes."""
+        """Return the initial values of the registers that no formula computes, as YAML."""
         found = []
         sampled = self._device.profile.sampled
         if sampled is not None and not self._controlled:

@@ -15,9 +15,9 @@ from fieldtwin.gateway.core.errors import UsageError
 EXAMPLE = "example"
 """The profile name that stands for the example tank of `fieldtwin new`."""
 MOST_DEVICES = 64
-"""The most devices of a new site."""
+"""Largest number of devices of a new site."""
 LONGEST_NAME = 40
-"""The most characters of a system's or a device's name."""
+"""Largest number of characters of a system's or a device's name."""
 _DEVICE = re.compile(r"(?:(?P<name>\w+)=)?(?P<profile>[^@#]+)(?:@(?P<endpoint>[^#]+))?(?:#(?P<address>\d+))?")
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 

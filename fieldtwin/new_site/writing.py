@@ -1,4 +1,4 @@
-"""Writes the files of a new site into an empty folder. If anything prevents that, the folder is as it was before."""
+"""Write the files of a new site into an empty folder. If that fails, the folder is left as it was before."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from fieldtwin.gateway.core.errors import UsageError
 
 ALLOWED = {".git"}
-"""The entries that an otherwise empty folder may have."""
+"""Files and folders that may exist in a folder that counts as empty."""
 _SHOWN = 3
 
 

@@ -1,4 +1,4 @@
-"""Writes reports as files. A missing folder is created, because a CI job's first report has none."""
+"""Write reports to files. A missing folder is created, because a CI job's first report has none."""
 
 from __future__ import annotations
 

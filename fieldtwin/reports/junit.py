@@ -1,8 +1,9 @@
 """JUnit XML in pytest's dialect (``xunit2`` with properties), as Jenkins and GitLab read it.
 
 A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check
-that failed, and its text contains all of them and the command that runs it again. INCONCLUSIVE is an ``error`` with its
-own type: JUnit has no result that neither passed nor failed, and a build must not take INCONCLUSIVE for a pass.
+that failed, and its text contains all failed checks and the command that runs the scenario again. INCONCLUSIVE is an
+``error`` with its own type: JUnit has no result that neither passed nor failed, and a build must not take INCONCLUSIVE for
+a pass.
 
 `Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a
 file. That schema has no properties of test cases: they become lines at the beginning of ``system-out``.
@@ -138,7 +139,7 @@ def _line(check: CheckResult) -> str:
 
 
 def _bounded(said: str) -> str:
-    """Return the beginning and the end of a long text: the command that runs it again is at the end."""
+    """Return only the beginning and the end of a long text: the command that runs the scenario again is at the end."""
     if len(said) <= MOST_TEXT:
         return said
     half = MOST_TEXT // 2

@@ -1,6 +1,6 @@
-"""SVG as values: text is escaped unless it is markup already, so that a name from a file cannot become markup.
+"""SVG elements as Python values: text is escaped unless it is markup already, so that a name from a file cannot become markup.
 
-This module knows elements, and nothing about reports. Pages are made from templates (fieldtwin.reports.pages).
+This module does not depend on the contents of reports. Pages are made from templates (fieldtwin.reports.pages).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def text(value: object) -> Markup:
 
 
 def clean(value: object) -> str:
-    """Return the same text without escaping, for writers that escape by themselves."""
+    """Return text without characters that no document may hold, but not escaped, for writers that escape by themselves."""
     return _UNSEEN.sub("\ufffd", str(value))
 
 
 def join(children: Child) -> Markup:
-    """Concatenate children."""
+    """Return the children, concatenated into one markup text; plain text in them is escaped."""
     if children is None:
         return Markup("")
     if isinstance(children, str):
@@ -38,7 +38,7 @@ def join(children: Child) -> Markup:
 
 
 def el(name: str, /, *children: Child, **attributes: object) -> Markup:
-    """Return an element.
+    """Return the element `name` with these children and attributes.
 
     ``cls`` is the class, and ``_`` in a name means ``-``. None leaves an attribute out; True writes it without a value.
     """

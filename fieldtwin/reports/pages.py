@@ -1,6 +1,6 @@
 """HTML pages from the templates in this folder. A template escapes every value, so that a name from a file cannot become markup.
 
-This module knows templates, and nothing about reports.
+This module does not depend on the contents of reports.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def fill(template: str, **values: object) -> Markup:
 
 
 def cut(text: str, most: int) -> str:
-    """Return `text` with at most `most` characters; one that was cut ends with an ellipsis."""
+    """Return `text` with at most `most` characters; a longer text is cut and ends with an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
 

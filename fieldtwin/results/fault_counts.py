@@ -7,5 +7,5 @@ from fieldtwin.twin.prototype.field_status import StruckStatus
 
 
 def struck_of(told: StruckStatus) -> Struck:
-    """Return one entry of a field simulator's history."""
+    """Return an entry of a field simulator's fault history as a `Struck`."""
     return Struck(told.id, told.name, told.on, told.struck, told.optional)

@@ -1,4 +1,4 @@
-"""The data of a report: results of scenarios with their traces, and the systems that they ran against. Plain values."""
+"""The data of a report: results of scenarios with their traces, and the systems that they ran against."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ class Struck:
 
 @dataclass
 class AccessCounts:
-    """The counts of accesses to devices, of refusals, and of states. `touched` and `refused`: (device, access, table, address,
-    count, subindex).
+    """The counts of accesses to devices, of refusals, and of states. The keys of `touched` and `refused` are (device, access,
+    table, address, count, subindex).
     """
 
     services: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -99,7 +99,7 @@ class AccessCounts:
     transitions: Counter[tuple[str, str, str]] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     pairs: Counter[tuple[str, str, str]] = field(default_factory=Counter)
-    """(fault's name, PROGRAM.VARIABLE, state)."""
+    """How often a fault was active in a state, by (fault's name, PROGRAM.VARIABLE, state)."""
 
     def add(self, other: AccessCounts) -> None:
         """Add the counts of another run."""
@@ -214,11 +214,11 @@ class Report:
     requirements: Mapping[str, str] = field(default_factory=dict)
     machines: Sequence[Machine] = ()
     faults: Sequence[str] = ()
-    """The available faults, by name; those that ran are added."""
+    """The names of the available faults; the report adds those that were injected."""
     framings: Mapping[str, str] = field(default_factory=dict)
     """The framing of each bus in the traces that is not a bus of the system: rtu, ascii, mbap, udp or can."""
     served: Sequence[str] = ()
-    """The buses on which the remote client sends the requests."""
+    """The buses on which a remote client sends the requests, so that the received frames are the requests."""
     machines_of: Mapping[SystemKey, Sequence[Machine]] = field(default_factory=dict)
     """The state machines of the systems of scenarios, for scenarios whose system is not `system`."""
 

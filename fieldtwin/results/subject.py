@@ -14,9 +14,9 @@ from fieldtwin.__about__ import __version__
 class Subject:
     """The subject of a check.
 
-    `identity` is the device's own identification, in its words, name to text: vendor, product, serial number...
+    `identity` is the identification that the device reports, name to text: vendor, product, serial number...
     `started` is ISO 8601 in UTC, `took_s` the duration of the whole check. `at_most` is the highest impact level that
-    was allowed, `wrote` lists the cells and objects given for writing.
+    was allowed, `wrote` lists the registers, coils and objects that the user gave for writing.
     """
 
     protocol: str

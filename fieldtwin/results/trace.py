@@ -32,7 +32,7 @@ class TraceKind(Enum):
                             ``ext``, ``err`` where they are set. Bytes of a stream are divided as the medium delivered them
     TAG     a tag           ``value``, ``quality``, ``reason``: what the gateway publishes
     STATE   PROGRAM.VARIABLE  ``value``: an output or local of a program that changed
-    FAULT   a fault's id    ``name``, ``on`` true | false, ``target``; ``said``, as in a fault file, while on
+    FAULT   a fault's id    ``name``, ``on`` true | false, ``target``; if it is on, ``said``: the fault as in a fault file
     STEP    a step's number ``text``, ``verdict`` once it has one
     REFUSED  DEVICE.TAG     a write that did not reach its device: ``value``, ``cause``, ``reason``, ``by``, ``program``,
                             ``place`` (FILE:LINE of the program), ``fault`` program | device | "" (by design, or tried again)

@@ -1,7 +1,7 @@
 """The description of a trace: its system, the programs of the PLC, and the results of the checks.
 
 A trace holds events only. The run writes the description into a second file (`about_path`) when it begins, and again with
-the results when it ends. A reader needs no program of the system for it, and executes nothing.
+the results when it ends. A reader does not need the programs of the system, and executes none.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
 
     version: int
     run: str = ""
-    """A number that no other run has. It shows whether a file of the same name was written again by another run."""
+    """A random ID of the run. It shows whether another run has written a file of the same name."""
     system: str
     """The name of the system."""
     system_path: str
@@ -93,7 +93,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     profiles: list[str] = []
     """Further folders of profiles."""
     title: str = ""
-    """The name of the scenario; empty for a run without one."""
+    """The name of the scenario; empty if the run is not a scenario."""
     target: str = ""
     seed: int | None = None
     programs: dict[str, ProgramAbout] = {}
@@ -104,7 +104,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
     checks: list[CheckAbout] = []
     report: str = ""
-    """The HTML report of the run, as a path from the folder of the trace; empty without one."""
+    """The HTML report of the run, as a path from the folder of the trace; empty if there is none."""
 
 
 def about_path(trace: Path) -> Path:
@@ -140,7 +140,7 @@ def write_about(trace: Path, about: TraceAbout) -> None:
 
 
 def read_about(trace: Path) -> TraceAbout | None:
-    """Return the description of a trace, None without one. Raises `FileInvalid` for a file that is not a description."""
+    """Return the description of a trace, None if there is none. Raises `FileInvalid` for an invalid description."""
     path = about_path(trace)
     try:
         about = msgspec.json.decode(read_input(path, MOST_BYTES), type=TraceAbout)

@@ -86,7 +86,7 @@ def agree(
 
     This is the only place where consent to foreign files is given. `systems` are pairs of a system and its prototype file; None
     stands for the prototype file next to the system file. `beside` is a file that names them, a scenario's or a network's, and
-    `opens` lists the endpoints that it opens itself, if it is from a template. Nothing is asked if all files are the user's
+    `opens` lists the endpoints that it opens itself, if it is from a template. The user is not asked if all files are the user's
     own. Call it before any of them is run: assembling a process image imports programs. Raises `NotAllowed`.
     """
     code: dict[str, None] = {}

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 COOKIE = "fieldtwin_studio"
 VIEW, OPERATE = "view", "operate"
 MOST_FAILURES = 10
-"""Wrong tokens from one address before it has to wait."""
+"""Number of wrong tokens from one address after which that address has to wait."""
 FORGET_FAILURES_S = 60.0
 MOST_ADDRESSES = 1_000
 LONGEST_TOKEN = 200
@@ -76,9 +76,10 @@ class Access:
 
 
 class AccessMiddleware:
-    """Refuse what `Access` does not allow, and put the role of the client into ``scope["role"]``.
+    """Refuse requests that `Access` does not allow, and put the role of the client into ``scope["role"]``.
 
-    ``/?token=TOKEN`` stores the token in a cookie and redirects to the page without it, so that the address bar does not show it.
+    ``/?token=TOKEN`` stores the token in a cookie and redirects to the page without it, so that the address bar does not show
+    the token.
     """
 
     def __init__(self, app: ASGIApp, access: Access, now_s: Callable[[], float]) -> None:
@@ -155,7 +156,7 @@ def _in_query(scope: Scope) -> bool:
 
 
 def _token_of(scope: Scope, headers: Headers) -> str:
-    """Return the token of a request, from the header, the query or the cookie in this order; "" without one."""
+    """Return the token of a request, from the header, the query or the cookie in this order; "" if it has none."""
     scheme, _, value = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return value.strip()[:LONGEST_TOKEN]

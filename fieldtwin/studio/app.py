@@ -48,7 +48,7 @@ OPERATIONS: tuple[Operation, ...] = (
 
 def application(access: Access, clock: Clock, folder: Path, known: Traces | None = None) -> Starlette:
     """Return the application for one server. `folder` is searched for systems that can be started, and for traces unless `known`
-    has those to show.
+    gives the traces to show.
     """
 
     @asynccontextmanager

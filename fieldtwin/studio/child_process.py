@@ -1,4 +1,4 @@
-"""Run a command of the command line as a child process of Studio. Each has its own process group, so that all of it can end."""
+"""Run a fieldtwin command as a child process of Studio, in its own process group, so that its children end with it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STOPS_WITHIN_S = 10.0
 
 
 class OutputTooLong(Exception):
-    """A command printed more than its reader accepts."""
+    """Raised when a command prints more than its reader accepts."""
 
 
 async def start(*arguments: str, **options: Any) -> Process:
@@ -26,7 +26,7 @@ async def start(*arguments: str, **options: Any) -> Process:
 
 
 async def read_whole(stream: asyncio.StreamReader, most_bytes: int) -> bytes:
-    """Return an output up to its end. Raises `OutputTooLong` for more than `most_bytes`."""
+    """Read an output up to its end, and return it. Raises `OutputTooLong` for more than `most_bytes`."""
     output = bytearray()
     while chunk := await stream.read(65_536):
         output += chunk

@@ -1,4 +1,4 @@
-"""Run Studio's web server until it is asked to stop."""
+"""Run Studio's web server until SIGINT or SIGTERM."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST_CONNECTIONS = 200
 
 @dataclass(frozen=True)
 class StudioOptions:
-    """Where the server listens and who may use it.
+    """The options of the server: its address, the access to it, and the page that it shows first.
 
     `port` 0 chooses a free port. `names` are further names of this computer that browsers may use. An empty token is made, unless
     `no_token` is set, which is for loopback only.
@@ -55,7 +55,7 @@ class StudioOptions:
     """The instant of the trace that the page shows first, in seconds since the start of the run."""
 
     def check(self) -> None:
-        """Raise `UsageError` for a combination that would let others operate a plant."""
+        """Raise `UsageError` for options that would let unauthorized clients operate a plant."""
         if self.is_loopback:
             return
         if self.no_token:

@@ -1,7 +1,7 @@
 """The conformance report as one HTML file, for devices and clients: no network, no script, readable on paper.
 
-Failed and open cases come first, with their frames. All cases follow in a table; the frames of the others are folded away
-there. The page's text is in templates/conformance.html.j2.
+Failed and open cases come first, with their frames. A table of all cases follows, in which the frames of the other cases are
+collapsed. The page's text is in templates/conformance.html.j2.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def render_page(
 
 
 def overall(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> Verdict:
-    """Return the verdict of the check, which agrees with its exit code.
+    """Return the verdict on all cases, which agrees with the exit code of `fieldtwin check`.
 
     It is failed if a case failed whose basis is one of `fail_on`, else passed if a case passed, and else inconclusive.
     """

@@ -1,7 +1,7 @@
 """The buses of a system as SVG: the controller on the left, a line for each bus, its devices below the line.
 
 One file that uses no external font, page or script. It draws its own background and follows the reader's light or dark theme;
-emulated parts are dashed. Pure: facts in, text out.
+emulated parts are dashed. The functions return text and write no file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ ROOM = 1000.0
 """Largest width of a row of devices in px; further devices are drawn in another row."""
 LONGEST = 44
 WIRE, LOGIC = 90, 34
-"""The maximum length of a text in a device's box, next to a bus, in the controller. A tooltip shows the whole text."""
+"""Maximum number of characters of a text: LONGEST in a device's box, WIRE next to a bus, LOGIC in the controller's box. A tooltip
+shows the whole text.
+"""
 
 LIGHT = {
     "ground": "#fff", "ink": "#17233a", "soft": "#55627a", "box": "#f3f6fb", "edge": "#9fb0cb", "logic": "#fff8e8",
@@ -60,7 +62,7 @@ def svg(wires: Wiring) -> str:
 
 
 def document(title: str, width: float, height: float, *parts: Child) -> str:
-    """Return a drawing as a complete file, with background and styles; a line for each mark."""
+    """Return a drawing as a complete file, with background and styles, and each element on its own line."""
     whole = el(
         "svg",
         el("title", title),
@@ -86,7 +88,7 @@ def _width(rows: list[tuple[str, str]], most: int = LONGEST) -> float:
 
 
 def _lines(x: float, y: float, rows: list[tuple[str, str]], most: int = LONGEST) -> list[Markup]:
-    """Return text elements below each other, each with its class; the base line of the first one is at `y`."""
+    """Return a text element for each (text, CSS class) of `rows`, below each other; the base line of the first one is at `y`."""
     return [_text(x, y + n * LINE, words, cls, most) for n, (words, cls) in enumerate(rows)]
 
 
@@ -159,7 +161,7 @@ def _rows(station: Station) -> list[tuple[str, str]]:
 
 
 def _box(x: float, y: float, width: float, tall: float, rows: list[tuple[str, str]], dashed: str) -> list[Markup]:
-    """Return the box of a device below the line at `y`, with its drop cable."""
+    """Return the box of a device below the bus line at `y`, and the line that connects it to the bus."""
     return [
         el("path", cls="line" + dashed, d=f"M{x + width / 2:.1f},{y:.1f} V{y + 22:.1f}"),
         el("rect", cls="box" + dashed, x=x, y=y + 22, width=width, height=tall, rx=6),

@@ -1,4 +1,4 @@
-"""Stylesheets for SVG files: literal colours for every viewer, and other ones where the reader prefers a dark page.
+"""Stylesheets for SVG files: literal colours for every viewer, and dark ones where the reader prefers a dark page.
 
 Many viewers (CairoSVG, librsvg, editors) know neither variables of CSS nor media queries, and draw black where a colour is
 `var(--ink)`. A stylesheet made here has literal colours in its plain rules, and the dark ones in a media query.

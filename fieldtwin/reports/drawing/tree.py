@@ -12,7 +12,7 @@ Cells = tuple[str, ...]
 def tree(wires: Wiring, columns: int = 1000) -> str:
     """Return a tree: the system, its buses with their devices, its programs, its servers.
 
-    Text longer than `columns` characters continues on the next line, between cells.
+    A line longer than `columns` characters is continued on the next line; it is broken between two entries.
     """
     branches: list[tuple[str, str, list[Cells]]] = [
         (wire.name, _wire_line(wire), [_station_cells(station) for station in wire.stations]) for wire in wires.wires

@@ -55,7 +55,7 @@ class Logic:
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """A server of the gateway: it serves tags as registers, or units of a bus."""
+    """A server of the gateway. It serves tags as registers, or forwards requests to the unit IDs of a bus."""
 
     name: str
     endpoint: str
@@ -64,7 +64,7 @@ class Server:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A system's buses. `prototype`: a prototype file was requested."""
+    """The buses, programs and servers of a system. `prototype`: the drawing includes the emulators of a prototype file."""
 
     system: str
     prototype: bool

@@ -52,7 +52,7 @@ def label(name: str, below: str = "") -> list[Markup]:
 
 
 def fitted(axis: TimeAxis, said: str, x1: float, x2: float, y: float, cls: str, *, cut: bool = False) -> list[Markup]:
-    """Return text inside a box if there is room for it, on one side of the line of the verdict.
+    """Return text inside a box if there is room for it, on one side of the line that marks the time of the verdict.
 
     With `cut`, a text that is too long is cut; if only a few characters would remain, its part before a colon is used.
     """
@@ -73,5 +73,5 @@ def _room(x1: float, x2: float) -> int:
 
 
 def seconds(t_ns: int) -> str:
-    """Return a time of the run, for titles."""
+    """Return a time of the run as text in seconds, for tooltips."""
     return f"{t_ns / NS_PER_S:.4f} s"

@@ -1,6 +1,6 @@
 """The coverage of a run: registers and objects, refusals, transitions, faults in states.
 
-`Collector` listens to a trace (or is fed with one) and gives `AccessCounts`, which add up over scenarios. What is missing is
+`Collector` counts the events of a trace and returns `AccessCounts`, which add up over scenarios. What is missing is
 derived from the profiles when the report is written. The number of counters is limited: those of the system by its contents,
 and all others by `MOST`.
 """
@@ -29,7 +29,7 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Collector:
-    """Counts one run's events. Subscribe `feed` to a trace: then events that a full trace drops are counted too."""
+    """The counters of one run's events. Subscribe `feed` to a trace: then events that a full trace drops are counted too."""
 
     def __init__(self, system: System | None, machines: Iterable[Machine] = ()) -> None:
         self.counts = AccessCounts()
@@ -48,7 +48,7 @@ class Collector:
         return self.counts
 
     def add(self, exchanges: Iterable[DecodedExchange]) -> None:
-        """Count exchanges that were completed by the end of the trace."""
+        """Count exchanges that the caller has decoded."""
         for exchange in exchanges:
             self._exchange(exchange)
 
@@ -157,9 +157,9 @@ _Key = tuple[str, str, str, int, int, int]
 
 
 def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
-    """Yield the tags of a device, and its mailboxes by their head.
+    """Yield the tags of a device, and the first two registers and the acknowledgement of each of its mailboxes.
 
-    Each entry has the name, the place, and whether it can be read and written.
+    Each entry has the name, the registers or the object, whether it can be read, and whether it can be written.
     """
     profile = config.profile
     for tag in profile.tags.values():

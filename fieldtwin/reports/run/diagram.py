@@ -72,8 +72,9 @@ def _buses(window: Window) -> list[str]:
 
 
 def _chosen(window: Window, lanes: dict[str, list[PlotStep]]) -> list[str]:
-    """Return the lanes to draw: the named ones, then those of the same devices, then others; words before numbers, and
-    those that changed most first. A lane that is not named and never changes is left out, except for a state in words.
+    """Return the lanes to draw: first those that the check names, then those of the same devices, then others. Within each group,
+    words come before numbers, and lanes with more changes first. A lane that the check does not name and that never changes is
+    left out, except for a state in words.
     """
     names = window.check.names
     devices = {name.rpartition(".")[0] for name in names}
@@ -149,7 +150,7 @@ def _wire_lane(axis: TimeAxis, window: Window, bus: str, system: System | None) 
 
 
 _RANK = {"message": 3, "asked": 2, "wrote": 1}
-"""Priority of the labels where there is not room for all; errors come first."""
+"""Priority of the labels if there is not room for all; a lower number comes first. All other kinds (errors) have 0."""
 
 
 def _words(axis: TimeAxis, words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
@@ -171,12 +172,12 @@ def _words(axis: TimeAxis, words: list[tuple[int, float, float, str, str]]) -> l
 
 
 def _row(exchange: DecodedExchange) -> int:
-    """Return the row of an exchange: requests above, messages below."""
+    """Return the row of an exchange in its lane: 0 (upper) for a request with its reply or timeout, 1 for a message."""
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
 
 def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[Lane]:
-    """Return the lane of the scans that changed something, each with its changes; other scans are not drawn."""
+    """Return the lane of the PLC scans in which a state changed, each with its changes; [] if there is none."""
     changed: dict[int, list[str]] = {}
     for name, steps in window.states.items():
         for step in steps:

@@ -2,8 +2,8 @@
 
     write_html(report, path)
 
-It is bounded: at most `MOST_DRAWN` failures are drawn, within `BUDGET` characters; every other one is in the tables,
-with the command that runs it again. The page's text is in templates/run.html.j2.
+It is bounded: at most `MOST_DRAWN` failures are drawn, within `BUDGET` characters; every other failure is in the tables,
+with the command that runs the scenario again. The page's text is in templates/run.html.j2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Lanes of a timing diagram for values: numbers as a stepped line over their quality, words as boxes."""
+"""Lanes of a timing diagram for values: numbers as a stepped line on a background that shows their quality, words as boxes."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ _QUALITIES = {str(q): int(q) for q in Quality}
 
 
 class VcdChange(NamedTuple):
-    """A change of one variable. `quality` marks the number of a tag's quality."""
+    """A change of one variable. `quality`: the value is the number of a tag's quality, not the tag's value."""
 
     t_ns: int
     scope: str

@@ -1,7 +1,7 @@
 """The time around a failure, extracted from a trace: frames on the buses, states of programs, values of tags.
 
 All windows of a scenario are filled in one pass over the events; each keeps at most `MOST_FRAMES` frames before the
-failure, `MOST_EXCHANGES` exchanges, and `MOST_STEPS` changes of each tag and state. Draws nothing.
+failure, `MOST_EXCHANGES` exchanges, and `MOST_STEPS` changes of each tag and state. This module draws nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class PlotStep:
 
 @dataclass(frozen=True, slots=True)
 class FaultBar:
-    """A fault that was active from `on_ns` to `off_ns` (None: it still was)."""
+    """A fault that was active from `on_ns` to `off_ns` (None: it was still active at the end of the trace)."""
 
     id: str
     name: str
@@ -62,7 +62,7 @@ class FrameLine:
 class Window:
     """The window around `check`, from `start_ns` to `end_ns`.
 
-    `cut` is the number of frames that were left out. `lost`: the trace begins later.
+    `cut` is the number of frames that were left out. `lost`: the trace begins only after `start_ns`.
     """
 
     check: CheckResult
@@ -80,7 +80,7 @@ class Window:
     """The problem of each frame that has one, by bus and time."""
     frames: int = 0
     thinned: set[str] = field(default_factory=set)
-    """Buses, tags and variables of which only a part is kept, because there was too much."""
+    """Buses, tags and variables of which only a part is kept, because there were too many events."""
 
     @property
     def lines(self) -> list[FrameLine]:
@@ -97,7 +97,7 @@ class Window:
 
 
 def around(check: CheckResult, end_ns: int) -> Window | None:
-    """Return the window of a check; None for a check that was never decided."""
+    """Return the empty window around the time of a check's verdict; None for a check without a verdict."""
     if check.t_ns is None:
         return None
     at = check.t_ns

@@ -121,14 +121,14 @@ class ReportedDevice:
 
     @property
     def type(self) -> str:
-        """Return maker and product if the device reports them; else the profile with which it was read."""
+        """Return vendor and product if the device reports them; else the profile with which it was read."""
         said = self.identity
         words = [said.get(name, "") for name in ("vendor", "product", "name", "product code", "model", "server id")]
         return ", ".join(dict.fromkeys(word for word in words if word)) or said.get("profile", "")
 
     @property
     def revision(self) -> str:
-        """Return its revisions of hardware and software, if it reports them."""
+        """Return the device's revisions of hardware and software; empty if it does not report them."""
         said = self.identity
         named = (("revision", ""), ("hardware", "hardware "), ("software", "software "))
         return ", ".join(prefix + said[name] for name, prefix in named if said.get(name))

@@ -29,9 +29,9 @@ from fieldtwin.reports.site.document import (
 from fieldtwin.reports.site.reading_dump import dump_piece
 
 MOST_BYTES = 1 << 28
-"""Limit for one JSON file; dumps are read line by line."""
+"""Largest size of a JSON file in bytes; dumps have no limit, because they are read line by line."""
 MOST_ROWS = 200
-"""Limit for the rows of one table: longer lists belong in a file, not on paper."""
+"""Largest number of rows of one table: longer lists belong in a file, not on paper."""
 SUFFIXES = (".json", ".jsonl")
 
 
@@ -44,7 +44,7 @@ def read_site(
 ) -> tuple[SiteDocument, list[str]]:
     """Return the document of all files, and the files of folders that were left out, with the reason.
 
-    Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` without any file.
+    Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` if there is no file.
     """
     pieces: list[tuple[Path, DocumentPiece]] = []
     left_out: list[str] = []
@@ -172,7 +172,7 @@ def _weight(case: dict[str, Any]) -> Weight:
 
 @cache
 def bases() -> dict[str, str]:
-    """Return the value of the basis by case ID, for all cases for devices."""
+    """Return, by case ID, the basis (`Basis.value`) of every test case for devices."""
     from fieldtwin.conformance.devices.canopen import cases as canopen_cases
     from fieldtwin.conformance.devices.modbus import cases as modbus_cases
 

@@ -51,7 +51,7 @@ def dump_piece(path: Path) -> DocumentPiece:
 def _verdict(dump: Dump) -> str:
     """Return the verdict: ``whole`` only if the dump is complete and every address gave a definite answer.
 
-    ``sampled``: it left out addresses between others with the same answer.
+    ``sampled``: the dump left out addresses between others with the same answer.
     """
     if not dump.ended:
         return "broken off"
@@ -83,7 +83,7 @@ def identity(dump: Dump) -> dict[str, str]:
 
 
 def _raw(dump: Dump, function: int) -> bytes:
-    """Return the data that the function returned; empty if there was no answer."""
+    """Return the data of the device's answer to the Modbus function `function`; empty if there was no answer."""
     try:
         return bytes.fromhex(dump.functions.get(function, {}).get("hex", ""))
     except (TypeError, ValueError):
@@ -116,7 +116,7 @@ def _spans(texts: Any, most: int = 8) -> str:
 
 
 def _places(found: dict[str, Any], key: str) -> str:
-    """Return the ranges in which every address has that state; for sampled ranges, how many have it."""
+    """Return the ranges in which every address has the state `key`; for a sampled range, how many addresses have it."""
     sampled = [
         f"{s['asked'] if key != 'not_asked' else s['addresses'] - s['asked']} of {s['range']}"
         for s in found.get("sampled", [])
@@ -126,7 +126,7 @@ def _places(found: dict[str, Any], key: str) -> str:
 
 
 def _longest(found: dict[str, Any]) -> str:
-    """Return the longest accepted read; it is a lower bound if no longer one was refused."""
+    """Return the size of the longest accepted read, with "or more" if the device refused no longer one."""
     if not found.get("max_read"):
         return ""
     return str(found["max_read"]) if found.get("limit_proved") else f"{found['max_read']} or more"

@@ -34,7 +34,7 @@ class CaptureTail:
         self._file.close()
 
     def read(self, start_ns: int) -> list[TraceEvent]:
-        """Return the new frames on the system's buses; times in ns since `start_ns`."""
+        """Return the frames that were captured on the system's buses since the last call; times in ns since `start_ns`."""
         *lines, self._rest = (self._rest + self._file.read(AT_ONCE)).split(b"\n")
         try:
             said = [json.loads(line) for line in lines if line]

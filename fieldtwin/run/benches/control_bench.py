@@ -1,4 +1,4 @@
-"""The bench of a scenario for a system that runs in processes, reached by control channels, process image and capture file.
+"""The test bench of a scenario whose system runs in separate processes. It uses their control channels, image and capture file.
 
 This is a `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. Its abilities depend on the parts
 that it can reach: without a field simulator it cannot inject faults, and without a capture it cannot see frames. It starts and
@@ -66,8 +66,8 @@ class Where:
     """The access to a running system.
 
     `run_dir` is its run directory on this host. `field_host` is its field simulator, ``HOST[:PORT]`` with a token, or
-    empty for the one in the run directory. `far` is its remote end, if no field simulator reports it. `capture` is the
-    capture file of its buses.
+    empty for the one in the run directory. `far` is the endpoint of the topside controller's modem, needed only if no field
+    simulator reports it. `capture` is the capture file of its buses.
     """
 
     run_dir: Path
@@ -84,7 +84,7 @@ class Where:
     foreign: bool = False
     """The controller is a user's program, so the bench cannot query a fieldtwin gateway."""
     env: Mapping[str, str] = field(default_factory=dict)
-    """The environment variables that tell that program the endpoints; endpoints of probes may refer to them."""
+    """The environment variables that give a user's program the endpoints; endpoints of probes may refer to them."""
     allowed: Impact = Impact.DISRUPT
 
 
@@ -135,9 +135,9 @@ class ControlBench(AsyncResource):
         self._asked: list[str] = []
         self._seen_ns = 0
         self._since: int | None = None
-        """The number of the newest sample that was seen, None before the first answer."""
+        """The number of the newest change of a tag that the gateway has reported; None before its first answer."""
         self._refused = 0
-        """The newest refusal that was seen, by its number in the gateway's journal."""
+        """The number, in the gateway's journal, of the newest refused output that the gateway has reported."""
         self._updates: dict[str, int] = {}
         self._states: dict[str, Any] = {}
         self._words: dict[str, dict[int, str]] = {}
@@ -258,7 +258,7 @@ class ControlBench(AsyncResource):
             self._env = {**environment_from(status, self.system, self._field_at, self._field_socket), **self._where.env}
 
     async def _served(self, name: str) -> Endpoint:
-        """Return the endpoint at which the gateway serves `name` of the system file; wait until it does."""
+        """Return the listening endpoint of the gateway's server `name` in the system file. Wait until the server listens."""
         assert self._gateway is not None
         until_s = self.now_s() + SERVED_WITHIN_S
         while not (listening := (await self._gateway.ask("get", GatewayStatus)).serve[name].listening):
@@ -357,7 +357,7 @@ class ControlBench(AsyncResource):
         self._note(TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
-        """Return the values that a device held.
+        """Return the values that a device held for the tag `name`, each as (time in s since the start, raw bytes).
 
         All processes share the host's clock: `compose` is tested on the host of its containers.
         """
@@ -403,7 +403,7 @@ class ControlBench(AsyncResource):
 
     @asynccontextmanager
     async def _naming_causes(self) -> AsyncIterator[None]:
-        """Raise the failure of the process in place of a lost control channel."""
+        """If a control channel is lost within this context, raise the error that ended its process instead."""
         try:
             yield
         except Unreachable as e:
@@ -471,7 +471,7 @@ class ControlBench(AsyncResource):
         return events
 
     async def _ask_plc(self) -> None:
-        """Query the lateness of scans since the last query: a new maximum, or an overrun of the limit."""
+        """Query the PLC's status: whether it has stopped, and how late its scans were since the last query."""
         assert self._plc is not None
         told = await self._plc.ask("get", PlcStatus, brief=True)
         self._stopped = self._what_stopped(told)

@@ -101,6 +101,6 @@ class FieldLease:
         return int(answer["now_ns"])
 
     async def release(self) -> None:
-        """End the lease. If the field simulator cannot be reached, it expires."""
+        """End the lease. If the field simulator cannot be reached, the lease expires by itself."""
         with suppress(FieldtwinError):
             await self._client.call("lease", id=self.id, release=True)

@@ -1,8 +1,8 @@
 """The lateness of a test that runs on the same host as the system. Times are in seconds since the scenario's start.
 
 There are two measures, which must not be mixed. *Own* lateness is the time by which a sleep of the testing process ended too
-late: the host did not serve it, and the system under test has no part in it. *Any* lateness also includes slow answers and
-scans of the PLC that began late: the cause may be the host, or a gateway that is stuck.
+late: the host gave it no processor time, and the system under test is not the cause. *Any* lateness also includes slow answers
+and scans of the PLC that began late: the cause may be the host, or a gateway that is stuck.
 """
 
 from __future__ import annotations

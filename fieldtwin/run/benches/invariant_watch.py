@@ -1,4 +1,4 @@
-"""Check the invariants of a system file during a run and report them in its summary. A broken one makes the run fail."""
+"""Check the invariants of a system file during a run and report them in its summary. A broken invariant makes the run fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Probes: registers of a third-party controller, polled with the gateway's own Modbus client into a separate table."""
+"""Probes: registers of a third-party controller that a scenario polls with the gateway's Modbus client, apart from the tags."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Probes:
     """All probes of a scenario. ``await run()`` polls them until cancelled; `reading` returns the latest values, and `changes`
     the changes since its last call.
 
-    `served` returns the endpoint of a server of the system itself, by name.
+    `served` gives the endpoint of each server of the system's own gateway that a probe polls, by name.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Probes:
         )
 
     def why_unknown(self, name: str) -> str:
-        """Return the endpoint that did not answer for a probe's register, and its error; empty for all other names."""
+        """Return why a probe's register has no value: the endpoint that did not answer, and its error. Empty for other names."""
         bus = next((one for one in self._buses if one.config.name == name.partition(".")[0]), None)
         if bus is None or name not in self.names:
             return ""

@@ -1,4 +1,4 @@
-"""A scenario's bench for a prototype in virtual time: it records events in the trace, and answers the checks of the scenario.
+"""The test bench of a scenario for a prototype in virtual time: it records events and reads the values that checks need.
 
 This is a `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
 """
@@ -49,7 +49,7 @@ class VirtualBench(AsyncResource):
     """A bench: ``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
     `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `has_topside` False omits
-    the client. `water`: the acoustic connections of transmitters that belong to a network's acoustic channel.
+    the client. `water`: for each transmitter in a network's acoustic channel, its connection to that channel.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class VirtualBench(AsyncResource):
             await self.run.clock.sleep_until_ns(self.loop.now_ns + NS_PER_MS)
 
     def _served(self, name: str) -> Endpoint:
-        """Return the endpoint at which the gateway serves `name` of the system file."""
+        """Return the listening endpoint of the gateway's server `name` in the system file."""
         for server in self.run.gateway.servers:
             if server.config.name == name and server.front.bound is not None:
                 return server.front.bound

@@ -26,7 +26,7 @@ from fieldtwin.scenarios.language.form import Scenario, load_scenario
 SHORTEST_S = 600.0
 """Default duration in seconds of a run with random faults."""
 _BY_RUN = ("running", "refused", "judge")
-"""Names of checks whose text does not depend on the cause of the failure."""
+"""The checks of a whole run, whose text does not name the cause of a failure; `got` does."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Campaign:
         return scenario
 
     def length_s(self, scenario: Scenario) -> float:
-        """Return how long a run with random faults lasts."""
+        """Return the duration in seconds of a run with random faults."""
         return self.duration_s or max(SHORTEST_S, longest_s(scenario))
 
 
@@ -101,8 +101,8 @@ def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | N
 
 
 def _slim(campaign: Campaign, seed: int) -> ScenarioResult:
-    """Run a seed and drop the events of its run, because those of two hundred seeds would not fit into memory. A seed can be
-    run again to see them.
+    """Run a seed and drop the events of its run, because the events of two hundred seeds would not fit into memory. To see
+    them, run the seed again.
     """
     result = run_seed(campaign, seed)
     return replace(result, trace=(), dropped=0)
@@ -185,7 +185,9 @@ def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
 
 
 def broken_by(result: ScenarioResult) -> list[str]:
-    """Return the failures of a run without their places in the file, so that they match those of a scenario written for it."""
+    """Return the failures of a run without their places in the file, so that they can be compared with those of a
+    scenario that was written to reproduce the run.
+    """
     told: list[str] = []
     for check in result.checks:
         if not check.verdict.bad:

@@ -1,4 +1,4 @@
-"""Confirm a scenario that was written for a failure: it has to fail in the same way."""
+"""Confirm a scenario that was written to reproduce a failure: it has to fail in the same way."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def confirm_run(path: Path, found: SeedResult, profiles: tuple[Path, ...]) -> st
 
 
 def ended(result: ScenarioResult) -> str:
-    """Return a sentence about the result of a scenario that was expected to fail in a certain way."""
+    """Return a sentence about the result of a scenario that should have failed like the run that it reproduces."""
     if result.verdict is Verdict.PASSED:
         return "this scenario passes"
     return f"this scenario has a different result ({result.verdict.value}: {result.reason})"

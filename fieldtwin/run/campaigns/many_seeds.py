@@ -18,7 +18,9 @@ _ERRORS_SHOWN = 5
 
 @dataclass(frozen=True, slots=True)
 class SeedResult:
-    """The result of one seed's run. `checked` values were compared with devices' values, `wrong` of them were never held."""
+    """The result of one seed's run. `checked` is the number of published values that were compared with the devices' values;
+    `wrong` of them were never held by the device.
+    """
 
     seed: int
     ok: bool
@@ -49,7 +51,7 @@ def what_runs(options: VirtualOptions) -> str:
 
 
 def run_seed(options: VirtualOptions) -> SeedResult:
-    """Make one complete run with this seed."""
+    """Make one complete run with the seed in `options`."""
     run = VirtualRun(options)
     run.run()
     summary = run.summary()

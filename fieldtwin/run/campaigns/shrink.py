@@ -93,7 +93,7 @@ def as_scenario(
 ) -> str:
     """Return a scenario file that injects the faults, lets `duration_s` pass, and is checked by `keys`, by default as a run.
 
-    `acts`: further steps, each with its time (s since the start).
+    `acts`: further steps, each with its time (s since the start). `why`: the errors of the run, for a comment.
     """
     lines = [
         "# Shrunk from a run that failed:",

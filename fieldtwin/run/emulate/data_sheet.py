@@ -65,7 +65,7 @@ async def run_data_sheet(
 
 
 async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None) -> int:
-    """Run as `run_data_sheet`, with a data sheet made from the log, so that the node has exactly the logged objects."""
+    """Serve like `run_data_sheet`, with a data sheet made from the log, so that the node has exactly the logged objects."""
     log = CanLog(path)
     there = nodes_of(log.frames())
     if node_id is None and len(there) != 1:

@@ -188,7 +188,7 @@ def replayed_units(
 
 
 def _kind(profile: DeviceProfile, wires: list[Endpoint]) -> ConnectionKind:
-    """Return the kind of connection of the emulated device, which is that of its first endpoint. A modem is on TCP."""
+    """Return the kind of connection of the emulated device, which is that of its first endpoint. A modem always counts as TCP."""
     on_line = plant_of(wires[0]).is_serial and profile.inbox is None
     return RS232Connection if on_line else TCPConnection
 

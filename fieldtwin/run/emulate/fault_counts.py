@@ -1,4 +1,4 @@
-"""Prints how often faults took effect, at the end of a run. A fault that never took effect has tested nothing."""
+"""Describe how often faults took effect, for the end of a run. A fault that never took effect has tested nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serves emulated devices in this terminal until a signal or a failure ends it."""
+"""Serve emulated devices in this terminal until a signal or a failure ends it."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class BridgeOptions:
 
 
 def bridge_config(options: BridgeOptions) -> BridgeConfig:
-    """Return the bridge for the options: reading functions only, unless writes are allowed; then every function."""
+    """Return the configuration of the bridge. It forwards only reading functions, or every function if writes are allowed."""
     functions = frozenset(range(1, 128)) if options.allow_writes else READ_FUNCTIONS
     return BridgeConfig(
         name="bridge",
@@ -132,7 +132,7 @@ async def run_bridge(options: BridgeOptions, report: Callable[[str], None]) -> d
 
 
 async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, report: Callable[[str], None]) -> None:
-    """Report where the bridge listens, and each connection and disconnection of an end. A missing end is retried forever."""
+    """Report where the bridge listens, and each loss and return of its listening endpoint or bus. Both are retried forever."""
     said: tuple[str, str] | None = None
     while True:
         bound = bridge.front.bound

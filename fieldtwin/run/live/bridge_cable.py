@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost
 
 
 class BridgeCable:
-    """A replacement for the line `plant`, with its speed. The gateway opens `gateway`; a client opens the link `master`."""
+    """A simulated cable at the speed of the line `plant`. The gateway opens the port `gateway`, a client the port `master`."""
 
     def __init__(self, plant: Endpoint, inside: PtyEnd, outside: PtyEnd) -> None:
         """Create a cable that is not open; the caller uses the class method `open`."""
@@ -41,7 +41,7 @@ class BridgeCable:
         return cls(plant, inside, outside)
 
     async def run(self) -> None:
-        """Carry bytes both ways until cancelled, or closed."""
+        """Carry bytes in both directions until cancelled, or until the cable is closed."""
         async with Nursery() as nursery:
             nursery.start(self._carry(self._outside, self._inside), "towards the gateway")
             nursery.start(self._carry(self._inside, self._outside), "towards the client")

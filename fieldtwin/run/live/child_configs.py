@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from fieldtwin.twin.prototype.field_process import FieldConfig
 
 MODEM_EVERY_S = 1.0
-"""Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
+"""Minimum time in seconds between two values of a tag that the digital thread sends over a modem (some 30 events a second)."""
 
 
 def transmitter_of_thread(o: RunOptions, system: System) -> str:
-    """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
+    """Return the transmitter whose mailboxes the digital thread uses, or "". Raises `UsageError` if it cannot use them."""
     delegated = delegated_transmitter(o.thread, system)
     if delegated and not o.prototype and not o.allow_writes:
         raise UsageError(
@@ -70,7 +70,7 @@ def gateway_config(
     delegated: str,
     resolved: str,
 ) -> ControllerConfig:
-    """Return the configuration of the gateway. `delegated` names the transmitter that the thread uses, if any."""
+    """Return the configuration of the gateway. `delegated` names the transmitter that the digital thread uses, if any."""
     return ControllerConfig(
         system=str(system.path.resolve()),
         run_dir=str(run_dir),

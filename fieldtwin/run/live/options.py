@@ -39,9 +39,9 @@ class RunOptions:
     thread: str = ""
     """The destination of the plant's side of a digital thread (`fieldtwin.twin.thread.place`), empty for none."""
     thread_store: str = ""
-    """The store of its log; the default is a file in the run directory."""
+    """The store of the digital thread's log; the default is a file in the run directory."""
     thread_every_s: float | None = None
-    """Minimum time in seconds between two new values of a tag in it. None: every value; over a modem, one a second."""
+    """Minimum time in seconds between two values of a tag in the thread's log. None: every value; over a modem, one a second."""
     seed: int | None = None
     """The seed of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()

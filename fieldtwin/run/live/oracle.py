@@ -1,6 +1,6 @@
 """The check of a prototype run: the device held every value that was published as good.
 
-It fetches the values that the gateway published and those that the emulators held, by number, so that none is compared
+It fetches the values that the gateway published and those that the emulators held, by journal number, so that none is compared
 twice and memory stays bounded. A value is right if the device held exactly these bytes for this tag at or before the time of
 the value.
 """

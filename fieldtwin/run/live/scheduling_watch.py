@@ -1,4 +1,4 @@
-"""Notice that this process was stopped or got no processor time: then it does not know whether other processes answered."""
+"""Detect that this process was stopped or got no processor time; meanwhile missing answers of other processes prove nothing."""
 
 from __future__ import annotations
 

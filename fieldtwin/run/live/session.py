@@ -1,8 +1,9 @@
 """A run: the field simulator (of a prototype), PLC, gateway and remote client, and all their results.
 
 Start order: process image, field simulator, PLC, gateway, remote client. Stop order is the reverse, with safe outputs
-in between; the counters of both sides are read when the buses are idle. The death of a process does not end the run:
-the other processes show its consequences, and the run fails. The thread's process, which only observes, is restarted.
+in between; the counters of gateway and emulators are read when the buses are idle. The death of a process does not end the
+run: the other processes show its consequences, and the run fails. The digital thread's process, which only observes, is
+restarted.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ class RunSession(AsyncResource):
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
         self._resolved = ""
-        """The file that hands the system to gateway and thread; the prototype has its own, which a gateway cannot read."""
+        """The file from which gateway and digital thread read the system. The field simulator reads a different file."""
         self.recreated = 0
         """How often a scenario has reset the simulated devices."""
         self.field_return: FieldReturn | None = None
@@ -143,13 +144,13 @@ class RunSession(AsyncResource):
 
     @property
     def disturbed(self) -> bool:
-        """Return whether faults were injected, or the field simulator was away: then the counts of both sides may differ."""
+        """Return whether there were faults or the field simulator was lost; then gateway and emulators may count differently."""
         lost = self.field_return is not None and self.field_return.losses > 0
         return bool(self.faults) or lost or self.recreated > 0
 
     @property
     def calm(self) -> bool:
-        """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
+        """Return whether the run had no faults, so that all must be good at its end. Recovery times are checked by scenarios."""
         return not self.faults and not self.recreated
 
     def summary(self) -> dict[str, Any]:
@@ -434,7 +435,7 @@ class RunSession(AsyncResource):
     async def _answer(
         self, client: ControlClient | None, name: str, ask: Callable[[ControlClient], Awaitable[T]]
     ) -> T | None:
-        """Return the answer of a process; without one, note an error. `name` is empty if it is monitored elsewhere."""
+        """Return the answer of a process, None if there is none. A timeout is an error of the run, if `name` is not empty."""
         if client is None:
             return None
         try:

@@ -1,4 +1,4 @@
-"""The verdict on a run: whether both sides' counters, the published values and the observed states agree."""
+"""The verdict on a run: the counters of gateway and emulators, the published values and the observed states must agree."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RunFacts:
     instance: str
     elapsed_s: float
     disturbed: bool
-    """Faults were injected, or the simulated field devices were lost or created again, so the counts of both sides may differ."""
+    """Faults were injected, or the simulated field devices were lost or created again, so the counts may differ."""
     calm: bool
     """There were no faults, or the last one has been over for long enough that the system must have recovered."""
     errors: Sequence[str]
@@ -49,7 +49,7 @@ class RunFacts:
     published: Mapping[str, Any]
     """How many published values were checked against those that the devices held, and the first wrong ones."""
     wrong_messages: Sequence[str] = ()
-    """Commands that reached the gateway through a mailbox and should not have. A run in real time cannot detect them."""
+    """Errors of commands that reached the gateway through a mailbox twice, too late or changed. Detected in virtual time only."""
     invariants: Sequence[Mapping[str, Any]] = ()
     """The results of the system file's invariants, and the errors that follow from them."""
     invariant_errors: Sequence[str] = ()
@@ -228,9 +228,9 @@ def _others(
 
 
 def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
-    """Compare the counts of both sides of each bus; return one sentence for each difference.
+    """Compare the gateway's and the emulators' counts of each bus; return one sentence for each difference.
 
-    A reply that was late, damaged, or still in transit when the gateway stopped counts on the emulators' side only. A
+    A reply that was late, damaged, or still in transit when the gateway stopped is counted by the emulators only. A
     device that the digital thread also uses is not compared.
     """
     failed = []

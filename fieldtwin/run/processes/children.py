@@ -30,7 +30,7 @@ class ChildFailed(FieldtwinError):
 
 
 async def cause_of(lost: Unreachable, failure: Failure) -> FieldtwinError:
-    """Return the error that ended a process; `lost`, the error of its control channel, if all processes run.
+    """Return the error that ended a process. If all processes still run, return `lost`, the error of the control channel.
 
     A process that fails closes its channel a moment before it ends, so the failure may appear up to `ENDS_WITHIN_S` later.
     """
@@ -42,9 +42,9 @@ async def cause_of(lost: Unreachable, failure: Failure) -> FieldtwinError:
 
 
 def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:
-    """Start a process that writes its output to `log`.
+    """Start a child process that writes its output to `log`.
 
-    It gets a separate session, so that Ctrl-C reaches only this process, which then ends its children in order.
+    The child gets a separate session, so that Ctrl-C reaches only the calling process, which then ends its children in order.
     """
     with log.open("wb") as out:
         return subprocess.Popen(
@@ -53,9 +53,9 @@ def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:
 
 
 class Child:
-    """One child process, in a separate session: Ctrl-C reaches only this process, which then ends its children in order.
+    """One child process, in a separate session: Ctrl-C reaches only its parent, which then ends its children in order.
 
-    If this process is killed, the child ends by itself after `linger_s` seconds.
+    If the parent is killed, the child ends by itself after `linger_s` seconds.
     """
 
     def __init__(self, name: str, module: str, config: Path, run_dir: Path, linger_s: float = 0.0) -> None:

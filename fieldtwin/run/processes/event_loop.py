@@ -1,6 +1,7 @@
-"""Choose the event loop of a server program: uvloop if it is installed (the `perf` extra), else asyncio's with exact waits.
+"""Choose the event loop of a server program: uvloop if it is installed (the `perf` extra), else asyncio's own loop.
 
-uvloop is the fastest on sockets, but it waits for whole milliseconds, which is too coarse for a serial line.
+uvloop is the fastest on sockets, but its timers have whole milliseconds, which is too coarse for a serial line. A serial
+line therefore gets asyncio's loop with exact timers.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ T = TypeVar("T")
 
 
 def run(main: Coroutine[Any, Any, T], *, serial: bool = False) -> T:
-    """Run `main` as `asyncio.run` does. `serial` states whether it needs the exact waits of a serial line."""
+    """Run `main` as `asyncio.run` does. `serial` states whether `main` needs the exact timers of a serial line."""
     factory: Callable[[], asyncio.AbstractEventLoop] = precise_loop
     if not serial:
         with suppress(ImportError):

@@ -1,8 +1,8 @@
 """Find the field simulator of `--target compose` if the user named none.
 
 In this order: FIELDTWIN_CONTROL (the scenario runs under `fieldtwin with`), the field simulator in the instance's own
-run directory, the only field simulator of this system that runs on this host alone (`fieldtwin with`, `fieldtwin
-emulate`), and the host `field` of the compose file.
+run directory, the only field simulator of this system that runs on this host without a gateway (`fieldtwin with`,
+`fieldtwin emulate`), and the host `field` of the compose file.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _sockets(root: Path) -> list[Path]:
 
 
 async def _is_of(path: Path, system: System) -> bool:
-    """Return whether a field simulator answers there that simulates the devices of exactly this system file."""
+    """Return whether the field simulator that listens at the socket `path` simulates exactly this system file."""
     try:
         client = await ControlClient.connect_unix(path)
     except FieldtwinError:

@@ -1,6 +1,6 @@
 """Reconnect the run's control client to a remote field simulator, with back-off, after the simulator was lost.
 
-Gateway, remote client and links have their own connections and reconnect by themselves; their values are bad meanwhile.
+Gateway, remote client and links have their own connections and reconnect by themselves; until then, values are bad.
 This module knows only the control channel: when it was lost, when it came back, and whether the simulator is still the
 same process.
 """
@@ -49,7 +49,7 @@ class FieldReturn:
         self._reason = ""
         self.losses = 0
         self.news = ""
-        """A sentence for the user about the latest return."""
+        """A sentence for the user about the latest reconnection."""
         self.moved = ""
         """The reason why the gateway cannot reach the returned simulator, if any."""
 
@@ -65,7 +65,7 @@ class FieldReturn:
         return self._reason or f"the field simulator at {self._where} was lost: the values of its devices are not known"
 
     def lost(self) -> None:
-        """Record that a call was not answered, or that its connection is lost."""
+        """Record that the field simulator did not answer a call, or that the control connection is lost."""
         if not self._gone.is_set():
             self.losses += 1
             self._gone_s = asyncio.get_running_loop().time()

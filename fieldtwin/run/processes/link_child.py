@@ -12,8 +12,8 @@ from fieldtwin.run.processes.children import START_TIMEOUT_S, spawn
 from fieldtwin.twin.plant.child import command
 
 LINGER_S = 2.0
-"""Time in seconds for which the serial line stays open after this process was killed, so that the gateway can write its safe
-values over it.
+"""Time in seconds for which the serial line stays open after the run's own process was killed, so that the gateway can write
+its safe values over it.
 """
 
 

@@ -1,4 +1,4 @@
-"""Connect to the PLC of a running instance; run proofs and draw diagrams of a system's programs. It prints nothing."""
+"""Connect to the PLC of a running instance, and find programs of a system and their proofs. This module prints nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ T = TypeVar("T")
 ACCEPTS_WITHIN_S = 1.0
 """Time in seconds in which a process has to accept a connection before it counts as gone."""
 LOOK_S = 0.02
-"""Seconds between two queries of whether all steps are done."""
+"""Interval in seconds at which `step_and_wait` queries whether all steps are done."""
 
 
 def running_instances() -> list[str]:
@@ -42,7 +42,7 @@ def _accepts(path: Path) -> bool:
 
 
 def choose(instance: str) -> Path:
-    """Return the PLC socket of the instance `name`, or that of the only running instance if the name is empty. Raises
+    """Return the PLC socket of an instance by name, or that of the only running instance if the name is empty. Raises
     `UsageError`, `Unreachable`.
     """
     if not instance:

@@ -1,6 +1,6 @@
 """Make a running instance read its files again: the gateway checks and applies them, and sends new limits to the PLC.
 
-SIGHUP and `fieldtwin reload` both use it. It prints nothing.
+SIGHUP and `fieldtwin reload` both use this module. It prints nothing.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Reloaded:
 
 
 async def reload(gateway: ControlClient, plc: ControlClient | None, by: str, *, check: bool = False) -> Reloaded:
-    """Make the instance behind these two clients read its files again. With `check` nothing is applied.
+    """Make the instance to which these two clients are connected read its files again. With `check` nothing is applied.
 
     Raises `RemoteError` with the line if a file is invalid, and the errors of the connections; nothing has changed
     then.

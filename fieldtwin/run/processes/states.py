@@ -29,7 +29,7 @@ def expected_states(periods_s: Iterable[int]) -> list[str]:
 
 
 def state_words(layout: ImageLayout, programs: Iterable[str]) -> dict[str, dict[int, str]]:
-    """Return, for each program with a `state` that has names, the name of each code."""
+    """Return, for each program whose `state` has named values, the name of each value."""
     tags = {tag.name: tag for region in layout.regions for tag in region.tags}
     return {p: dict(tags[f"{p}.state"].words) for p in programs if f"{p}.state" in tags and tags[f"{p}.state"].words}
 
@@ -68,7 +68,7 @@ class StateWatch:
                 self._reader = None
 
     def knows(self, layout: ImageLayout) -> None:
-        """Learn the names of each program's states from this process image."""
+        """Read the names of each program's states from the layout of the process image."""
         self._words = state_words(layout, self._programs)
 
     @property
@@ -78,7 +78,7 @@ class StateWatch:
 
     @property
     def relays(self) -> list[str]:
-        """Return the programs that are the paper's state machine: only it follows the topside controller's commands."""
+        """Return the programs that are the reference state machine: only these follow the topside controller's commands."""
         return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]
 
     def look(self, now_ns: int) -> None:
@@ -107,9 +107,9 @@ class StateWatch:
             seen.append(((now_ns - self._first_ns) / 1e9, state))
 
     def sequence(self, program: str) -> list[str]:
-        """Return the states of a program in the order in which it was in them."""
+        """Return the states of a program, in order of time."""
         return [state for _, state in self.transitions.get(program, [])]
 
     def seen(self) -> SeenStates:
-        """Return the states until now."""
+        """Return all states that were recorded until now."""
         return SeenStates({p: self.sequence(p) for p in self.programs}, dict(self.transitions), tuple(self.relays))

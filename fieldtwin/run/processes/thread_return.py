@@ -1,7 +1,7 @@
-"""Keep the thread's process of a run alive: restart it when it dies.
+"""Restart the process of a run's digital thread whenever it dies.
 
-The thread only observes, and no control function depends on it, so a plant continues without it; events during the gap
-are in no log, so the gap is kept short. This module does not depend on the meaning of a digital thread or on its destination.
+The digital thread only observes, and no control function depends on it, so a plant continues without it; events during the gap
+are in no log, so the gap is kept short. This module does not depend on the data or the destination of the digital thread.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from fieldtwin.run.processes.children import Child
 
 FIRST_S, LIMIT_S = 0.5, 60.0
 LASTED_S = 60.0
-"""If a child ran for this time in seconds, it is restarted without a delay."""
+"""If a child ran for longer than this (seconds), the growing delay before a restart begins again at its first value."""
 LOOK_S = 0.1
 
 
 class ThreadReturn:
-    """A watcher of `child`.
+    """A watcher that restarts `child`, the process of the digital thread.
 
     `start` creates a new child, `came` is called with its control channel, and `failed` with the reason why a child did not
     start. `deaths` counts the children that died. After `run` has ended, `end` ends the current child.
@@ -71,5 +71,5 @@ class ThreadReturn:
                 await client.aclose()
 
     async def end(self) -> None:
-        """End the current child in order."""
+        """End the current child process: SIGTERM first, SIGKILL after a time limit."""
         await self._child.end()

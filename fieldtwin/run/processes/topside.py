@@ -1,6 +1,6 @@
-"""The topside controller: a transmitter at the other end of the modems' link, and a script of commands.
+"""The topside controller: a transmitter at the topside end of the modem link, and a script of commands.
 
-The same `TransmitterDriver` as on the plant's side serves it, over the same runtime, with inputs and outputs exchanged.
+It uses the same `TransmitterDriver` and runtime as the plant's side, with inputs and outputs exchanged.
 Commands are periods in seconds; the next is sent when it is due and the transmitter has accepted the last.
 """
 
@@ -69,7 +69,7 @@ def parse_periods(text: str) -> tuple[int, ...]:
 
 
 class TopsideController:
-    """The remote end of one transmitter of `system`, reached at `endpoint`."""
+    """The topside controller for one transmitter of `system`; its modem is reached at `endpoint`."""
 
     def __init__(
         self, system: System, device: str, endpoint: Endpoint, clock: Clock, connector: Connector | None = None
@@ -97,7 +97,7 @@ class TopsideController:
         """Called with each period when it is commanded."""
 
     async def run(self, commands: list[Scripted]) -> None:
-        """Serve the remote end until cancelled, sending each command at its time."""
+        """Operate the topside end of the link until cancelled, and send each command at its time."""
         async with Nursery() as nursery:
             nursery.start(self._bus.run(), "far transmitter")
             nursery.start(self._cycle(deque(commands)), "topside")

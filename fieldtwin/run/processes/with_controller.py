@@ -39,7 +39,7 @@ class ControllerEnded(FieldtwinError):
 
 
 class WithController(AsyncResource):
-    """Both processes: ``async with WithController(system, config, argv, name) as both``.
+    """The field simulator and the user's program: ``async with WithController(system, config, argv, name) as both``.
 
     `name` is the run directory's; it is removed at the end. Raises `UsageError` for a program that does not exist,
     before anything starts.
@@ -49,7 +49,7 @@ class WithController(AsyncResource):
         super().__init__()
         self.instance = Instance(name)
         self.env: dict[str, str] = {}
-        """The environment variables that tell the program where the devices are."""
+        """The environment variables that give the program the endpoints of the devices."""
         self._system = system
         self._config = config
         self._argv = list(argv)

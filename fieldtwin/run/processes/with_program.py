@@ -1,4 +1,4 @@
-"""Run a third-party program against the emulated field: start it with the ports in its environment, return its exit status.
+"""Run a third-party program against simulated field devices, whose endpoints are in its environment; return its exit status.
 
 The program keeps the terminal: its output is not changed, and Ctrl-C goes to it.
 """
@@ -57,8 +57,8 @@ def environment(contact: FieldContact, system: System, control: Path) -> dict[st
 
 
 def environment_from(status: FieldStatus, system: System, host: str, control: Path) -> dict[str, str]:
-    """Return these variables from the answer of a field simulator on `host` to `get`. Ports that cannot be reached are
-    omitted.
+    """Return the variables of `environment` from the answer of a field simulator on `host` to `get`. Ports that cannot be
+    reached from this host are omitted.
     """
     env: dict[str, str] = {}
     for bus, url in status.listening.items():

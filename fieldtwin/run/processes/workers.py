@@ -1,7 +1,7 @@
 """Worker processes that share a task and end with it: after Ctrl-C no worker continues, and no worker prints a traceback.
 
-A worker that receives Ctrl-C while it still imports would print one. SIGINT is therefore blocked in it until it can
-handle it.
+A worker that receives SIGINT while it still imports modules would print a traceback. SIGINT is therefore blocked in a worker
+until the worker can handle it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Workers:
-    """At most `jobs` processes.
+    """A pool of at most `jobs` worker processes.
 
     Use it as a context manager; when an error or Ctrl-C ends the block, they are ended at once.
     """
@@ -29,7 +29,7 @@ class Workers:
         self._pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_ends_quietly)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run `work` in a free process, or in the next one that becomes free; a process may be started for it."""
+        """Run `work` in a free process, in a new one if there are fewer than `jobs`, or else in the next that becomes free."""
         with _sigint_held_back():
             return self._pool.submit(work, *args, **kwargs)
 

@@ -1,7 +1,7 @@
-"""A running digital shadow: the thread that delivers the plant's observations, the store that keeps them, and the shadow.
+"""A running digital shadow: the digital thread that delivers the plant's observations, the store that keeps them, and the model.
 
-The transmitter's side is assembled here, outside of `fieldtwin.twin.model.shadow` (paper.md, ruling 16): it acknowledges
-events and requests missing ones, and has no log to send.
+The part that sends to the plant is assembled here, outside of `fieldtwin.twin.model.shadow`
+(docs/explanation/paper.md, ruling 16): it acknowledges events and requests missing ones, and has no log to send.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ STALE_AFTER_MS = 30_000
 
 
 def limits_of(system: System) -> dict[str, Limits]:
-    """Return the limits of every tag whose profile states some."""
+    """Return the limits of every tag for which its profile states limits, by DEVICE.TAG."""
     return {
         f"{d.name}.{t.name}": t.limits
         for d in system.devices.values()
@@ -54,8 +54,8 @@ def limits_of(system: System) -> dict[str, Limits]:
 class Shadowing:
     """A digital shadow of a plant: ``await Shadowing(...).run(stop)``. `on_verdict` is called with each verdict.
 
-    While it runs it serves commands on `KIND.sock` in the run directory: ready (an event of the plant arrived and the thread
-    is connected) and get for health checks, and status (`TwinStatus`) for programs that show it.
+    While it runs it serves commands on `KIND.sock` in the run directory: ready (an event of the plant arrived and the digital
+    thread is connected) and get for health checks, and status (`TwinStatus`) for programs that show it.
     """
 
     kind = "shadow"
@@ -73,7 +73,7 @@ class Shadowing:
         self.receiving = ReceivingEnd("from the plant")
         self.shadow = self._make(system)
         self.prototypes: set[str] = set()
-        """Origins whose field is emulated (paper.md, ruling 15)."""
+        """Origins of logs whose field devices are simulated (docs/explanation/paper.md, ruling 15)."""
         self.origins: set[str] = set()
         self._system = system
         self._place = place
@@ -81,10 +81,10 @@ class Shadowing:
         self._store = store or str(Path(instance.dir) / "knowledge.sqlite")
         self._on_verdict = on_verdict
         self.on_trouble: Callable[[str, str], None] = lambda where, text: None
-        """Called with each problem of the thread or the store, and with an empty text when it is over."""
+        """Called with each problem of the digital thread or the store, and with an empty text when the problem is over."""
         self._troubles: dict[str, str] = {}
         self._recalled = ""
-        """The origin of the log in the store with which the shadow began."""
+        """The origin of the stored log from which the shadow restored its knowledge at the start; empty if there was none."""
         self._end: ThreadEnd | None = None
 
     def _make(self, system: System) -> DigitalShadow:
@@ -93,7 +93,7 @@ class Shadowing:
         )
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
-        """Return this side of the thread: it receives, and has no log to send."""
+        """Return the receiving end of the digital thread; it has no log to send."""
         return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived, insists=False)
 
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
@@ -171,7 +171,7 @@ class Shadowing:
         """Stop a subclass's tasks without waiting for unfinished work. A plain shadow has no such tasks."""
 
     async def _flush(self) -> None:
-        """Write the remaining data other than the knowledge, after the last event. A shadow has none."""
+        """Write and send a subclass's remaining data, after the last event. A plain shadow has none."""
         return
 
     async def _work(self, writer: KnowledgeWriter) -> None:
@@ -204,7 +204,7 @@ class Shadowing:
                 writer.observe(event)
 
     def _kept(self, event: Event) -> None:
-        """Handle an event of this side's own knowledge before it is stored."""
+        """Handle an event that this shadow itself recorded, before it is stored."""
 
     def status(self) -> TwinStatus:
         """Return the present status, with the newest decisions."""
@@ -236,7 +236,7 @@ class Shadowing:
         )
 
     def describe(self) -> dict[str, Any]:
-        """Return the shadow's knowledge and the status of its thread."""
+        """Return the shadow's knowledge and the status of its digital thread."""
         thread = msgspec.to_builtins(self._end.status()) if self._end is not None else {}
         return {
             "system": self._system.name,

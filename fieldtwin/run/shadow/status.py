@@ -47,13 +47,13 @@ class CommandCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TwinStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A shadow or a twin. `commands` is None for a shadow, which has no way to send any."""
+    """The status of a shadow or a twin. `commands` is None for a shadow, which has no way to send any."""
 
     kind: str
     """``shadow`` or ``twin``."""
     system: str
     place: str
-    """The address at which it receives the plant's thread."""
+    """The address at which it receives the plant's digital thread."""
     now_ms: int
     origins: list[str]
     """The logs that it has received since it started."""

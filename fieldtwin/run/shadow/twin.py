@@ -1,7 +1,7 @@
-"""A running digital twin: a digital shadow that also commands the plant. Its commands form a log, which the thread delivers to
-the plant.
+"""A running digital twin: a digital shadow that also commands the plant. Its commands form a log, which the digital
+thread delivers to the plant.
 
-If configured, it first queries a prototype in a separate process (`fieldtwin.run.what_if.asking`).
+If configured, the twin first queries a prototype in a separate process (`fieldtwin.run.what_if.asking`).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Twinning(Shadowing):
         return end
 
     def plan(self, command: COMMAND) -> None:
-        """Add a user's plan by hand. It is handled like any other, after the first event of the plant."""
+        """Add a command that the user gives. It is handled like a planner's command, after the first event of the plant."""
         self._by_hand.append(command)
 
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:

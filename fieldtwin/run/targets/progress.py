@@ -22,13 +22,13 @@ from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.words import word_of
 
 VALUES_EVERY_S = 0.1
-"""The shortest time of the run between two lines with values of the same name."""
+"""The shortest time in seconds, on the run's clock, between two lines with values of the same name."""
 MOST_VALUES = 20_000
 RULES = ("always", "never", "within", "rate", "cycle")
 
 
 class Progress:
-    """Writes to one file. Raises `FileInvalid` if the file cannot be written."""
+    """The writer of the progress of one run to one file. Raises `FileInvalid` if the file cannot be written."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -40,11 +40,11 @@ class Progress:
         self._last: dict[str, tuple[int, dict[str, Any]]] = {}
         """The time and the value in the latest line of each name."""
         self._held: dict[str, TraceEvent] = {}
-        """The latest change of each name that followed its line too soon to be written."""
+        """For each name, the latest change that is not written yet, because it followed the last line too soon."""
         self._values = 0
 
     def begin(self, scenario: Scenario, target: str, trace: Trace) -> None:
-        """Write the parts of the scenario, and begin to follow the trace of its run."""
+        """Write the steps and checks of the scenario, and begin to follow the trace of its run."""
         steps = [
             {"number": str(n), "text": f"{word}: {said(getattr(step, word))}"}
             for n, step in enumerate(scenario.form.steps, 1)
@@ -128,7 +128,7 @@ def _names(scenario: Scenario) -> set[str]:
 
 
 def _checks(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield number and text of each check of the whole run, as its result will have the number."""
+    """Yield (number, text) of each check of the whole run; the check's result will have the same number."""
     for word in RULES:
         for n, one in enumerate(getattr(scenario.form, word), 1):
             yield f"{word} {n}", said(one)

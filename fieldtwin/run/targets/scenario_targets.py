@@ -48,7 +48,7 @@ class ScenarioTarget:
     """The target of a scenario.
 
     `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the system's name,
-    `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the remote end of a plant.
+    `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the topside modem of a plant.
     `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local` the
     interface of emulated CAN buses (`socketcan/vcan0`); empty: the interface in the prototype file. `controller`: on `local`
     the user's program and its arguments, which replaces fieldtwin's gateway and PLC.
@@ -149,7 +149,7 @@ def _attempt(
 
 
 def _of_a_group(kind: str, target: ScenarioTarget) -> str:
-    """Return the reason why the target cannot run a scenario of several systems; empty if it can."""
+    """Return the reason why the target cannot run a scenario of several systems (`kind` of their file); empty if it can."""
     if target.name != "local":
         return f"a {kind} runs as prototypes, on --target virtual or local only, not on {target.name}"
     if target.can:
@@ -185,7 +185,7 @@ def _words(target: ScenarioTarget) -> list[str]:
 
 
 def _with_words(target: ScenarioTarget) -> str:
-    """Return the part of the command line that names the user's controller; empty without one."""
+    """Return the part of the command line that names the user's controller; empty if there is none."""
     return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
 
 

@@ -1,4 +1,4 @@
-"""Ask the user before running a foreign scenario, or a scenario of a foreign system, as for a template.
+"""Ask for the user's consent before a scenario runs that is from a template, or whose system is.
 
 Only the names in the scenario are examined: reading it completely assembles the process image of its system, which
 imports programs.
@@ -35,8 +35,9 @@ def agree_to_scenario(
 
 
 def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) -> list[tuple[System, Path | None]]:
-    """Find the systems as `fieldtwin.scenarios.language.form` does: next to the scenario, or shipped.
+    """Return the scenario's systems, each with its prototype file; None stands for the one next to the system file.
 
+    They are found as `fieldtwin.scenarios.language.form` does: next to the scenario, or among the shipped systems.
     A file with several systems yields all of them.
     """
     name, prototype = str(said.get("system", "")), said.get("prototype")

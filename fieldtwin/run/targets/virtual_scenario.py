@@ -103,7 +103,7 @@ def run_virtual(
 
 
 async def _judged(runner: ScenarioRunner, judge: RunChecker | None, running: VirtualSystems) -> ScenarioResult:
-    """Run the scenario, with the checks of a run in addition if it requests them."""
+    """Run the scenario. If it requests `judge: run`, `judge` makes the checks of a run in addition."""
     if judge is None:
         return await runner.run()
     judge.attach(running.systems)
@@ -114,7 +114,7 @@ async def _judged(runner: ScenarioRunner, judge: RunChecker | None, running: Vir
 
 
 def reproduce(scenario: Scenario, *more: str) -> str:
-    """Return the command line that repeats a scenario."""
+    """Return the command line that repeats a scenario, with the options `more`."""
     profiles = [word for folder in scenario.profiles for word in ("--profiles", str(folder))]
     return shlex.join(["fieldtwin", "test", str(scenario.path), *more, *profiles])
 

@@ -1,8 +1,8 @@
 """The strict check of a run in virtual time: the device held every value that was published as good within the value's age.
 
-Both sides share one clock there, so the check is exact: between the moment of the request (for an unrequested value:
-the value's own time) and the publication the device must have held exactly these bytes at least once. Bounded: history
-older than `KEPT_NS` is dropped.
+Gateway and emulators share one clock in virtual time, so the check is exact: between the moment of the request (for an
+unrequested value: the value's own time) and the publication the device must have held exactly these bytes at least once.
+History older than `KEPT_NS` is dropped, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class AgeOracle:
         self._still_good.append((now_ns, tag, raw, value, source_ns))
 
     def check(self, emulated: frozenset[str]) -> None:
-        """Compare the waiting values with the device's history. Skip tags of devices that are not `emulated`."""
+        """Compare the values published since the last call with the devices' histories. Skip devices that are not `emulated`."""
         judged: dict[str, bool] = {}
         for now_ns, tag, raw, value, source_ns in self._waiting:
             if tag not in judged:

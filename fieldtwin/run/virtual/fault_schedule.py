@@ -125,7 +125,7 @@ def _is_seen(name: str, endpoint: Endpoint) -> bool:
 
 
 def _struck(system: System, name: str, device: str) -> list[str]:
-    """Return the tags of `device` that a value fault can change."""
+    """Return the tags of `device` whose values the fault `name` can change."""
     return [
         tag.name
         for tag in numbers(system.devices[device].profile.tags.values())

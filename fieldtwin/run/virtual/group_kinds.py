@@ -37,7 +37,7 @@ class VirtualSystems(Protocol):
 
     @property
     def topside(self) -> TopsideController | None:
-        """Return the name of the sender of commands that the systems share; empty if they share none."""
+        """Return the topside controller that the systems share; None if they share none."""
 
     def results(self) -> dict[str, Any]:
         """Return the part of the summary that is about the resources that the systems share."""

@@ -44,7 +44,7 @@ MOST_REASON = 2000
 
 @dataclass(frozen=True)
 class VirtualOptions:
-    """The systems of a run, and its duration in virtual seconds. `system` names the file of one system or of several.
+    """The options of a run. `system` names the file of one system or of several; the duration is in virtual seconds.
 
     `faults`, and those of the file `fault_file`, are injected in addition to those of `random_faults`, which the seed
     chooses; `trace` is a file for every
@@ -109,7 +109,7 @@ class VirtualRun:
         self._about: TraceAbout | None = None
         """The description of the trace, if there is one."""
         self._judged = False
-        """Whether the run has begun. An error before that is a mistake of the user, and is raised."""
+        """Whether the checks of the run have begun. An invalid file or option that is found before that is raised."""
 
     @property
     def scripted(self) -> list[Scripted]:
@@ -196,7 +196,7 @@ class VirtualRun:
             check.check(running.systems[name])
 
     async def _through(self, bench: Bench, loop: VirtualLoop, judge: Callable[[], None]) -> None:
-        """Advance to the end of the run's time, piece by piece."""
+        """Advance to the end of the run, `PIECE_S` at a time, and call `judge` after each piece."""
         while (left_s := self.options.duration_s - bench.now_s()) > 0:
             await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
             self.elapsed_s = bench.now_s()

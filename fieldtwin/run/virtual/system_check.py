@@ -37,12 +37,12 @@ from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 SETTLE_S = 10.0
-"""Time in seconds for a command in progress after the end of the run."""
+"""Longest time in seconds to wait, after the end of the run, until the programs have followed a command in progress."""
 LAST_REPLIES_S = 0.5
 CALM_S = 60.0
 """Time in seconds after the last fault in which the system must recover."""
 CAN_WIRE_NS = 10 * NS_PER_MS
-"""The time that a frame may need on a CAN bus: several attempts, after other frames."""
+"""The time in ns that a frame may need on a CAN bus, including repeated attempts and waiting for other frames."""
 STALE_CHECK_NS = 100 * NS_PER_MS
 """Minimum time between two checks for values that are still good although they exceed their maximum age."""
 _GOOD = Quality.GOOD  # module constants, because looking up members of an Enum is slow
@@ -51,7 +51,7 @@ _GOOD = Quality.GOOD  # module constants, because looking up members of an Enum 
 class SystemCheck:
     """The checks of one system. Call `attach`, then `check` from time to time, then `finish`, and then `summary`.
 
-    `faults` are those that are injected into this system. `disturbed`: whether the counts of both sides may differ;
+    `faults` are those that are injected into this system. `disturbed`: whether the counts of gateway and emulators may differ;
     by default if there are faults. `may_refuse`: tags of which a scenario expects that their outputs are refused.
     """
 
@@ -92,7 +92,7 @@ class SystemCheck:
         return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
 
     def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
-        """Judge the invariants of the system file from now on, as long as the tasks of `nursery` run."""
+        """Check the invariants of the system file from now on, in a task of `nursery`."""
         self.invariants = self._stated
         if self._stated:
             nursery.start(self._stated.run(bench, TICK_S), "invariants")
@@ -117,7 +117,7 @@ class SystemCheck:
         self._judge(bench.run.field)
 
     async def finish(self, bench: VirtualBench) -> None:
-        """Stop the gateway in order and take the last figures; then `summary`."""
+        """Stop the gateway in an orderly way and read the final counters. Call `summary` afterwards."""
         self.outputs_confirmed_safe = await bench.run.stop_gateway()
         outputs = describe(bench.run.gateway, bench.loop.now_ns).outputs  # a stopped node has no certain values
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
@@ -127,7 +127,7 @@ class SystemCheck:
         self._take_status(bench, outputs)
 
     async def settle(self, bench: VirtualBench) -> None:
-        """Wait for a command in progress, at most `SETTLE_S`."""
+        """Wait until the programs have followed all commands, at most `SETTLE_S`."""
         deadline_s = bench.now_s() + SETTLE_S
         while self.topside is not None and bench.now_s() < deadline_s:
             expected = expected_states(self.topside.commands_sent)

@@ -1,8 +1,8 @@
-"""The process that answers a question: ``python -m fieldtwin.run.what_if.asked``. It reads one JSON object and writes one.
+"""The process that simulates one command for a digital twin: ``python -m fieldtwin.run.what_if.asked``. JSON in, JSON out.
 
-Input, as `QuestionMessage`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty
-if the prototype does not object to the command. With ``"only_check": true`` nothing is run, and the objection is an error in
-the question.
+Input on stdin, as `QuestionMessage`: a system, its known state, a command and the requirements. Output on stdout:
+``{"objection": TEXT}``, empty if the prototype does not object to the command. With ``"only_check": true``
+nothing is run, and the objection is an error in the question.
 """
 
 from __future__ import annotations

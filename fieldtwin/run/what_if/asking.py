@@ -1,4 +1,4 @@
-"""Asks a prototype on behalf of a digital twin: one process per question, with a time limit, while the twin continues.
+"""Query a prototype before a digital twin sends a command: one process per query, with a time limit, while the twin continues.
 
 A missing answer is an objection: if the prototype fails, takes too long or cannot be forked, the command is not sent.
 """
@@ -29,11 +29,11 @@ VALUES_WITHIN_S = 12.0
 """Time in seconds within which a new twin has received every value: a plant repeats unchanged values every ten seconds."""
 LOOK_MS = 100
 MOST_KEPT = 1 << 16
-"""Bytes of the process's output that are kept."""
+"""Largest number of bytes of the process's output that are kept."""
 
 
 class QuestionMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A question as it is sent to the process `fieldtwin.run.what_if.asked`.
+    """A what-if question as it is sent to the process `fieldtwin.run.what_if.asked`.
 
     `require`, `finally_`, `horizon_s` and `settle_s` are as in `fieldtwin.twin.model.mape.what_if.Question`.
     """
@@ -61,8 +61,8 @@ class ForkSubject:
 
 
 class Asking:
-    """The `WhatIf` of a twin, which asks separate processes. The twin runs `run` as one of its tasks, and passes each received
-    event to `known`.
+    """The `WhatIf` of a twin, which runs each query in a separate process. The twin runs `run` as one of its tasks, and passes
+    each received event to `known`.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Asking:
 
 
 async def _talk_with(process: asyncio.subprocess.Process, question: bytes) -> tuple[bytes, bytes]:
-    """Send the question, and return the last `MOST_KEPT` bytes of the process's stdout and stderr."""
+    """Send `question` to the stdin of `process`, and return the last `MOST_KEPT` bytes of the process's stdout and stderr."""
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stderr is not None

@@ -1,4 +1,4 @@
-"""Initializes a fork with the known state: programs continue from their variables, devices from their values."""
+"""Initialize a fork with the known state: programs continue from their variables, devices from their values."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
     A recording is searched for its nearest row, a simulation by formulas continues from the values, and registers take
     them. A device with internal state (a drive's motor, a model in Python) starts as usual. The gateway writes the
-    outputs of the programs again. A program whose period is not one of its variables is commanded the known period.
-    Raises `FileInvalid` for a variable that cannot hold its value.
+    outputs of the programs again. If a program has a known period that is not one of its variables, the period is
+    sent as a command. Raises `FileInvalid` for a variable that cannot hold its value.
     """
     for bound in run.plc.programs:
         known = state.programs.get(bound.name)
@@ -48,7 +48,7 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
 
 def _command(run: VirtualPrototype, period_s: Number) -> None:
-    """Inject the command as if the transmitter had received it, if the plant has a transmitter and obeys its commands."""
+    """Inject a command with this sample period, as if the only transmitter had received it. Without one, do nothing."""
     if len(run.gateway.pumps) == 1 and isinstance(period_s, int):
         run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
 

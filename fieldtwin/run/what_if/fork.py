@@ -37,7 +37,7 @@ from fieldtwin.twin.prototype.virtual import VirtualPrototype
 LOOK_S = 1.0
 """Interval in seconds at which requirements are evaluated, in addition to each change of a program's variables."""
 BEGUN_S = 2.0
-"""A plan without a command in this time (seconds) has not moved a program from its initial state."""
+"""If a plan has no command in the first `BEGUN_S` seconds, every program must be in its known state by then."""
 MAX_TRANSITIONS = 10_000
 MAX_HORIZON_S = 30 * 86_400.0
 

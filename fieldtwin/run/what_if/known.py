@@ -1,4 +1,4 @@
-"""Reads the last known state of a plant from a knowledge store: an SQLite file, or PostgreSQL."""
+"""Read the last known state of a plant from a knowledge store: an SQLite file, or PostgreSQL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BLOCK = 5_000
 async def known_state(place: str, system: System, origin: str = "") -> KnownState:
     """Return the last known state of an origin in a knowledge store.
 
-    Without a name, there must be only one origin with tags or states. Raises `FileInvalid` or `UsageError`. If the last
+    Without `origin`, the store must have only one origin with tags or states. Raises `FileInvalid` or `UsageError`. If the last
     value of a tag was bad, no older one is used.
     """
     store = await open_knowledge(place)

@@ -18,7 +18,7 @@ from fieldtwin.twin.site.system import System
 
 
 class LastKnown:
-    """Keeps the newest value of each name. Events are passed to `take`, which accepts events of one or several logs, each in
+    """The newest value of each name. The caller passes events to `take`, which accepts those of one or several logs, each in
     order.
 
     A value that turned bad is not known.
@@ -74,7 +74,7 @@ def of_period(period_s: int) -> dict[str, Number]:
 
 
 def of_status(data: bytes) -> dict[str, Number]:
-    """Return the same variables from a STATUS, which has state and period; none if `data` is not a status."""
+    """Return the same variables from a STATUS message, which has state and period; empty if `data` is no such message."""
     try:
         name, period_s = decode_status(data)
     except Desync:

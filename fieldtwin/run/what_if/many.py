@@ -1,4 +1,4 @@
-"""Runs several plans in parallel, in processes on this computer."""
+"""Run several plans in parallel, in processes on this computer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldtwin.run.what_if.plan import WhatIfPlan
 def answers(
     fork: Fork, plans: Sequence[WhatIfPlan], jobs: int, progress: Progress = lambda outcome: None
 ) -> list[PlanOutcome]:
-    """Return the outcome of each plan, in their order. One job or one plan runs in this process. Raises like `answer`."""
+    """Return the outcome of each plan, in the order of `plans`. One job or plan runs in this process. Raises like `answer`."""
     if jobs <= 1 or len(plans) == 1:
         found = []
         for plan in plans:

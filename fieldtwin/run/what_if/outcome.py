@@ -45,7 +45,7 @@ class VariableOutcome:
             self.lowest, self.highest = min(self.lowest, value), max(self.highest, value)
 
     def ends(self, t_ns: int) -> None:
-        """End the last value at `t_ns`, and add it to the mean."""
+        """End the interval of the last value at `t_ns`, and add the value to the mean."""
         if self._held is not None and t_ns > self._since_ns:
             self._weighed += self._held * (t_ns - self._since_ns)
             self._spent_ns += t_ns - self._since_ns
@@ -103,7 +103,7 @@ class Series:
 
 @dataclass(slots=True)
 class Requirement:
-    """A requirement. `kind` is ``require`` or ``finally``.
+    """A requirement of a plan and whether it held. `kind` is ``require`` or ``finally``.
 
     `broken_s` is the time at which it first did not hold, None while it holds; `seen` are the values at that time.
     """

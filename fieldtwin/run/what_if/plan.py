@@ -51,7 +51,7 @@ class PlansForm(_Strict):
 
 @dataclass(frozen=True)
 class WhatIfPlan:
-    """A plan. `require` are expressions that must hold all the time, `finally_` at the end.
+    """A plan. `require` are expressions that must hold all the time, `finally_` those that must hold at the end.
 
     `faults` are as in a fault file.
     """
@@ -84,7 +84,7 @@ def in_words(commands: Sequence[Scripted], faults: Sequence[Mapping[str, Any]]) 
 
 
 def _time(time_s: float) -> str:
-    """Return a time of the plan in its largest whole unit."""
+    """Return a time in the largest unit in which it is a whole number, such as ``10 min``."""
     for unit_s, unit in ((3600, "h"), (60, "min")):
         if time_s and time_s % unit_s == 0:
             return f"{time_s / unit_s:g} {unit}"

@@ -1,4 +1,4 @@
-"""The guide to the first hour with a device: its steps as jobs in the working folder, their files, and the draft of a profile."""
+"""The commissioning guide: run its steps as jobs in the working folder, read their files, and edit the draft of a profile."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOOK_AGAIN_S = 1.0
 
 
 class StepForm(msgspec.Struct, forbid_unknown_fields=True):
-    """A step with its values."""
+    """A request body: one step of the commissioning guide, with the values of its form."""
 
     step: AnyStep
 
@@ -87,7 +87,7 @@ async def stop_job(request: Request) -> dict[str, Any]:
 
 
 async def clear_jobs(request: Request) -> dict[str, Any]:
-    """Forget the finished jobs, to begin with another device. The files stay."""
+    """Remove the finished jobs from the list, to begin with another device. The files stay."""
     _jobs(request).clear()
     return {"jobs": []}
 
@@ -130,7 +130,7 @@ async def save_draft(request: Request) -> dict[str, Any]:
 
 
 async def stream_jobs(socket: WebSocket) -> None:
-    """Send the states of all jobs after each change, at most five times a second, until the client leaves.
+    """Send the states of all jobs after each change, at most five times a second, until the client disconnects.
 
     Each message holds the present state, so a slow client misses intermediate states and nothing is queued for it.
     """

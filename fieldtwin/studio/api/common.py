@@ -1,4 +1,4 @@
-"""Functions that all handlers use: the gallery of the server, and the instance that a request names."""
+"""Functions that all handlers use: they return parts of the server, and the instance or tag that a request names."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def of_server(request: HTTPConnection, name: str, kind: type[T]) -> T:
 
 
 def gallery_of(request: HTTPConnection) -> Gallery:
-    """Return the gallery of the server."""
+    """Return the server's collection of observed instances (`fieldtwin.studio.live.gallery`)."""
     return of_server(request, "gallery", Gallery)
 
 
 def recordings_of(request: HTTPConnection) -> Recordings:
-    """Return the scenario recordings of the server, in which handlers note what clients do."""
+    """Return the scenario recordings of the server, in which handlers record the actions of clients."""
     return of_server(request, "recordings", Recordings)
 
 
@@ -65,6 +65,6 @@ def tag_of(request: HTTPConnection, attachment: Attachment) -> tuple[str, str]:
 
 
 def by_studio(request: HTTPConnection) -> str:
-    """Return the user for audit logs."""
+    """Return the name under which audit logs record the client of a request: ``studio`` and its address."""
     client = request.client
     return f"studio {client.host}" if client is not None else "studio"

@@ -21,7 +21,7 @@ from fieldtwin.studio.replay.traces import NoTrace
 
 
 class NotFound(UsageError):
-    """The interface has nothing under this name."""
+    """Raised when a request names an object (a tag, frame or scenario, for example) that does not exist."""
 
 
 STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (

@@ -1,4 +1,4 @@
-"""Faults of a prototype: the kinds with their forms, the active ones with their counts, injecting and clearing."""
+"""Faults of a prototype: list kinds with their parameters and active faults with their counts, inject and clear faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fieldtwin.studio.api.operation import Operation, body_of
 
 
 class InjectFault(msgspec.Struct, forbid_unknown_fields=True):
-    """A fault as in a fault file: ``{"name": "silence", "device": "ctd"}``. Its times count from now."""
+    """A fault as in a fault file: ``{"name": "silence", "device": "ctd"}``. Its times count from the request."""
 
     fault: dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Frames of the buses: pages of any position, filters, and exports."""
+"""Frames of the buses: pages from any position, filters, and exports."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from fieldtwin.twin.site.system import System
 MOST_ROWS = 500
 MOST_EXPORTED = 200_000
 AT_ONCE = 2_000
-"""Frames that an export reads before it lets other requests be answered."""
+"""Number of frames that an export reads before the server answers other requests in between."""
 FORMATS = ("pcap", "candump", "recording")
 FILTERS = (
     Parameter("bus", "string", "only frames of this bus"),
@@ -73,7 +73,7 @@ async def list_frames(request: Request) -> dict[str, Any]:
 
 
 def page_of(request: Request, frames: FrameLog) -> dict[str, Any]:
-    """Return the frames that a request asks for."""
+    """Return the page of frames that the query of a request selects."""
     wanted = _wanted(request)
     total, count = frames.count(wanted), whole(request, "count", 100, 1, MOST_ROWS)
     if (at := request.query_params.get("at_ns")) is not None:
@@ -85,13 +85,13 @@ def page_of(request: Request, frames: FrameLog) -> dict[str, Any]:
 
 
 async def get_frame(request: Request) -> dict[str, Any]:
-    """Return one frame with its fields, the frames that it belongs to, and the changes of tags after it."""
+    """Return one frame with its fields, its request or reply, and the changes of tags after it."""
     attachment = await attached(request)
     return frame_of(request, _frames(attachment), attachment.system, attachment.history)
 
 
 def frame_of(request: Request, frames: FrameLog, system: System, history: Changes) -> dict[str, Any]:
-    """Return the frame that a request names. Raises `NotFound`."""
+    """Return the frame whose number is in the path of a request, as `get_frame` does. Raises `NotFound`."""
     text = request.path_params["number"]
     number = int(text) if text.isdigit() else -1
     try:
@@ -107,7 +107,7 @@ def frame_of(request: Request, frames: FrameLog, system: System, history: Change
 
 
 async def list_services(request: Request) -> list[str]:
-    """Return the functions and services that have occurred, for a filter."""
+    """Return the Modbus functions and CANopen services that have occurred, as choices for a filter."""
     return _frames(await attached(request)).services()
 
 
@@ -120,7 +120,7 @@ async def export_frames(request: Request) -> Response:
 
 
 async def file_of(request: Request, frames: FrameLog, system: System, offset_ns: int, *, prototype: bool) -> Response:
-    """Return the frames that a request selects as a file. `offset_ns` makes a time of the frames a UTC time."""
+    """Return the frames that a request selects as a file. A frame's time plus `offset_ns` is its UTC time."""
     wanted = _wanted(request)
     kind = request.query_params.get("format", "pcap")
     if kind not in FORMATS:

@@ -33,7 +33,7 @@ async def list_systems(request: Request) -> list[dict[str, Any]]:
 
 
 async def start_prototype(request: Request) -> dict[str, Any]:
-    """Start the prototype of a known system. The answer comes when its gateway runs."""
+    """Start the prototype of a known system. The request is answered when its gateway runs."""
     form = await body_of(request, StartPrototype)
     known = {system.path for system in known_systems(folder_of(request))}
     if form.system not in known:  # a page must not start arbitrary files

@@ -57,7 +57,7 @@ class Operation:
 
 
 async def body_of(request: Request, form: type[S]) -> S:
-    """Return the content of a request. Raises `UsageError` if it is too long, no JSON, or not of this form."""
+    """Return the content of a request. Raises `UsageError` if it is too long, not JSON, or not of this form."""
     content = bytearray()
     async for piece in request.stream():
         content += piece
@@ -70,7 +70,7 @@ async def body_of(request: Request, form: type[S]) -> S:
 
 
 def whole(request: Request, name: str, default: int, least: int = 0, most: int = 1 << 62) -> int:
-    """Return a whole number of the query. Raises `UsageError`."""
+    """Return an integer parameter of the query, from `least` to `most`. Raises `UsageError`."""
     text = request.query_params.get(name)
     if text is None:
         return default

@@ -1,7 +1,7 @@
 """HTML reports of runs, with links to the views of their traces.
 
-A report is a file that the user may have from elsewhere, so it has a separate policy: its styles are used, and no
-script of it is executed. Only files that `fieldtwin test` has written are served.
+A report is a file that the user may have from elsewhere, so it has a separate content security policy: its styles are used, and
+its scripts are not executed. Only files that `fieldtwin test` has written are served.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ POLICY = (
 MOST_BYTES = 64 << 20
 _GENERATOR = b'<meta name="generator" content="fieldtwin">'
 _BEGIN_BYTES = 1000
-"""The generator is named within this many bytes."""
+"""Number of bytes at the beginning of a report that must contain the tag that names fieldtwin as the generator."""
 _INSTANT = re.compile(r'<pre class="instant" data-trace="([^"]*)" data-at="([0-9.]*)">.*?</pre>', re.DOTALL)
 
 
 def report_response(path: Path, traces: Mapping[str, str]) -> Response:
-    """Return a report as a page. `traces`: by the name of a trace's file its name in Studio.
+    """Return a report as a page. `traces`: the name of each trace in Studio, by the name of its file.
 
     Raises `FileInvalid` if the file is missing, too long, or not a report.
     """

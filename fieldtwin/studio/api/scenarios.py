@@ -102,7 +102,7 @@ async def save_scenario(request: Request) -> dict[str, Any]:
 
 
 def _run_of(request: Request, values_from: int) -> dict[str, Any] | None:
-    """Return the present or latest run, with the name of its trace; "" if Studio has none of it."""
+    """Return the present or latest run, with its values from number `values_from` on and the name of its trace or ""."""
     run = _runner(request).state(values_from)
     if run is not None:
         traces = of_server(request, "traces", Traces)

@@ -18,13 +18,13 @@ from fieldtwin.studio.api.common import attached
 from fieldtwin.studio.live.subscription import Subscription
 
 FULL = 4503
-"""The code with which a further client is refused."""
+"""The WebSocket close code for a client that is refused because too many are connected."""
 SENT_WITHIN_S = 10.0
 """A client that takes no data for this many seconds is disconnected."""
 
 
 async def stream(socket: WebSocket) -> None:
-    """Serve one client until it leaves or the instance ends."""
+    """Serve one client until it disconnects or the instance ends."""
     await socket.accept()
     try:
         attachment = await attached(socket)
@@ -74,7 +74,7 @@ async def _serve(socket: WebSocket, subscription: Subscription) -> None:
 
 
 async def until_left(socket: WebSocket) -> None:
-    """Return when the client has left. Messages from the client are ignored."""
+    """Return when the client has disconnected. Messages from the client are ignored."""
     with contextlib.suppress(WebSocketDisconnect):
         while True:
             await socket.receive_text()

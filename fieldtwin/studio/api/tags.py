@@ -24,7 +24,7 @@ class SetValue(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class WriteValue(msgspec.Struct, forbid_unknown_fields=True):
-    """A value to write to a device, in engineering units, and the value that the user has seen before."""
+    """A value to write to a device, in engineering units, and the value that the page showed to the user before."""
 
     value: float
     old: float | bool | str | None
@@ -53,7 +53,7 @@ async def get_history(request: Request) -> dict[str, Any]:
 
 
 async def get_recent(request: Request) -> dict[str, Any]:
-    """Return of each tag the numbers of the last minute: [time in ns, number, or null for a value that is not good]."""
+    """Return, for each tag, its numbers in the last minute: [time in ns, number, or null for a value that is not good]."""
     attachment = await attached(request)
     await attachment.has_history()
     return recent(attachment.history, attachment.history.names(), attachment.now_ns())

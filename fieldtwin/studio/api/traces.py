@@ -1,4 +1,4 @@
-"""Traces of virtual runs: which ones there are, and the state of each as of any instant. Nothing here changes anything."""
+"""Traces of virtual runs: which ones there are, and the state of each as of any instant. All operations only read."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ async def list_trace_frames(request: Request) -> dict[str, Any]:
 
 
 async def list_trace_services(request: Request) -> list[str]:
-    """Return the functions and services that have occurred, for a filter."""
+    """Return the Modbus functions and CANopen services that have occurred, as choices for a filter."""
     return (await _opened(request)).frames.services()
 
 
@@ -111,7 +111,7 @@ async def export_trace_frames(request: Request) -> Response:
 
 
 async def get_trace_frame(request: Request) -> dict[str, Any]:
-    """Return one frame with its fields, the frames that it belongs to, and the changes of tags after it."""
+    """Return one frame with its fields, its request or reply, and the changes of tags after it."""
     replay = await _opened(request)
     return frame_of(request, replay.frames, replay.system, replay.history)
 

@@ -1,4 +1,4 @@
-"""Twins: the shadows and twins of an instance with their models, threads and decisions, and forecasts."""
+"""Digital shadows and twins of an instance, with their models, digital threads and decisions, and what-if forecasts."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fieldtwin.studio.twin.forecast import AskWhatIf, Forecaster
 async def get_twins(request: Request) -> dict[str, Any]:
     """Return the instance's end of the digital thread, its shadows and twins, and the command lines that start one.
 
-    Of each shadow or twin: state and period of its model, its variables beside the plant's values, its end of the thread, and its
-    newest decisions, oldest first.
+    For each shadow or twin: state and period of its model, its variables next to the plant's values, its end of the thread, and
+    its newest decisions, oldest first.
     """
     attachment = await attached(request)
     thread, found = await look(attachment)
@@ -48,7 +48,7 @@ async def get_forecast(request: Request) -> dict[str, Any]:
 
 
 async def ask_what_if(request: Request) -> dict[str, Any]:
-    """Run ahead in virtual time from the present state of the instance. The plant is not touched; one question runs at a time."""
+    """Simulate ahead in virtual time, from the present state of the instance. The plant is not affected; one run at a time."""
     attachment = await attached(request)
     await _forecaster(request).start(attachment, await body_of(request, AskWhatIf))
     return {"run": _forecaster(request).state(attachment.name)}

@@ -1,4 +1,4 @@
-"""Check the text of a device profile as the commands will: YAML, the schema, and what only the loader of profiles can see."""
+"""Check the text of a device profile as the commands will: YAML, the schema, and the checks of the profile loader."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class CheckedDraft:
 
 def check_draft(text: str, folder: Path, name: str) -> CheckedDraft:
     """Return the errors of a profile. The result of a profile without errors describes its device. References to other files
-    begin in `folder`."""
+    are relative to `folder`."""
     try:
         profile = resolve(parse(text, str(folder / name)))
     except FileInvalid as e:

@@ -1,6 +1,6 @@
-"""Run the steps of the guide: each job is the real command as a child process in the working folder.
+"""Run the steps of the commissioning guide: each job is the real command as a child process in the working folder.
 
-Numbers are bounded: running jobs, remembered jobs and lines, bytes of a result. Forgotten jobs and lines are counted.
+Running jobs, kept jobs and lines, and the bytes of a result are limited. Dropped jobs and lines are counted.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from fieldtwin.studio.commissioning.work_folder import WorkFolder
 
 MOST_RUNNING = 6
 MOST_KEPT = 40
-"""Finished jobs whose results are kept; the oldest are forgotten first."""
+"""Largest number of finished jobs whose results are kept; the oldest are dropped first."""
 MOST_LINES = 400
 LONGEST_LINE = 500
 LAST_LINES = 8
-"""Lines of a job in an overview of all jobs."""
+"""Number of the last lines of a job that an overview of all jobs contains."""
 MOST_RESULT_BYTES = 8 << 20
 LONGEST_S = 86_400.0
 MOST_LISTENERS = 50
@@ -88,11 +88,11 @@ class Jobs:
             self.forgotten += 1
 
     def job(self, number: int) -> Job | None:
-        """Return the job with this number, None for an unknown or forgotten number."""
+        """Return the job with this number, None for an unknown number or a dropped job."""
         return self._jobs.get(number)
 
     def clear(self) -> None:
-        """Forget all finished jobs, to begin with another device. Raises `NotAllowed` while one runs."""
+        """Remove all finished jobs, to begin with another device. Raises `NotAllowed` while one runs."""
         running = [job.step for job in self._jobs.values() if job.is_running]
         if running:
             raise NotAllowed("steps are running", expected="no running step", got=", ".join(running))
@@ -171,7 +171,7 @@ class Job:
         }
 
     def whole(self) -> dict[str, Any]:
-        """Return the job with its result and all remembered lines."""
+        """Return the job with its result and all lines that are kept."""
         dropped = self._count - len(self._lines)
         return self.state() | {"lines": list(self._lines), "dropped_lines": dropped, "result": self.result}
 
@@ -216,7 +216,7 @@ class Job:
             asyncio.get_running_loop().call_soon(self._changed)
 
     async def _read(self, stream: asyncio.StreamReader) -> bytes:
-        """Return the result, without one if the output is text for the user."""
+        """Return the command's JSON result. Output that is text for the user becomes lines of the job; then return b""."""
         if self.command.as_json:
             return await child_process.read_whole(stream, MOST_RESULT_BYTES)
         await self._read_lines(stream)
@@ -241,7 +241,7 @@ class Job:
             self._changed()
 
     def _forget_traceback(self) -> None:
-        """Remove what Python prints if the interrupt arrives before the command has begun."""
+        """Remove the traceback that Python prints if the interrupt arrives before the command handles it."""
         lines = list(self._lines)
         begins = next((n for n, line in enumerate(lines) if line.startswith("Traceback ")), len(lines))
         self._lines = deque(lines[:begins], MOST_LINES)

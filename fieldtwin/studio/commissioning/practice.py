@@ -1,4 +1,4 @@
-"""The known profiles: with an emulator of one of them the guide can be tried without hardware."""
+"""The known device profiles. With an emulator of one of them, the commissioning guide can be tried without hardware."""
 
 from __future__ import annotations
 

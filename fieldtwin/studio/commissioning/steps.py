@@ -1,4 +1,4 @@
-"""The steps of the guide as typed forms, each of which becomes one command line.
+"""The steps of the commissioning guide as typed forms, each of which becomes one command line.
 
 A browser never supplies an argument: it fills in a form, whose fields have types, limits and patterns, and this module makes the
 arguments from it. Text of a user follows its option after ``=``, so that it cannot become a separate option.
@@ -35,7 +35,7 @@ Tolerance = Annotated[str, Meta(max_length=60, pattern=r"^([A-Za-z_][A-Za-z0-9_]
 class Command:
     """A command line. `port` is the port, host or bus that it uses, "" for none; `writes` are the files that it makes.
 
-    `out` receives its stdout. A command that is not `as_json` has no data for programs, so its text is shown.
+    `out` is the file that receives its stdout. A command that is not `as_json` prints text, which is shown to the user.
     """
 
     arguments: tuple[str, ...]
@@ -50,7 +50,7 @@ class Command:
 
     @property
     def line(self) -> str:
-        """Return the command line for a shell. The guide adds ``--json`` to read the result, a user does not need it."""
+        """Return the command line for a shell. It has no ``--json``, which only the guide needs to read the result."""
         shown = shlex.join(["fieldtwin", *self.arguments])
         return f"{shown} --json > {shlex.quote(self.out)}" if self.out else shown
 
@@ -59,12 +59,12 @@ class Step(Struct, tag_field="step", forbid_unknown_fields=True, kw_only=True):
     """The form of one step of the guide."""
 
     def command(self, folder: WorkFolder) -> Command:
-        """Return the command line of the filled form. Raises `UsageError` for a value that it must not contain."""
+        """Return the command line for the values of the form. Raises `UsageError` for a value that is not allowed."""
         raise NotImplementedError
 
 
 class Listen(Step, tag="line"):
-    """Listen to a line or bus without sending; `probe` sends one read to this unit."""
+    """Listen to a line or bus without sending; `probe` is a unit ID to which one read request is sent."""
 
     endpoint: Url
     listen_s: Seconds = 5.0
@@ -140,7 +140,7 @@ class Dump(Step, tag="dump"):
 
 
 class Infer(Step, tag="infer"):
-    """Infer types, orders and counters from a dump or a recording, and write a draft of a profile."""
+    """Infer data types, word orders and counters from a dump or a recording, and write a draft of a profile."""
 
     dump: File
     out: File
@@ -213,7 +213,7 @@ class Emulate(Step, tag="emulate"):
 
 
 class Compare(Step, tag="compare"):
-    """Repeat the requests of a recording on another device or emulator, and compare the answers. `out` gets the result."""
+    """Repeat the requests of a recording on another device or emulator, and compare the answers. `out` is the result file."""
 
     recording: File
     endpoint: Url
@@ -237,7 +237,7 @@ class Compare(Step, tag="compare"):
 
 
 class Check(Step, tag="check"):
-    """Test the device against the standard. It only reads, unless `writes` names cells that may be written, and `confirmed`."""
+    """Test the device against the standard by reading. With `confirmed` it also writes the registers or objects in `writes`."""
 
     endpoint: Url
     out: File
@@ -288,7 +288,7 @@ AnyStep = Listen | Scan | Identify | Dump | Infer | Record | Emulate | Compare |
 
 
 def check_may_start(step: Step, command: Command, folder: WorkFolder) -> None:
-    """Raise an error if the files of a command are missing or would be replaced, or if it writes unconfirmed."""
+    """Raise an error if the files of a command are missing or would be replaced, or if it writes to a device unconfirmed."""
     if isinstance(step, Check) and step.writes and not step.confirmed:
         raise NotAllowed("a check that writes to the device needs a confirmation", expected="confirmed: true")
     for name in command.reads:
@@ -312,7 +312,7 @@ def _endpoint(url: str, folder: WorkFolder) -> list[str]:
 
 
 def _port(url: str, folder: WorkFolder) -> str:
-    """Return what a command occupies: two names of the same serial port give the same text."""
+    """Return the port, host or bus that a command occupies. Two names of the same serial port give the same text."""
     endpoint = Endpoint.parse(url)
     if endpoint.is_serial:
         return str((folder.path / endpoint.path).resolve())
@@ -339,7 +339,7 @@ def _shipped_or_file(name: str, folder: WorkFolder, *suffixes: str) -> str:
 
 
 def _files(folder: WorkFolder, *names: str | None) -> tuple[str, ...]:
-    """Return those of the names that mean a file and not a known profile."""
+    """Return those of `names` that are files and not known profiles."""
     return tuple(name for name in names if name is not None and name not in profile_names())
 
 
@@ -358,7 +358,7 @@ def _flag(name: str, on: bool) -> list[str]:
 
 
 def _duration(name: str, seconds: float | None, default: float | None) -> list[str]:
-    """Return a duration as the commands read it; nothing for the command's own default."""
+    """Return the option `name` with a duration; an empty list for the command's own default."""
     if seconds is None or seconds == default:
         return []
     return [name, f"{round(seconds * 1000)}ms" if seconds < 1 else f"{seconds:g}s"]

@@ -1,4 +1,4 @@
-"""The working folder of the guide: which files a page may name, list, download and write.
+"""The working folder of the commissioning guide: which files a page may name, list, download and write.
 
 A page names a file by a plain name, never by a path. A link that leads out of the folder is refused. Only files that the steps
 write or read are listed and can be downloaded, because the folder may also hold the user's tokens and keys.
@@ -47,7 +47,7 @@ _SIGNS: tuple[tuple[str, str, re.Pattern[bytes]], ...] = (
 
 @dataclass(frozen=True)
 class KnownFile:
-    """A file of the guide. `written` means that a step of this server wrote it."""
+    """A file of the guide. `written`: a step that this server ran has written it."""
 
     name: str
     kind: str
@@ -57,7 +57,7 @@ class KnownFile:
 
 
 class WorkFolder:
-    """The folder in which Studio was started."""
+    """The working folder, which is the one in which Studio was started, and its files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
@@ -84,7 +84,7 @@ class WorkFolder:
         return path
 
     def note_written(self, name: str) -> None:
-        """Note that a step writes this file, so that it is listed."""
+        """Record that a step writes this file, so that `files` lists it."""
         self._written.add(name)
 
     def files(self) -> tuple[list[KnownFile], int]:

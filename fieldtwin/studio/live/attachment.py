@@ -1,8 +1,8 @@
 """Observe one running instance through its control channels and its capture.
 
 The statuses of gateway, PLC and field simulator are read two to four times a second, changes of tags ten times a second. A
-process that does not answer is asked again; its last status is dropped, so that a page never shows an old value as current.
-Gateway and PLC are asked only for what they answer in a bounded time; present values come from the process image.
+process that does not answer is queried again; its last status is dropped, so that a page never shows an old value as current.
+Gateway and PLC get only queries that they answer in a bounded time; present values come from the process image.
 """
 
 from __future__ import annotations
@@ -43,17 +43,19 @@ from fieldtwin.twin.site.system import System
 TAGS_EVERY_S = 0.1
 GATEWAY_EVERY_S = 0.5
 COMPARED_EVERY_S = 0.5
-"""How often the history is compared with the present values, which become stale without a change that the gateway reports."""
+"""Interval in seconds at which the history is compared with the present values: the gateway reports no change when one becomes
+stale.
+"""
 PLC_EVERY_S = 0.25
 BUCKETS_EVERY_S = 2.0
-"""The distribution of scan times is read less often, because it takes the PLC longer than the rest of its brief status."""
+"""Interval in seconds at which the scan time distribution is read, which takes the PLC longer than its brief status."""
 FIELD_EVERY_S = 0.5
 FRAMES_EVERY_S = 0.02
 FRAME_COUNT_EVERY_S = 0.04
-"""The shortest time between two messages with the number of frames."""
+"""The shortest time in seconds between two messages with the number of frames."""
 RECORD_EVERY_S = 0.5
 AGAIN_AFTER_S = 1.0
-"""Pause in seconds before a process that did not answer is asked again."""
+"""Pause in seconds before a process that did not answer is queried again."""
 NONE_OF_THEM = 1 << 62
 """The number after which refused writes are requested. It excludes all of them, because the status already contains them."""
 
@@ -85,9 +87,9 @@ class Attachment:
         self.plc_channel = Channel(found.dir / PLC_SOCKET, "PLC")
         self.field_channel = Channel(found.dir / FIELD_SOCKET, "field simulator")
         self.history_from_ns = clock.monotonic_ns()
-        """Since when changes of tags are known: the start of the gateway, or the oldest change that it still keeps."""
+        """The time since which changes of tags are known: the start of the gateway, or the oldest change that it still keeps."""
         self.changes_lost = 0
-        """Changes of tags that the gateway had dropped before they were read."""
+        """Number of changes of tags that the gateway had dropped before they were read."""
         self.frames: FrameLog | None = None
         self._clock = clock
         tags = {f"{d.name}.{t.name}": t for d in system.devices.values() for t in d.profile.tags.values()}
@@ -100,16 +102,16 @@ class Attachment:
         """Set when all changes that the gateway has kept were read, or when it did not answer."""
         self._present = PresentTags(system, self.secrets, self.history)
         self._compared_ns = 0
-        """When the history was last compared with the present values."""
+        """Time of the last comparison of the history with the present values."""
         self._reloads = 0
-        """The reloads of the gateway's files that `_present` knows."""
+        """Number of reloads of the gateway's files when `_present` last took over the names of values."""
         self._gateway_began_ns = 0
-        """The start of the gateway whose changes are read."""
+        """The start time of the gateway process whose changes are read."""
         self._described: tuple[int, int] | None = None
         """Process ID and restarts of the PLC that `programs` describes."""
         self._image = ProcessImage(found.dir)
         self._buckets_ns = 0
-        """When the distribution of scan times was read."""
+        """Time at which the distribution of scan times was last read."""
         self._nursery = Nursery()
 
     def _read_system(self) -> System:
@@ -161,7 +163,7 @@ class Attachment:
         }
 
     def point(self, name: str, t_ns: int, value: Any, quality: str, reason: str) -> Point:
-        """Return a change of a tag, without the value of a secret."""
+        """Return a change of a tag; the value of a secret tag is masked."""
         return Point(t_ns, SECRET if name in self.secrets else value, quality, reason)
 
     async def _repeat(self, what: str, read: Callable[[], Awaitable[None]], every_s: float) -> None:
@@ -199,7 +201,7 @@ class Attachment:
         self.updates.publish({"type": "status", "status": self.status()})
 
     async def read_plc(self, buckets: bool = True) -> WholePlcStatus:
-        """Ask the PLC for its brief status, and return it with the present values; `buckets` asks for the distributions too."""
+        """Query the PLC's brief status, and return it with the present values; `buckets`: also the scan time distribution."""
         brief = await self.plc_channel.ask("get", PlcStatus, brief=True, buckets=buckets)
         if self._described != (brief.pid, brief.restarts):  # a restart reads Structured Text again
             self.programs = await self._read_programs()
@@ -230,7 +232,7 @@ class Attachment:
         return programs
 
     async def look_at_field(self) -> None:
-        """Read the status of the simulated devices now: after an action of a client, so that even a short fault has its marks."""
+        """Read the status of the simulated devices at once: after a client's action, so that even a short fault is marked."""
         with contextlib.suppress(FieldtwinError):  # the regular reading reports it
             await self._read_field()
 
@@ -291,7 +293,7 @@ class Attachment:
             await asyncio.sleep(0 if new else FRAMES_EVERY_S)
 
     async def _until_replaced(self) -> None:
-        """End the updates when another run has begun under the same name: clients then ask for that run."""
+        """Wait until another run has begun under the same name, then end the updates, so that clients connect to that run."""
         while True:
             await asyncio.sleep(RECORD_EVERY_S)
             try:

@@ -1,4 +1,4 @@
-"""A control channel that is opened again when it is lost, with the reason why it is closed."""
+"""A control channel that reconnects after a loss and reports why it is closed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Channel:
 
     def __init__(self, path: Path, process: str) -> None:
         self.process = process
-        """The process for a reader: gateway, PLC or field simulator."""
+        """The name of the process in messages: gateway, PLC or field simulator."""
         self.trouble = ""
         self._path = path
         self._client: ControlClient | None = None

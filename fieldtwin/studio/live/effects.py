@@ -1,6 +1,6 @@
 """The changes after a frame: those of the tags that it carried, and those of the tags that PLC programs write.
 
-That a change followed a frame does not prove that the frame caused it; the page says "after" for this reason.
+A change that followed a frame was not necessarily caused by it; for this reason the page says "after".
 """
 
 from __future__ import annotations

@@ -33,19 +33,19 @@ from fieldtwin.results.trace import TraceEvent
 from fieldtwin.twin.site.system import System
 
 MOST_FRAMES = 4_000_000
-"""Frames that are indexed; the capture itself is limited to 1 GiB."""
+"""Largest number of frames that are indexed; the capture itself is limited to 1 GiB."""
 MOST_FILTERS = 8
 MOST_ENDPOINTS = 1_024
-"""Endpoints of a capture whose bus is kept."""
+"""Largest number of endpoints of a capture whose bus is kept in memory."""
 MOST_OPEN = 4_096
-"""Requests whose reply is still awaited. More than the buses can have open at the same time."""
+"""Largest number of requests whose reply is still awaited: more than the buses can have open at the same time."""
 AT_ONCE_BYTES = 8_192
-"""Bytes of the capture that one call of `follow` reads: about 60 frames, which take some 5 ms. Requests wait for that time."""
+"""Bytes of the capture that one call of `follow` reads: about 60 frames, which take some 5 ms. HTTP requests wait meanwhile."""
 PENDING, GOOD = 0, 1
 
 
 class FrameRow(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """A decoded frame. `t_ns` counts on the monotonic clock; bytes are in hex; `latency_ns` is None without a request."""
+    """A decoded frame. `t_ns` counts on the monotonic clock; bytes are in hex; `latency_ns` is None if it answers no request."""
 
     t_ns: int
     bus: str
@@ -61,7 +61,7 @@ class FrameRow(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     request: int | None
     """The number of the frame that this one answers."""
     tags: dict[str, Any]
-    """The values that it carried, in engineering units."""
+    """The values that the frame carried, in engineering units."""
     whole: str = ""
     """The whole reply in hex if this frame is its last piece, else ""."""
 
@@ -85,7 +85,7 @@ _EVERYTHING = FrameFilter()
 
 
 class _Names:
-    """Names as small numbers, for the columns of the index."""
+    """A table that assigns a small number to each name, for the columns of the index."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -200,7 +200,7 @@ class FrameLog:
         return self._problems.names[self._verdicts[number]]
 
     def reply_to(self, number: int) -> int | None:
-        """Return the number of the frame that answered a request, None without one."""
+        """Return the number of the frame that answered a request, None if no frame did."""
         return self._replies[number] - 1 if self._replies[number] else None
 
     def position_at(self, t_ns: int, wanted: FrameFilter = _EVERYTHING) -> int:
@@ -237,7 +237,7 @@ class FrameLog:
         return self._decoder.fields(event, request)
 
     def services(self) -> list[str]:
-        """Return the services that have occurred, for a choice of filters."""
+        """Return the functions and services that have occurred, as choices for a filter."""
         return sorted({self._names.names[n] for n in set(self._services)} - {""})
 
     def _matching(self, wanted: FrameFilter) -> array[int]:
@@ -274,7 +274,7 @@ class FrameLog:
             self._add(event, at)
 
     def _event_of(self, line: bytes) -> TraceEvent | None:
-        """Return the frame of a line of the file; None for a line without a frame of a bus of the system."""
+        """Return the frame of a line of the file; None for any other line, or if its bus is not in the system."""
         if not line.startswith(b'{"t_ns"'):
             return None  # the head of the file
         read = json.loads(line)
@@ -288,7 +288,7 @@ class FrameLog:
         return captured_of(json.loads(line))
 
     def _bus_of(self, endpoint: str) -> str:
-        """Return the bus at an endpoint, "" without one. Kept, because writing an endpoint as text takes longer than decoding."""
+        """Return the bus at an endpoint, "" if none is there. Cached, because formatting an endpoint is slower than decoding."""
         bus = self._bus_names.get(endpoint)
         if bus is None:
             text = str(Endpoint.parse(endpoint))

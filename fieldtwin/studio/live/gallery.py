@@ -14,7 +14,7 @@ MOST_ATTACHED = 8
 
 
 class NoInstance(UsageError):
-    """The instance does not exist on this computer."""
+    """Raised when the instance does not exist on this computer."""
 
 
 class Gallery:

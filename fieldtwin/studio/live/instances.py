@@ -55,7 +55,7 @@ async def _look(folder: Path) -> FoundInstance | None:
 
 
 async def accepts(path: Path) -> bool:
-    """Return whether a process accepts connections on a socket. A process that was killed leaves its socket."""
+    """Return whether a process accepts connections on a Unix socket. A process that was killed leaves its socket file."""
     try:
         async with asyncio.timeout(ACCEPTS_WITHIN_S):
             _, writer = await asyncio.open_unix_connection(str(path))

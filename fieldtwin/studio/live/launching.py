@@ -20,7 +20,7 @@ STARTS_WITHIN_S = 30.0
 STOPS_WITHIN_S = 10.0
 LOOK_EVERY_S = 0.1
 MOST_OUTPUT_BYTES = 16_384
-"""The end of a run's messages, which is kept to explain why it did not start."""
+"""Number of bytes at the end of a run's messages that are kept to explain why it did not start."""
 MOST_RUNS = 4
 MOST_SYSTEMS = 200
 
@@ -150,7 +150,7 @@ class _Run:
         return " ".join(lines[-5:])[-800:] or "it printed nothing"
 
     async def stop(self) -> None:
-        """Stop the run in order: the gateway makes its outputs safe. A run that does not end is killed."""
+        """Stop the run so that its gateway makes the outputs safe. A run that does not end is killed."""
         if not self.has_ended:
             with contextlib.suppress(ProcessLookupError):
                 self._process.send_signal(signal.SIGINT)

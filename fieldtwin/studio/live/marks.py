@@ -1,4 +1,4 @@
-"""Marks on the axis of time: faults that begin and end, values that are set and released, and changes of programs' states."""
+"""Marks on the time axis: faults that begin and end, values that are set and released, and changes of programs' states."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.twin.prototype.field_status import FieldStatus
 
 MOST_MARKS = 1_000
-"""Faults and set values that are kept, the oldest ones dropped first."""
+"""Largest number of faults and set values that are kept; the oldest are dropped first."""
 
 
 class Mark(msgspec.Struct, frozen=True):
@@ -32,7 +32,7 @@ class FaultMarks:
         self._active: dict[str, str] = {}
 
     def look(self, status: FieldStatus, now_ns: int) -> None:
-        """Compare a status with the one before it."""
+        """Compare a status with the previous one, and record the differences as marks at `now_ns`."""
         active = {fault.id: f"{fault.name} on {fault.device or fault.bus}" for fault in status.faults}
         active |= {f"set {tag} {value:g}": f"{tag} set to {value:g}" for tag, value in status.set.items()}
         self.marks += [Mark(now_ns, "cleared", text) for key, text in self._active.items() if key not in active]

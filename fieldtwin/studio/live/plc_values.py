@@ -1,7 +1,7 @@
 """The values of a PLC's tags, read from the process image.
 
 The PLC answers on the thread that executes the scans, so a list of thousands of values would delay a scan. The image is shared
-memory: reading it costs the PLC nothing, however many tags there are. The PLC itself is asked for its brief status only.
+memory: reading it costs the PLC nothing, however many tags there are. The PLC itself is queried for its brief status only.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def whole_plc_status(
 
 
 def _input(plc: PlcStatus, seen: TagValue) -> TagValue:
-    """Return an input with the quality that it has for the programs: bad while no program reads it or the gateway is dead."""
+    """Return an input with the quality that it has for the programs: bad while the PLC is stopped or the gateway is dead."""
     if plc.state == "stopped":
         return TagValue(seen.value, Quality.BAD, Reason.NOT_OPERATIONAL, seen.t_ns)
     if not plc.gateway_alive:

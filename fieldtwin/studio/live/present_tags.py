@@ -1,8 +1,8 @@
-"""The present values of a gateway's tags, without a request for each of them.
+"""The present values of a gateway's tags, read without a request for each tag.
 
-Numbers come from the process image, which holds values, qualities and times of all of them. Texts, which the image cannot
-hold, come from the gateway. A change that the gateway has reported after that counts, because the image is published once
-per cycle of the PLC.
+Numbers come from the process image, which holds values, qualities and times of all tags. Texts, which the image cannot
+hold, come from the gateway. A change that the gateway has reported since then takes precedence, because the image is
+published only once per PLC cycle.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class PresentTags:
         return found
 
     def missing(self, inputs: Snapshot) -> list[tuple[str, Point]]:
-        """Return the points that the history lacks, as of the snapshot: values that became stale, and lost changes.
+        """Return the points that are not in the history at the time of the snapshot: values that became stale, and lost changes.
 
         The history must have all changes that the gateway reported up to the snapshot.
         """

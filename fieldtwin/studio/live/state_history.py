@@ -16,7 +16,7 @@ from fieldtwin.plc.status import WholePlcStatus
 from fieldtwin.studio.live.channel import Channel
 
 MOST_TRANSITIONS = 200
-"""Transitions that are kept of each program, the oldest ones dropped first."""
+"""Largest number of transitions that are kept of each program; the oldest are dropped first."""
 
 
 class StateChange(msgspec.Struct, frozen=True):
@@ -37,7 +37,7 @@ class StateHistory:
     def __init__(self) -> None:
         self.changes: dict[str, deque[StateChange]] = {}
         self._run: tuple[int, int] = (0, 0)
-        """Process ID and number of restarts: the PLC counts scans and changes from the beginning of such a run."""
+        """Process ID and number of restarts of the PLC. The PLC counts scans and changes anew after each restart."""
         self._seen: dict[str, Any] = {}
         self._last_scan: dict[str, int] = {}
 

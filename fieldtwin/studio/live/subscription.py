@@ -1,4 +1,6 @@
-"""Updates for several clients, each with a bounded queue: a slow client loses updates, which are counted, and delays no other."""
+"""Updates for several clients, each with a bounded queue: a slow client loses updates, which are counted, and does not delay
+other clients.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from collections import deque
 from typing import Any
 
 MOST_WAITING = 100
-"""Updates that wait for one client. At ten updates a second this is the backlog of ten seconds."""
+"""Largest number of updates that wait for one client. At ten updates a second this is the backlog of ten seconds."""
 MOST_SUBSCRIBERS = 32
 
 Update = dict[str, Any]

@@ -1,4 +1,4 @@
-"""The history of tags: for each tag its latest changes, with quality and reason, and thinned out for a diagram of some width."""
+"""The history of tags: the latest changes of each tag, with quality and reason, thinned out if a diagram has no room for all."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any, NamedTuple, Protocol
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 MOST_CHANGES = 2_000_000
-"""Changes that are kept of all tags together: about 300 MB."""
+"""Largest number of changes that are kept of all tags together: about 300 MB."""
 MOST_OF_A_TAG = 100_000
 LEAST_OF_A_TAG = 1_000
 MOST_POINTS = 5_000
-"""Points in one answer."""
+"""Largest number of points in one answer."""
 RECENT_NS = 60 * NS_PER_S
 MOST_RECENT = 120
-"""Points of the last minute of a tag in one answer."""
+"""Largest number of points of the last minute of a tag in one answer."""
 MOST_RECENT_OF_ALL = 50_000
-"""Points of the last minute of all tags in one answer: about 1.5 MB. With more than 417 tags, each has fewer."""
+"""Largest number of points of all tags of the last minute in one answer: about 1.5 MB. Above 417 tags, each has fewer."""
 
 GOOD = "good"
 
@@ -40,9 +40,9 @@ class Points(Protocol):
 
 
 def recent(history: Points, names: Collection[str], t_ns: int) -> dict[str, list[tuple[int, float | None]]]:
-    """Return of each tag the numbers of the minute before `t_ns` as (time in ns, number); None for a value that is not good.
+    """Return for each tag its numbers in the minute before `t_ns` as (time in ns, number); None for a value that is not good.
 
-    A tag has at most `MOST_RECENT` points, and all together have about `MOST_RECENT_OF_ALL`. A tag with texts has none.
+    A tag has at most `MOST_RECENT` points, and all together have about `MOST_RECENT_OF_ALL`. A tag with text values has none.
     """
     most = max(4, min(MOST_RECENT, MOST_RECENT_OF_ALL // max(1, len(names))))
     found = {}
@@ -103,8 +103,8 @@ class TagHistory:
     def between(self, name: str, from_ns: int, to_ns: int, points: int = MOST_POINTS) -> tuple[list[Point], bool]:
         """Return the points of a tag in an interval, at most `points`, and whether they were thinned out.
 
-        The first one is the point that was valid at the beginning. Thinning keeps of each part of the interval the first, the
-        smallest, the largest and the last value, and every change of quality.
+        The first one is the point that was valid at the beginning. For each part of the interval, thinning keeps the
+        first, the smallest, the largest and the last value, and every change of quality.
         """
         found: list[Point] = []
         for point in reversed(self._points[name]):

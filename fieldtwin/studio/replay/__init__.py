@@ -1,1 +1,1 @@
-"""A trace of a virtual run, opened and shown as of any instant. It is read only, and nothing of it is executed."""
+"""A trace of a virtual run, opened and shown as of any instant. The trace is only read; no program of its system is executed."""

@@ -75,9 +75,9 @@ def _tag(replay: Replay, name: str, t_ns: int) -> dict[str, Any]:
 
 
 def _was_read(replay: Replay, name: str, t_ns: int, since_ns: int) -> bool:
-    """Return whether the device has sent a tag between two instants.
+    """Return whether the device has sent the tag `name` between `since_ns` and `t_ns`.
 
-    The gateway publishes only changes, so an unchanged value is confirmed by the frames of its device only.
+    The gateway publishes only changes, so only the frames of the device show that an unchanged value was read again.
     """
     device, _, tag = name.rpartition(".")
     for row in islice(replay.frames.latest_of_device(device, t_ns + 1), LOOKS_BACK):
@@ -104,7 +104,7 @@ def _bus(replay: Replay, name: str, t_ns: int) -> dict[str, Any]:
 
 
 def _rate(replay: Replay, name: str, t_ns: int) -> float:
-    """Return the frames of a bus in a second, over the last `RATE_OVER_NS`."""
+    """Return the frame rate of a bus in frames per second, averaged over the last `RATE_OVER_NS`."""
     since_ns = max(0, t_ns - RATE_OVER_NS)
     count = replay.frames.count_of_bus(name, t_ns + 1) - replay.frames.count_of_bus(name, since_ns)
     return count / max(0.1, (t_ns - since_ns) / NS_PER_S)

@@ -12,9 +12,9 @@ from fieldtwin.studio.live.tag_history import Point
 from fieldtwin.studio.replay.trace_log import BAD_VERDICTS, FaultEvent, TraceLog
 
 MOST_MARKS = 2_000
-"""Marks in one answer. Failed checks come first, then faults, then transitions."""
+"""Largest number of marks in one answer. Failed checks come first, then faults, then transitions."""
 MOST_TRANSITIONS = 200
-"""Transitions of a program before an instant."""
+"""Largest number of transitions of a program that are returned, the latest ones before an instant."""
 
 
 def marks_of(log: TraceLog, about: TraceAbout | None, programs: list[str]) -> tuple[list[dict[str, Any]], int]:
@@ -42,7 +42,7 @@ def marks_of(log: TraceLog, about: TraceAbout | None, programs: list[str]) -> tu
 
 
 def failed_checks(log: TraceLog, about: TraceAbout | None) -> list[CheckAbout]:
-    """Return the checks that failed: those of the description, and while the run continues those of its steps."""
+    """Return the failed checks: those in the description of the trace or, while the run continues, the failed steps."""
     if about is not None and about.finished:
         return [check for check in about.checks if check.verdict in BAD_VERDICTS]
     return [
@@ -68,7 +68,7 @@ def step_at(log: TraceLog, t_ns: int) -> dict[str, Any] | None:
 
 
 def state_changes(log: TraceLog, program: str, t_ns: int, most: int = MOST_TRANSITIONS) -> list[tuple[Point, Point]]:
-    """Return the last changes of a program's state up to an instant, the oldest first, each as before and after."""
+    """Return the last changes of a program's state up to an instant, the oldest first, each as (before, after)."""
     series = log.states.get(_state(program))
     if series is None or most <= 0:
         return []
@@ -82,7 +82,7 @@ def _state(program: str) -> str:
 
 
 def _active(events: list[FaultEvent]) -> list[tuple[int, int | None, dict[str, Any]]]:
-    """Return each fault with its first and last instant. The data of a fault can limit it to a part of the run."""
+    """Return each fault as (begin in ns, end in ns or None, data). The fault's own `from` and `until` can limit its time."""
     found: list[tuple[int, int | None, dict[str, Any]]] = []
     open_: dict[str, int] = {}
     for event in events:
@@ -108,7 +108,7 @@ def _active(events: list[FaultEvent]) -> list[tuple[int, int | None, dict[str, A
 
 
 def _ns(value: Any) -> int | None:
-    """Return a time of a fault in ns, None without one."""
+    """Return a time of a fault file, such as ``10s``, in ns; None if there is none or it is invalid."""
     from fieldtwin.emulators.faults.schema import seconds  # here: a plant has no emulators installed
 
     if not isinstance(value, int | float | str):

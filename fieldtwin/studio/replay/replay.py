@@ -63,7 +63,7 @@ class Replay:
 
     @property
     def is_growing(self) -> bool:
-        """Return whether the run has not ended. This is not known of a trace without a description."""
+        """Return whether the run has not ended. False for a trace without a description, of which this is not known."""
         return self.about is not None and not self.about.finished
 
     @property

@@ -10,7 +10,7 @@ from fieldtwin.studio.replay.series import Series
 from fieldtwin.studio.replay.trace_log import TraceLog
 
 MOST_READ = 200_000
-"""Events of one tag that one answer looks at. A longer range is sampled at equal distances first."""
+"""Largest number of events of one tag that are read for one answer. A longer range is first sampled at equal distances."""
 
 
 class ReplayedHistory:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 MOST_KINDS = 0xFFFF
 EXACT = 1 << 53
-"""Whole numbers below this are exact as a floating-point number."""
+"""Integers below this limit are represented exactly as floating-point numbers."""
 
 
 class Kind(NamedTuple):
@@ -20,7 +20,7 @@ class Kind(NamedTuple):
 
 
 class Kinds:
-    """The kinds of a trace as small numbers. A trace has few; after `MOST_KINDS` a further one raises `ValueError`."""
+    """A table that gives each kind of a trace a small number. After `MOST_KINDS` kinds, a further one raises `ValueError`."""
 
     def __init__(self) -> None:
         self._kinds: list[Kind] = []
@@ -40,7 +40,7 @@ class Kinds:
 
 
 def encoded(value: Any, at: int) -> tuple[str, float]:
-    """Return type and number of a value. `at` is the place of its line in the file, which is kept for a value without a number.
+    """Return type and number of a value. With type t, the number is `at`, the position of its line in the file.
 
     The types are b (boolean), i (whole number), f (number), n (no value) and t (text or anything else, which stays in the file).
     """
@@ -65,7 +65,7 @@ class Series:
         return len(self.times)
 
     def add(self, t_ns: int, value: float, kind: int) -> None:
-        """Add an event; one that is older than the latest goes to its place."""
+        """Add an event. An event that is older than the latest is inserted in order of time."""
         if not self.times or t_ns >= self.times[-1]:
             self.times.append(t_ns)
             self.values.append(value)
@@ -77,7 +77,7 @@ class Series:
         self.kinds.insert(at, kind)
 
     def last_at(self, t_ns: int) -> int:
-        """Return the position of the last event at or before an instant, -1 without one."""
+        """Return the position of the last event at or before an instant, -1 if there is none."""
         return bisect_right(self.times, t_ns) - 1
 
     def first_from(self, t_ns: int) -> int:

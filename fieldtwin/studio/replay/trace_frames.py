@@ -1,4 +1,4 @@
-"""The frames of a trace, with the index that Studio has for captures."""
+"""The frames of a trace, indexed in the same way as a capture file (`FrameLog`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fieldtwin.twin.site.system import System
 
 _FRAME, _STEP = (f'"{kind.value}"'.encode() for kind in (TraceKind.FRAME, TraceKind.STEP))
 HEAD_BYTES = 40
-"""The beginning of a line that holds time and kind."""
+"""Number of bytes at the beginning of a line that contain time and kind of the event."""
 
 
 class TraceFrames(FrameLog):
@@ -30,7 +30,7 @@ class TraceFrames(FrameLog):
         self._of_bus = {name: array("L") for name in system.buses}
         self._of_device = {name: array("L") for name in system.devices}
         self._failed_ns = {name: array("q") for name in system.buses}
-        """By bus: when exchanges failed, ordered by time."""
+        """For each bus, the times in ns at which exchanges failed, in order."""
 
     def reaches(self, t_ns: int) -> bool:
         """Return whether the frames up to an instant are indexed."""

@@ -1,7 +1,7 @@
 """An index of a trace: the values of tags and variables over time, faults and steps. It follows a file that still grows.
 
-Memory holds 18 bytes for each value. A trace may come from a stranger: lines, names and events are limited, and an invalid
-line ends the reading with its number.
+Memory holds 18 bytes for each value. A trace may be from an untrusted source: lines, names and events are limited, and
+reading ends at an invalid line with an error that gives its number.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from fieldtwin.studio.live.tag_history import Point
 from fieldtwin.studio.replay.series import Kind, Kinds, Series, encoded
 
 AT_ONCE_BYTES = 256 * 1024
-"""Bytes that one call of `follow` reads: some 2,000 events, which take about 10 ms."""
+"""Number of bytes that one call of `follow` reads: some 2,000 events, which take about 10 ms."""
 MOST_VALUES = 10_000_000
-"""Events of tags and variables: 180 MB."""
+"""Largest number of events of tags and variables: 180 MB."""
 MOST_NAMES = 20_000
 MOST_EVENTS = 50_000
 """Largest number of fault events, and of step events of scenarios."""
@@ -39,7 +39,7 @@ EXPECTED = "[ns, kind, where, data], as `fieldtwin simulate --trace` writes it"
 
 
 class FaultEvent(NamedTuple):
-    """A fault was injected, or cleared. `data` is that of the event."""
+    """A fault was injected, or cleared. `data` is the data of the trace event."""
 
     t_ns: int
     id: str
@@ -86,7 +86,7 @@ class TraceLog:
         """The time of the latest event; the first one is at 0."""
         self.events = 0
         self.trouble: FileInvalid | None = None
-        """Why the reading ended before the end of the file."""
+        """The error at which reading ended before the end of the file, if any."""
         self.kinds = Kinds()
         self._after_check = AfterCheck()
         self._values = 0
@@ -165,7 +165,7 @@ class TraceLog:
         return None if series is None or position < 0 else self.point(series, position)
 
     def _text(self, at: int) -> Any:
-        """Return a value that has stayed in the file."""
+        """Read a value from its line in the file, which begins at byte `at`."""
         self._lines.seek(at)
         value = decode_event(self._lines.readline(MAX_LINE_BYTES)).data.get("value")
         return value if isinstance(value, str | int) else str(value)

@@ -16,17 +16,17 @@ from fieldtwin.studio.replay.replay import Replay
 from fieldtwin.twin.site.data_files import system_files
 
 MOST_OPEN = 3
-"""Traces that are indexed at a time; the one that was opened first is closed."""
+"""Largest number of traces that are open at a time. For a further one, the trace that was opened first is closed."""
 MOST_LISTED = 200
 
 
 class NoTrace(UsageError):
-    """Studio knows no trace of this name."""
+    """Raised when Studio knows no trace of this name."""
 
 
 @dataclass(frozen=True)
 class KnownTrace:
-    """A trace that can be opened. `about` is None without a description; `trouble` says what is wrong with it."""
+    """A trace that can be opened. `about` is None if it has no valid description; `trouble` then gives the error, if any."""
 
     name: str
     path: Path
@@ -35,7 +35,7 @@ class KnownTrace:
 
     @property
     def report(self) -> Path | None:
-        """Return the HTML report of the run, None without one."""
+        """Return the HTML report of the run, None if it wrote none."""
         if self.about is None or not self.about.report:
             return None
         path = (self.path.parent / self.about.report).resolve()
@@ -69,7 +69,7 @@ class Traces:
         self._open: dict[Path, tuple[Replay, AsyncExitStack]] = {}
         self._lock = asyncio.Lock()
         self._read: dict[Path, tuple[tuple[int, int], TraceAbout | None, str]] = {}
-        """By trace: the version of its description that was read, and the result."""
+        """For each trace: the version of the description file that was read last, and the description or the error."""
 
     async def __aenter__(self) -> Traces:
         return self
@@ -163,7 +163,7 @@ def _changed_ns(path: Path) -> int:
 
 
 def _replaced(replay: Replay, now: KnownTrace) -> bool:
-    """Return whether another run has written a file of this name since it was opened."""
+    """Return whether another run has overwritten the trace file since `replay` was opened."""
     if replay.about is not None and now.about is not None and replay.about.run != now.about.run:
         return True
     return replay.log.is_replaced

@@ -1,1 +1,1 @@
-"""Scenarios in Studio: recorded from what clients do to a prototype, and run as a child process. It does not know HTTP."""
+"""Scenarios in Studio: recorded from the actions of clients on a prototype, and run as a child process. Independent of HTTP."""

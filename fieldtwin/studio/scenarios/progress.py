@@ -26,7 +26,7 @@ class RunProgress:
         self._t_s = 0.0
 
     def look(self) -> bool:
-        """Read the next new lines, and return whether there were any. A file that is not there yet has none."""
+        """Read the next new lines, and return whether there were any. There are none while the file does not exist yet."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._read_to)
@@ -44,7 +44,7 @@ class RunProgress:
         return bool(chunk)
 
     def state(self, values_from: int) -> dict[str, Any]:
-        """Return steps and checks with their verdicts, the latest time in s, and the values from a position on."""
+        """Return steps and checks with their verdicts, the latest time in s, and the values from number `values_from` on."""
         return {
             "t_s": self._t_s,
             "steps": self._steps,
@@ -72,7 +72,7 @@ class RunProgress:
 
     @staticmethod
     def _of(among: list[dict[str, Any]], line: dict[str, Any]) -> dict[str, Any]:
-        """Return the step or check of a line; one that was not named before is added."""
+        """Return the step or check in `among` that a line is about; add it if it is new."""
         for one in among:
             if one["number"] == line["number"]:
                 return one

@@ -1,4 +1,4 @@
-"""Turn a recording of Studio into a scenario file with proposed expectations. Pure: data in, text out.
+"""Turn a recording of Studio into the text of a scenario file with proposed expectations. No file is read or written.
 
 The actions become steps, with the pauses between them. After each action the file expects what was observed until the next
 one: tags that turned bad, with the reason, tags that became good again, values that were set in a device, and states that
@@ -17,15 +17,15 @@ from typing import Any, NamedTuple, TypeVar
 from fieldtwin.studio.scenarios.recorder import Action, Recording, Seen, State
 
 BRIEF_NS = 500_000_000
-"""A shorter state or quality is not expected: it depends on chance whether a check sees it."""
+"""A state or quality that lasted less than this (ns) is not expected, because a check could miss it by chance."""
 MOST_OF_A_PERIOD = 40
-"""Expectations after one action."""
+"""Largest number of expectations after one action."""
 RESTLESS = 3
 """A tag whose quality changes more often than this after one action is not expected to have a certain quality."""
 SLACK_S = 4.0
-"""An effect may take twice as long as observed, and this much longer: polls have another phase in each run."""
+"""An effect may take twice the observed time plus this many seconds, because the phase of the polls differs in each run."""
 RECOVERY_SLACK_S = 10.0
-"""The same for a tag that becomes good again: the gateway asks a lost device at growing intervals."""
+"""The same for a tag that becomes good again, because the gateway retries a lost device at growing intervals."""
 KNOWN_WITHIN_S = 60
 
 T = TypeVar("T", Seen, State)
@@ -83,7 +83,7 @@ def _steps(recording: Recording, expected: list[list[_Expected]]) -> Iterator[st
 
 
 def _beginning(recording: Recording) -> Iterator[str]:
-    """Return waits for the states of programs, and for each tag that is expected later and was good at first."""
+    """Yield a `wait` step for each program's first state, and for each tag that is expected later and was good at first."""
     for name, states in sorted(recording.states.items()):
         first = _at(states, recording.begin_ns) or (states[0] if states else None)
         if first is not None:
@@ -96,14 +96,14 @@ def _beginning(recording: Recording) -> Iterator[str]:
 
 
 def _expected(recording: Recording, n: int) -> Iterator[_Expected]:
-    """Return what was observed between an action and the next one, by time."""
+    """Yield the expectations for what was observed between action `n` and the next one, in order of time."""
     found = [one for name in sorted(recording.tags) if (one := _changed(recording, name, n)) is not None]
     found += _reached(recording, n)
     yield from sorted(found, key=lambda one: one.t_ns)
 
 
 def _changed(recording: Recording, name: str, n: int) -> _Expected | None:
-    """Return the expectation for a tag that turned bad or good in a period, or whose value was set."""
+    """Return the expectation for a tag that turned bad or good after action `n`, or whose value was set; None if neither."""
     begin_ns, end_ns = _period(recording, n)
     changes = recording.tags[name]
     before, after = _at(changes, begin_ns), _at(changes, end_ns)
@@ -134,7 +134,7 @@ def _good_at_first(recording: Recording, name: str) -> bool:
 
 
 def _held(name: str, seen: Seen, begin_ns: int) -> _Expected | None:
-    """Return the expectation for a value that was set, as the gateway has read it: in the steps of the device's register."""
+    """Return the expectation for a value that was set, as the gateway read it, rounded by the register's resolution."""
     if seen.quality != "good" or not isinstance(seen.value, bool | int | float):
         return None
     tolerance = f", tolerance: {abs(seen.value) * 1e-6:.3g}" if isinstance(seen.value, float) and seen.value else ""
@@ -143,7 +143,7 @@ def _held(name: str, seen: Seen, begin_ns: int) -> _Expected | None:
 
 
 def _never_read(recording: Recording, n: int) -> bool:
-    """Return whether an action sets a value that the gateway has not read before it was released, or is that release.
+    """Return whether action `n` sets a value that was released before the gateway read it, or is that release.
 
     A scenario fails if a `set` takes no effect.
     """
@@ -181,13 +181,13 @@ def _reached(recording: Recording, n: int) -> Iterator[_Expected]:
 
 
 def _period(recording: Recording, n: int) -> tuple[int, int]:
-    """Return the time from an action to the next one, or to the end."""
+    """Return begin and end (ns) of the period from action `n` to the next action, or to the end of the recording."""
     actions = recording.actions
     return actions[n].t_ns, actions[n + 1].t_ns if n + 1 < len(actions) else recording.end_ns
 
 
 def _since_quality(inside: list[Seen], after: Seen) -> int:
-    """Return since when the tag had its last quality and reason without interruption."""
+    """Return the time in ns since which the tag had its last quality and reason without interruption."""
     since_ns = after.t_ns
     for change in reversed(inside):
         if (change.quality, change.reason) != (after.quality, after.reason):
@@ -202,7 +202,7 @@ def _at(changes: Sequence[T], t_ns: int) -> T | None:
 
 
 def _flow(step: dict[str, Any]) -> str:
-    """Return a step on one line: JSON, which is YAML, without the quotation marks of its word."""
+    """Return a step on one line: YAML with its content as JSON."""
     [(word, what)] = step.items()
     return f"{word}: {json.dumps(what, ensure_ascii=False)}"
 
@@ -212,7 +212,7 @@ def _since(recording: Recording, t_ns: int) -> str:
 
 
 def _line(text: str) -> str:
-    """Return a text that cannot leave its comment."""
+    """Return `text` on one line, so that it stays within a YAML comment."""
     return " ".join(text.split())[:200]
 
 

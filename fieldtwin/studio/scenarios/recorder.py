@@ -23,7 +23,7 @@ MOST_CHANGES = 50_000
 LONGEST_S = 3600.0
 
 Words = Mapping[str, Mapping[int, str]]
-"""PROGRAM.state, and the word of each of its values."""
+"""For each tag PROGRAM.state, the name of each of its values."""
 
 
 class Action(NamedTuple):
@@ -37,7 +37,7 @@ class Action(NamedTuple):
 
     @property
     def said(self) -> str:
-        """Return the action for a reader."""
+        """Return the action as text for the user."""
         if self.step is None:
             return self.note
         [(word, what)] = self.step.items()
@@ -49,7 +49,7 @@ class Action(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """A tag from `t_ns` on. The value is noted for tags that were set, and only then is a change of the value noted."""
+    """The quality of a tag from `t_ns` on. The value is recorded only for tags whose value a client has set."""
 
     t_ns: int
     value: Any
@@ -78,7 +78,7 @@ class Recording:
 
 
 class Recorder:
-    """Records one instance from `begin` to `end`. It looks four times a second: a shorter change is not noted."""
+    """The recorder of one instance, from `begin` to `end`. It samples four times a second, so shorter changes can be missed."""
 
     def __init__(self, attachment: Attachment) -> None:
         self.attachment = attachment
@@ -88,7 +88,7 @@ class Recorder:
         self._nursery = Nursery()
 
     async def begin(self) -> None:
-        """Begin. Raises `UsageError` if faults or forces are active: the scenario would not have them."""
+        """Begin to record. Raises `UsageError` if faults or forces are active, because the scenario would not contain them."""
         field_now = await self.attachment.field_channel.ask("get", FieldStatus)
         plc = self.attachment.plc
         active = [*(fault.id for fault in field_now.faults), *(f"set {tag}" for tag in field_now.set)]
@@ -103,7 +103,7 @@ class Recorder:
         self._nursery.start(self._watch(), "scenario recorder")
 
     async def end(self) -> Recording:
-        """End, and return what was recorded."""
+        """End the recording, and return it."""
         self.recording.end_ns = self.recording.end_ns or self.attachment.now_ns()
         await self._nursery.__aexit__(None, None, None)
         return self.recording
@@ -153,7 +153,7 @@ class Recorder:
                 states.append(State(now_ns, word))
 
     def _state_words(self) -> Words:
-        """Return the words of the programs' states, as the PLC describes them; none until it has answered."""
+        """Return the names of the programs' states, as the PLC describes them; empty until the PLC has answered."""
         variables = {name: program["variables"].get(STATE) for name, program in self.attachment.programs.items()}
         return {
             f"{name}.{STATE}": {int(code): word for code, word in state["words"].items()}

@@ -33,7 +33,7 @@ class Recordings:
             await recorder.end()
 
     def state(self, attachment: Attachment) -> dict[str, Any]:
-        """Return whether the instance is recorded, for how long, what was done, and the latest draft."""
+        """Return whether the instance is recorded, for how long, the actions so far, and the latest draft."""
         recorder = self._recorder(attachment)
         draft = self._drafts.get(attachment.name, "")
         if recorder is None:
@@ -96,7 +96,7 @@ class Recordings:
         return path
 
     def _recorder(self, attachment: Attachment) -> Recorder | None:
-        """Return the recorder of this run, not that of an earlier one of the same name."""
+        """Return the recorder of this run, None if there is none or it belongs to an earlier run of the same name."""
         recorder = self._recorders.get(attachment.name)
         return recorder if recorder is not None and recorder.attachment is attachment else None
 

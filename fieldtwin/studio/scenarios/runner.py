@@ -22,7 +22,7 @@ MOST_FILE_BYTES = 1 << 20
 LOOK_EVERY_S = 0.1
 TARGETS = ("virtual", "local")
 PROGRESS, REPORT = "progress", "report.html"
-"""Files in the folder of a run, beside its trace. The name of a trace ends with ``.jsonl``."""
+"""Files in the folder of a run, next to its trace. The name of a trace ends with ``.jsonl``."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class ScenarioRunner:
             self._run.forget()
 
     def state(self, values_from: int = 0) -> dict[str, Any] | None:
-        """Return the present or the latest run, None if there was none. `values_from`: the first value of its progress."""
+        """Return the present or the latest run, None if there was none. Its values begin with number `values_from`."""
         return self._run.state(values_from) if self._run is not None else None
 
     async def start(self, path: str, target: str) -> None:

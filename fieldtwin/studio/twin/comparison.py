@@ -17,7 +17,7 @@ AGREES, DEVIATES, ON_THE_WAY, UNKNOWN = "agrees", "deviates", "on the way", "unk
 
 
 class Compared(msgspec.Struct, frozen=True, kw_only=True):
-    """A variable of the model beside the plant's value. `plant` is None if the gateway has no such tag or does not answer."""
+    """A variable of the model and the plant's value. `plant` is None if the gateway has no such tag or does not answer."""
 
     name: str
     unit: str
@@ -25,7 +25,7 @@ class Compared(msgspec.Struct, frozen=True, kw_only=True):
     model_quality: str
     model_reason: str
     model_age_s: float | None
-    """Time since the plant reported the value; None if it never did."""
+    """Time in seconds since the plant reported the value; None if it never did."""
     plant: Any
     plant_quality: str | None
     plant_reason: str | None

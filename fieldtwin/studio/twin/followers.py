@@ -94,9 +94,9 @@ async def _client(socket: Path) -> AsyncIterator[ControlClient]:
 
 
 def starting_commands(attachment: Attachment, thread: PlantThreadStatus | None) -> list[dict[str, str]]:
-    """Return the command lines that start a shadow or a twin of the instance, with what each does.
+    """Return the command lines that start a shadow or a twin of the instance, with a description of each.
 
-    Without a thread the instance has to be started again with one, which is then the first command.
+    If the instance has no digital thread, the first command starts the instance again with one.
     """
     record = attachment.record
     system = shlex.quote(short_system(record))

@@ -33,7 +33,7 @@ class PlannedPeriod(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AskWhatIf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A question: the horizon in seconds, and what changes within it.
+    """A what-if question: the horizon in seconds, and the commands and faults within it.
 
     `faults` are as in a fault file, and their times count from now: ``{"name": "silence", "device": "ctd", "from": "1min"}``.
     `require` are expressions that must hold all the time, `finally_` at the end. `series` are the tags whose values over time
@@ -49,7 +49,7 @@ class AskWhatIf(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Forecaster:
-    """Answers one question at a time. Use it as ``async with Forecaster() as forecaster``; leaving the block stops the run."""
+    """The server's forecasts, one at a time. Use it as ``async with Forecaster() as forecaster``; leaving the block stops it."""
 
     def __init__(self) -> None:
         self._run: ChildRun | None = None
@@ -88,7 +88,7 @@ class Forecaster:
         }
 
     async def start(self, attachment: Attachment, asked: AskWhatIf) -> None:
-        """Ask a question.
+        """Start the forecast for a question.
 
         Raises `UsageError` for a question that is too large, `NotAllowed` for one about a secret tag, and `EndpointBusy` while
         another question is answered.

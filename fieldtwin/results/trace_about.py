@@ -104,7 +104,7 @@ class TraceAbout(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
     checks: list[CheckAbout] = []
     report: str = ""
-    """The HTML report of the run, as a path from the folder of the trace; empty if there is none."""
+    """The HTML report of the run, as a path from the folder of the trace; empty without a report."""
 
 
 def about_path(trace: Path) -> Path:
@@ -140,7 +140,7 @@ def write_about(trace: Path, about: TraceAbout) -> None:
 
 
 def read_about(trace: Path) -> TraceAbout | None:
-    """Return the description of a trace, None if there is none. Raises `FileInvalid` for an invalid description."""
+    """Return the description of a trace, None if it does not exist. Raises `FileInvalid` for an invalid description."""
     path = about_path(trace)
     try:
         about = msgspec.json.decode(read_input(path, MOST_BYTES), type=TraceAbout)

@@ -120,7 +120,7 @@ class RegisterDriver(DeviceDriver):
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
         """Return the value of a tag, decoded with the present configuration from the bytes in `held`.
 
-        `of` is the value of the tag that holds its scale factor, or None if there is none."""
+        `of` is the value of the tag that holds its scale factor, or None if it has no scale factor."""
         tag = self.profile.tags[tag_name]
         value = decode(tag, held.raw, held.t_ns)
         return apply_scale(tag, value, of) if tag.scale_by is not None else value

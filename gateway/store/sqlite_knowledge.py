@@ -264,7 +264,7 @@ class SqliteKnowledge:
         ]
 
     def _text(self, number: int) -> str:
-        """Return the event name with this number, which another process added. Raises `FileInvalid` if there is none."""
+        """Return the event name with this number, which another process added. Raises `FileInvalid` if it has no such row."""
         row = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
         if row is None:
             raise FileInvalid(f"damaged: events refer to name {number}, which does not exist", path=str(self.path))

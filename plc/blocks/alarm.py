@@ -3,9 +3,9 @@
     LL  alarm     L  warning          H  warning     HH  alarm
 
 A limit is violated when X is beyond it, and no longer violated when X is back by more than HYS. A violation that lasts DELAY
-raises its condition; a shorter violation raises none. A raised condition stays *unacknowledged* until ACK rises, even if the
-limit is no longer violated. The condition ends when it is acknowledged and the limit is no longer violated. A value that is not
-a number changes nothing.
+raises its condition; a shorter violation raises none. A raised condition stays *unacknowledged* until ACK rises, even if X has
+returned. The condition ends when it is acknowledged and X has returned. A value that is not a
+number changes nothing.
 """
 
 from __future__ import annotations

@@ -286,7 +286,7 @@ class OutputImage:
         return owner, places.pop() if len(places) == 1 else ""
 
     def stop(self, now_ns: int) -> None:
-        """Publish OUTPUTS flagged as stopped, so that it is no longer used: every tag is BAD, and its value is unchanged."""
+        """Publish OUTPUTS flagged as stopped, so that its readers ignore it: every tag is BAD, and its value is unchanged."""
         self._same = False
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
 

@@ -222,7 +222,7 @@ class Scan:
         self.output_image.publish(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Publish OUTPUTS flagged as stopped, so that it is no longer used: every tag is BAD, and its value is unchanged."""
+        """Publish OUTPUTS flagged as stopped, so that its readers ignore it: every tag is BAD, and its value is unchanged."""
         self.output_image.stop(now_ns)
 
     def release(self) -> None:

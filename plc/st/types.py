@@ -254,7 +254,7 @@ def takes_bits(target: Type | None, source: AnyInt) -> TypeGuard[Elementary]:
 
 
 def common(a: Type, b: Type) -> Type | None:
-    """Return the type to which both operands convert implicitly, or None if there is none."""
+    """Return the type to which both operands convert implicitly, or None if no such type exists."""
     a, b = plain(a), plain(b)
     if isinstance(a, AnyInt) and isinstance(b, AnyInt):
         return AnyInt(0)

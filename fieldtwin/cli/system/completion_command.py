@@ -15,7 +15,7 @@ NEEDED = {
     "bash": "bash needs its package bash-completion for this; without the package add this line to ~/.bashrc: . {path}",
     "zsh": "add these lines to ~/.zshrc, before compinit: fpath+=~/.zfunc; autoload -Uz compinit && compinit",
 }
-"""What a shell needs in addition to the completion file, in order to load it."""
+"""The lines that a user must add for a shell, so that it loads the completion file."""
 
 
 @click.command("completion")

@@ -94,7 +94,7 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
     """Reduce the faults of a failed seed to those that the failure needs, write them as a scenario into the working
     directory, and run this scenario to confirm it.
 
-    Return the result of the confirmed scenario in a list, empty if there is none. `told`: print the findings.
+    Return the result of the confirmed scenario in a list, empty if no scenario was confirmed. `told`: print the findings.
     """
     stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrink_seed(campaign, failed)

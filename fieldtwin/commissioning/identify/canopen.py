@@ -44,7 +44,7 @@ class CanIdentity:
 
     @property
     def certain(self) -> str | None:
-        """Return the profile that is certain; None if there is none or more than one."""
+        """Return the profile that is certain; None if no profile or more than one is certain."""
         return None if self.conflict else certain(self.candidates)
 
 

@@ -101,7 +101,7 @@ def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
 
 
 def certain(ranked: Sequence[Candidate]) -> str | None:
-    """Return the profile that is certain; None if there is none or more than one."""
+    """Return the profile that is certain; None if no profile or more than one is certain."""
     found = [c.profile for c in ranked if c.sureness is Sureness.CERTAIN]
     return found[0] if len(found) == 1 else None
 

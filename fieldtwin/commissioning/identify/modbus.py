@@ -67,7 +67,7 @@ class ModbusIdentity:
 
     @property
     def certain(self) -> str | None:
-        """Return the profile that is certain; None if there is none or more than one."""
+        """Return the profile that is certain; None if no profile or more than one is certain."""
         return certain(self.candidates)
 
 

@@ -1,6 +1,6 @@
 """The coverage of a run: registers and objects, refusals, transitions, faults in states.
 
-`Collector` counts the events of a trace and returns `AccessCounts`, which add up over scenarios. What is missing is
+`Collector` counts the events of a trace and returns `AccessCounts`, which add up over scenarios. The missing parts are
 derived from the profiles when the report is written. The number of counters is limited: those of the system by its contents,
 and all others by `MOST`.
 """

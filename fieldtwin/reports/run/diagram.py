@@ -177,7 +177,7 @@ def _row(exchange: DecodedExchange) -> int:
 
 
 def _scan_lane(axis: TimeAxis, window: Window, system: System | None) -> list[Lane]:
-    """Return the lane of the PLC scans in which a state changed, each with its changes; [] if there is none."""
+    """Return the lane of the PLC scans in which a state changed, each with its changes; [] if no state changed."""
     changed: dict[int, list[str]] = {}
     for name, steps in window.states.items():
         for step in steps:

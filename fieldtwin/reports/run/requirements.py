@@ -50,7 +50,7 @@ class Matrix:
 
 
 def requirement_matrix(report: Report) -> Matrix | None:
-    """Return the matrix, or a list if there are many scenarios; None if there are no requirements."""
+    """Return the matrix, or a list if there are many scenarios; None without requirements."""
     verdicts = requirement_verdicts(report)
     if not verdicts:
         return None

@@ -44,7 +44,7 @@ def read_site(
 ) -> tuple[SiteDocument, list[str]]:
     """Return the document of all files, and the files of folders that were left out, with the reason.
 
-    Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` if there is no file.
+    Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` without files.
     """
     pieces: list[tuple[Path, DocumentPiece]] = []
     left_out: list[str] = []

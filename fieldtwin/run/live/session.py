@@ -435,7 +435,7 @@ class RunSession(AsyncResource):
     async def _answer(
         self, client: ControlClient | None, name: str, ask: Callable[[ControlClient], Awaitable[T]]
     ) -> T | None:
-        """Return the answer of a process, None if there is none. A timeout is an error of the run, if `name` is not empty."""
+        """Return the answer of a process, None without an answer. A timeout is an error of the run, if `name` is not empty."""
         if client is None:
             return None
         try:

@@ -185,7 +185,7 @@ def _words(target: ScenarioTarget) -> list[str]:
 
 
 def _with_words(target: ScenarioTarget) -> str:
-    """Return the part of the command line that names the user's controller; empty if there is none."""
+    """Return the part of the command line that names the user's controller; empty if fieldtwin controls."""
     return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
 
 

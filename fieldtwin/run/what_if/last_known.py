@@ -74,7 +74,7 @@ def of_period(period_s: int) -> dict[str, Number]:
 
 
 def of_status(data: bytes) -> dict[str, Number]:
-    """Return the same variables from a STATUS message, which has state and period; empty if `data` is no such message."""
+    """Return the same variables from a STATUS message, which has state and period; empty if `data` is another message."""
     try:
         name, period_s = decode_status(data)
     except Desync:

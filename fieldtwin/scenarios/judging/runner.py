@@ -367,7 +367,7 @@ class ScenarioRunner:
 
     @staticmethod
     def _bound(expression: Expression, limit_s: float = 0.0) -> float:
-        """Return the shortest time in a check, in seconds: `limit_s` and the times in the expression; 0 if there is none."""
+        """Return the shortest time in a check, in seconds: `limit_s` and the times in the expression; 0 if it has no time."""
         return min([t for t in (limit_s, *expression.times_s) if t > 0], default=0.0)
 
     # -- time, and what holds all the time --------------------------------------------------------------------------------

@@ -108,7 +108,7 @@ def _active(events: list[FaultEvent]) -> list[tuple[int, int | None, dict[str, A
 
 
 def _ns(value: Any) -> int | None:
-    """Return a time of a fault file, such as ``10s``, in ns; None if there is none or it is invalid."""
+    """Return a time of a fault file, such as ``10s``, in ns; None if the time is missing or invalid."""
     from fieldtwin.emulators.faults.schema import seconds  # here: a plant has no emulators installed
 
     if not isinstance(value, int | float | str):

@@ -77,7 +77,7 @@ class Series:
         self.kinds.insert(at, kind)
 
     def last_at(self, t_ns: int) -> int:
-        """Return the position of the last event at or before an instant, -1 if there is none."""
+        """Return the position of the last event at or before an instant, -1 if all events are later."""
         return bisect_right(self.times, t_ns) - 1
 
     def first_from(self, t_ns: int) -> int:

@@ -26,7 +26,7 @@ class RunProgress:
         self._t_s = 0.0
 
     def look(self) -> bool:
-        """Read the next new lines, and return whether there were any. There are none while the file does not exist yet."""
+        """Read the next new lines, and return whether there were any. A file that does not exist yet has no lines."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._read_to)

@@ -96,7 +96,7 @@ class Recordings:
         return path
 
     def _recorder(self, attachment: Attachment) -> Recorder | None:
-        """Return the recorder of this run, None if there is none or it belongs to an earlier run of the same name."""
+        """Return the recorder of this run, None if it is missing or belongs to an earlier run of the same name."""
         recorder = self._recorders.get(attachment.name)
         return recorder if recorder is not None and recorder.attachment is attachment else None
 

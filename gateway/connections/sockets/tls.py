@@ -29,7 +29,7 @@ class TlsConnection(TcpConnection):
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
         super().__init__(endpoint, max_pending)
         self.role = ""
-        """The role in the local certificate (MBTLS 8.4), which was presented to the server; empty if there is none."""
+        """The role in the local certificate (MBTLS 8.4), which was presented to the server; empty without a role."""
 
     @classmethod
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:

@@ -34,7 +34,7 @@ class AckedCommandStore:
                 pass  # there is no file yet, or fieldtwin did not write it
 
     def of(self, device: str) -> bytes:
-        """Return the content of the inbox of transmitter `device` whose message was taken, or b"" if there is none."""
+        """Return the content of the inbox of transmitter `device` whose message was taken, or b"" if none was taken."""
         return self._taken.get(device, b"")
 
     def note(self, device: str, raw: bytes) -> None:

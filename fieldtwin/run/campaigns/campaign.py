@@ -178,7 +178,7 @@ def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
     """Return the check that at least one fault took effect, with the number of times by name of the fault."""
     names = sorted({fault.name for result in results for fault in result.faults})
     struck = {n: [fault.struck for result in results for fault in result.faults if fault.name == n] for n in names}
-    parts = [f"{name} {len(each)} (struck {sum(each)} times)" for name, each in struck.items()]
+    parts = [f"{name} {len(each)} (took effect {sum(each)} times)" for name, each in struck.items()]
     got = f"{sum(map(len, struck.values()))} injected: {', '.join(parts)}" if parts else "none was injected"
     verdict = Verdict.PASSED if any(map(sum, struck.values())) else Verdict.INCONCLUSIVE
     return CheckResult("faults", "random faults are injected", verdict, got=got)

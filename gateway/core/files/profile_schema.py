@@ -134,7 +134,7 @@ class BoxForm(Strict):
 
 
 class MailboxForm(Strict):
-    """A transmitter's two mailboxes (paper.md, ruling 17)."""
+    """A transmitter's two mailboxes."""
 
     inbox: BoxForm
     outbox: BoxForm

@@ -32,7 +32,8 @@ def site(folder: Path, profiles: tuple[Path, ...], as_json: bool) -> int:
     profiles, networks, faults, rules and waivers, and the services of compose files that run fieldtwin.
 
     Every error is reported in one run, one per line, with file, line and column: for example each reference to a device,
-    a bus, a tag or a program that was renamed or removed. Files of other programs, such as CI files, are left out.
+    a bus, a tag or a program that was renamed or removed. The references to and from a file with an unknown key or a wrong
+    type are checked once that file is corrected. Files of other programs, such as CI files, are left out.
 
     Exit code 0 without errors, else 1.
     """

@@ -202,6 +202,6 @@ async def _run(
         await asking.check(questions)
     stop = stop_signal()
     if not as_json:
-        stderr.print(f"[bold]twin[/bold] of {system.name}, opposite {place}", soft_wrap=True, markup=True)
+        stderr.print(f"[bold]twin[/bold] of {system.name}, from {place}", soft_wrap=True, markup=True)
     await twinning.run(stop, duration_s)
     return twinning.describe()

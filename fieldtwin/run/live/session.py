@@ -144,9 +144,11 @@ class RunSession(AsyncResource):
 
     @property
     def disturbed(self) -> bool:
-        """Return whether there were faults or the field simulator was lost; then gateway and emulators may count differently."""
+        """Return whether there were faults, also those that Studio or a script injected, or the field simulator was lost; then
+        gateway and emulators may count differently."""
         lost = self.field_return is not None and self.field_return.losses > 0
-        return bool(self.faults) or lost or self.recreated > 0
+        injected = self.field_status is not None and any(fault.struck for fault in self.field_status.struck)
+        return bool(self.faults) or injected or lost or self.recreated > 0
 
     @property
     def calm(self) -> bool:

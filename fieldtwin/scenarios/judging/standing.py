@@ -119,10 +119,10 @@ class AlwaysRule:
         if vacuous:
             verdict, got = Verdict.INCONCLUSIVE, f"there was never a value of {', '.join(dict.fromkeys(names))}"
         else:
-            got = f"{self.looks} looks from {self.since_s:.3f} s on"
+            got = f"{self.looks} checks from {self.since_s:.3f} s on"
         if self.unknown_s is not None:
             verdict = Verdict.INCONCLUSIVE
-            got += f"; no value in {self.unknown_looks} looks, first at {self.unknown_s:.3f} s"
+            got += f"; no value in {self.unknown_looks} checks, first at {self.unknown_s:.3f} s"
         since_ns = round((self.since_s or 0.0) * NS_PER_S)
         return CheckResult(
             self.number,

@@ -96,19 +96,23 @@ async def _client(socket: Path) -> AsyncIterator[ControlClient]:
 def starting_commands(attachment: Attachment, thread: PlantThreadStatus | None) -> list[dict[str, str]]:
     """Return the command lines that start a shadow or a twin of the instance, with a description of each.
 
-    If the instance has no digital thread, the first command starts the instance again with one.
+    If the instance has no digital thread, the first command starts the instance again with one. A twin commands periods over
+    a transmitter, so a system without one has only a shadow.
     """
     record = attachment.record
     system = shlex.quote(short_system(record))
     place = thread.place if thread is not None else EXAMPLE_PLACE
     mode = "--prototype" if record.prototype else "--plant"
     commands = [
-        {"text": "Watch the plant with a shadow", "command": f"fieldtwin shadow {system} --from {shlex.quote(place)}"},
-        {
-            "text": "Command it with a twin, which starts with a period of 2 s",
-            "command": f"fieldtwin twin {system} --from {shlex.quote(place)} --command 2",
-        },
+        {"text": "Watch the plant with a shadow", "command": f"fieldtwin shadow {system} --from {shlex.quote(place)}"}
     ]
+    if any(device.profile.inbox is not None for device in attachment.system.devices.values()):
+        commands.append(
+            {
+                "text": "Command it with a twin, which starts with a period of 2 s",
+                "command": f"fieldtwin twin {system} --from {shlex.quote(place)} --command 2",
+            }
+        )
     if thread is None:
         run = f"fieldtwin run {system} {mode} --instance {attachment.name} --studio --thread {place}"
         commands.insert(0, {"text": "Start the instance with a digital thread", "command": run})

@@ -78,7 +78,7 @@ function Controller({ store, height }) {
       <text class=${gateway ? "soft" : "bad-text"} x="16" y="60">
         ${gateway ? (store.isTrace ? "as recorded" : `${gateway.published} values published`) : "no answer"}
       </text>
-      <text class="soft" x="16" y="80">${gateway?.writes ? (gateway.writes.allowed ? `${gateway.writes.done} writes` : "read-only") : ""}</text>
+      <text class="soft" x="16" y="80">${gateway?.writes ? (gateway.writes.allowed ? `${gateway.writes.done} ${gateway.writes.done === 1 ? "write" : "writes"}` : "read-only") : ""}</text>
       ${lines.map(([text, cls], n) => html`<text class=${cls} x="16" y=${116 + n * 20}>${text}</text>`)}
       ${served.map(
         ([name, front], n) =>

@@ -65,6 +65,12 @@ CONSTANTS = {"pi": math.pi, "nan": math.nan, "true": 1.0, "false": 0.0}
 FUNCTIONS = (*sorted([*OF_NUMBERS, *OF_TIME]), "noise")
 
 
+def uses_time(text: str) -> bool:
+    """Return whether the valid formula `text` contains `t` or a function of time. Its values then follow the time of the run."""
+    names = (node.id for node in ast.walk(Parsed(text, "formula", "").tree) if isinstance(node, ast.Name))
+    return any(name == TIME or name in OF_TIME for name in names)
+
+
 class Formula:
     """A formula, parsed once from `text`. `names` are the names that it uses. Raises `UsageError` for an invalid formula.
 

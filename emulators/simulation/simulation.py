@@ -28,11 +28,17 @@ class Simulation:
     itself, with dt 0.
 
     `start` are the values before the first step, NaN if only the step determines them. `inputs` are the names that `put` may set;
-    they are 0 at first. Values are constant between two steps.
+    they are 0 at first. Values are constant between two steps. `of_time`: the step depends on the time since the start.
     """
 
     def __init__(
-        self, step: Step, start: Mapping[str, float], inputs: Sequence[str], start_ns: int, step_ns: int
+        self,
+        step: Step,
+        start: Mapping[str, float],
+        inputs: Sequence[str],
+        start_ns: int,
+        step_ns: int,
+        of_time: bool = False,
     ) -> None:
         if step_ns <= 0:
             raise UsageError("the step of a simulation", expected="more than 0 ns", got=str(step_ns))
@@ -41,7 +47,7 @@ class Simulation:
         self.skipped = 0
         """Steps that were skipped after a long time without an access."""
         self._step = step
-        self._own_state = any(math.isnan(value) for value in start.values())
+        self._own_state = of_time or any(math.isnan(value) for value in start.values())
         self._step_ns = step_ns
         self._values: dict[str, float] = dict(start) | dict.fromkeys(inputs, 0.0)
         self._inputs = frozenset(inputs)
@@ -56,7 +62,7 @@ class Simulation:
         self._values[name] = value
 
     def begin_with(self, values: Mapping[str, float]) -> bool:
-        """Set the values with which the next step starts. Return False if the step keeps its own state."""
+        """Set the values with which the next step starts. Return False if the step keeps its own state or follows the time."""
         known = {name: value for name, value in values.items() if name in self.names}
         self._values.update(known)
         return bool(known) and not self._own_state

@@ -10,7 +10,7 @@ from random import Random
 
 from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.models.modbus.sampled_sensor import sampled_tags
-from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
+from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula, uses_time
 from fieldtwin.emulators.simulation.inputs import number_of
 from fieldtwin.emulators.simulation.python_model import PythonModel
 from fieldtwin.emulators.simulation.signals import SimulatedSignals
@@ -137,7 +137,8 @@ class Simulations:
             step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
         else:
             step, start = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
-        return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
+        of_time = any(uses_time(text) for text in form.formulas.values())
+        return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS), of_time)
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
         """Return the signals that give `device` its values: those that its entry names, else every value of the simulation that

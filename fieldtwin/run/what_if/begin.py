@@ -77,6 +77,7 @@ def _begin_device(run: VirtualPrototype, name: str, values: Mapping[str, Number]
         taken = bool(sets)
     signals = run.field.signals.get(name)
     if signals is not None:
-        numbers = {tag: float(v) for tag, v in values.items() if not isinstance(v, str)}
-        taken = signals.begin_with(numbers, now_ns) or taken
+        numbers = {tag: float(v) for tag, v in values.items() if not isinstance(v, str) and tag in signals.names}
+        if numbers:  # the signals determine these registers from now on
+            taken = signals.begin_with(numbers, now_ns)
     return taken

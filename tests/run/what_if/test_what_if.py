@@ -91,6 +91,11 @@ def test_a_state_that_a_fork_could_not_begin_with_is_named_unless_a_command_came
     assert told == [[program], []]
 
 
+def test_a_simulation_that_follows_the_time_is_named_because_its_curve_begins_again() -> None:
+    known = KnownState({"optode.temperature": 7.4})
+    assert answer(Fork("ocean_middle", known, 3.0), WhatIfPlan("go on")).not_taken == ["optode"]
+
+
 def test_without_knowledge_it_begins_as_any_prototype() -> None:
     outcome = answer(
         Fork("observatory", KnownState(), 2.0, settle_s=1.0),

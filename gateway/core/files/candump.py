@@ -1,7 +1,7 @@
 """Read and write CAN logs in the format of candump -L: ``(1436509052.249713) can0 585#4B06200034120000``.
 
-The written logs can be replayed by candump's own tools. Logs may contain additions of kernels and adapters: CAN FD
-frames and error frames are counted and omitted. This module must not depend on the meaning of frames.
+The written logs can be replayed by candump's own tools. Logs may contain CAN FD frames, and error frames of kernels and adapters;
+they are counted and omitted. This module must not depend on the meaning of frames.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def line_of(t_ns: int, frame: CanFrame, channel: str = "can0") -> bytes:
 
 
 def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str, CanFrame]]:
-    """Yield (ns, channel, frame) of each line of a file, see `read_lines`. Raises `FileInvalid` also if the file cannot be
-    read.
+    """Yield (time stamp in ns, channel, frame) of each line of a file, see `read_lines`. Raises `FileInvalid` also if the file
+    cannot be read.
     """
     try:
         with open_input(path) as file:
@@ -58,10 +58,10 @@ def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str
 def read_lines(
     lines: Iterable[bytes], path: str = "", left: LeftOut | None = None
 ) -> Iterator[tuple[int, str, CanFrame]]:
-    """Yield (ns, channel, frame) of each line. Omitted frames are counted in `left`.
+    """Yield (time stamp in ns, channel, frame) of each line. Omitted frames are counted in `left`.
 
-    A line without a newline is taken for a truncated one and ends the log, if it is invalid. Raises `FileInvalid` with
-    `path` and the number of the line for any other invalid line, and for one of more than `MAX_LINE` bytes.
+    An invalid line without a newline counts as a truncated last line and ends the log. Raises `FileInvalid` with `path` and the
+    line number for any other invalid line, and for a line of more than `MAX_LINE` bytes.
     """
     left = left if left is not None else LeftOut()
     for number, line in enumerate(lines, start=1):

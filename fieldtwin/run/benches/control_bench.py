@@ -14,8 +14,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,7 @@ from fieldtwin.run.benches.field_lease import FieldLease
 from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
 from fieldtwin.run.benches.host_lateness import HostLateness
 from fieldtwin.run.benches.probes import Probes
-from fieldtwin.run.processes.children import Failure, cause_of
+from fieldtwin.run.processes.children import Failure, naming_failures
 from fieldtwin.run.processes.field_contact import check_same, connect_control, reachable
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
@@ -155,7 +154,7 @@ class ControlBench(AsyncResource):
         self._held_since: dict[str, int] = {}
 
     async def _start(self) -> None:
-        async with self._naming_causes():
+        async with naming_failures(self._failure):
             await self._open()
 
     async def _open(self) -> None:
@@ -198,7 +197,7 @@ class ControlBench(AsyncResource):
         if where.own and self._plc is not None:  # a short scenario would end before the programs had their first inputs
             await programs_scan(self._plc)
         self._start_ns = self._clock.monotonic_ns()
-        await self._refresh()
+        await self._look()
         self._updates.clear()
 
     async def _open_lease(self, nursery: Nursery) -> None:
@@ -382,7 +381,7 @@ class ControlBench(AsyncResource):
         if self._field is None:
             raise UsageError("there are no simulated field devices", expected="a prototype")
         try:
-            async with self._naming_causes():
+            async with naming_failures(self._failure):
                 return await self._field.call(command, **args)
         except RemoteError as e:
             if e.remote_exit_code == UsageError.exit_code:
@@ -398,18 +397,8 @@ class ControlBench(AsyncResource):
         self._note(TraceKind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
-        async with self._naming_causes():
+        async with naming_failures(self._failure):
             await self._look()
-
-    @asynccontextmanager
-    async def _naming_causes(self) -> AsyncIterator[None]:
-        """If a control channel is lost within this context, raise the error that ended its process instead."""
-        try:
-            yield
-        except Unreachable as e:
-            if self._failure is None:
-                raise
-            raise await cause_of(e, self._failure) from e
 
     async def _look(self) -> None:
         failed = self._failure() if self._failure is not None else None

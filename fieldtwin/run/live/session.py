@@ -38,7 +38,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
 from fieldtwin.run.live.scheduling_watch import SchedulingWatch
 from fieldtwin.run.live.summary import RunFacts, summarise
-from fieldtwin.run.processes.children import Child, ChildFailed, cause_of
+from fieldtwin.run.processes.children import Child, ChildFailed, naming_failures
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
@@ -189,10 +189,8 @@ class RunSession(AsyncResource):
     # -- starting -------------------------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        try:
+        async with naming_failures(self.failure):
             await self._start_all()
-        except Unreachable as e:
-            raise await cause_of(e, self.failure) from e
 
     async def _start_all(self) -> None:
         self._stack.enter_context(self.instance)

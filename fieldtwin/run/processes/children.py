@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fieldtwin.gateway.core.control import ControlClient
@@ -29,16 +30,24 @@ class ChildFailed(FieldtwinError):
         super().__init__(f"{name}: {text}", hint=f"log: {log}")
 
 
-async def cause_of(lost: Unreachable, failure: Failure) -> FieldtwinError:
-    """Return the error that ended a process. If all processes still run, return `lost`, the error of the control channel.
+@asynccontextmanager
+async def naming_failures(failure: Failure | None) -> AsyncIterator[None]:
+    """Raise the error that ended a process in place of the loss of its control channel. Do nothing if `failure` is None.
 
     A process that fails closes its channel a moment before it ends, so the failure may appear up to `ENDS_WITHIN_S` later.
     """
-    loop = asyncio.get_running_loop()
-    until_s = loop.time() + ENDS_WITHIN_S
-    while (failed := failure()) is None and loop.time() < until_s:
-        await asyncio.sleep(POLL_S)
-    return failed or lost
+    try:
+        yield
+    except Unreachable as lost:
+        if failure is None:
+            raise
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + ENDS_WITHIN_S
+        while (failed := failure()) is None and loop.time() < until_s:
+            await asyncio.sleep(POLL_S)
+        if failed is None:
+            raise
+        raise failed from lost
 
 
 def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:

@@ -56,7 +56,7 @@ def _launcher(request: Request) -> Launcher:
 async def get_instance(request: Request) -> dict[str, Any]:
     """Return the description of an instance: buses, devices with their tags, programs."""
     attachment = await attached(request)
-    await attachment.has_history()
+    await attachment.wait_for_history()
     record = attachment.record
     return {
         "name": attachment.name,

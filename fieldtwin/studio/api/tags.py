@@ -44,7 +44,7 @@ async def get_history(request: Request) -> dict[str, Any]:
     """Return the changes of a tag: [time in ns, value, quality, reason]."""
     attachment = await attached(request)
     device, name = tag_of(request, attachment)
-    await attachment.has_history()
+    await attachment.wait_for_history()
     now_ns = attachment.now_ns()
     from_ns, to_ns = whole(request, "from_ns", 0), whole(request, "to_ns", now_ns)
     points = whole(request, "points", MOST_POINTS, 4, MOST_POINTS)
@@ -55,7 +55,7 @@ async def get_history(request: Request) -> dict[str, Any]:
 async def get_recent(request: Request) -> dict[str, Any]:
     """Return, for each tag, its numbers in the last minute: [time in ns, number, or null for a value that is not good]."""
     attachment = await attached(request)
-    await attachment.has_history()
+    await attachment.wait_for_history()
     return recent(attachment.history, attachment.history.names(), attachment.now_ns())
 
 

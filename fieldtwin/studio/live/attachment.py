@@ -192,7 +192,7 @@ class Attachment:
             self.updates.publish({"type": "status", "status": self.status()})
 
     async def _read_gateway(self) -> None:
-        await self.has_history()
+        await self.wait_for_history()
         gateway = await self.gateway_channel.ask("get", GatewayStatus, brief=True)
         if gateway.config is not UNSET and gateway.config.reloads != self._reloads:
             self._reloads = gateway.config.reloads
@@ -240,7 +240,7 @@ class Attachment:
         self.field = await self.field_channel.ask("get", FieldStatus)
         self.fault_marks.look(self.field, self.now_ns())
 
-    async def has_history(self) -> None:
+    async def wait_for_history(self) -> None:
         """Wait until the changes that the gateway has kept are in `history`, or until the gateway did not answer."""
         await self._history_read.wait()
 

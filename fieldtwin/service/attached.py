@@ -56,6 +56,8 @@ def snapshot(session: RunSession) -> RunState:
         children={name: child.returncode is None for name, child in session.children.items()},
         asked_ago_s=(now_ns - asked) / 1e9,
         thread=session.thread_status,
+        gateway_ago_s=(now_ns - session.answered_ns.get("gateway", session.started_ns)) / 1e9,
+        exported_tags=session.system.exported_tags,
     )
 
 

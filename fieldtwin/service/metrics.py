@@ -1,8 +1,8 @@
 """A run's metrics for monitoring: the latest statuses of gateway and PLC.
 
-They contain neither values nor names of tags, because these may be confidential, and because a plant with 100,000 tags then
-has no more series than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the rest is counted as left
-out. This module sends no requests: its caller passes statuses that the run polls in any case.
+They contain values and names of those tags only that the system file exports, because others may be confidential, and because a
+plant with 100,000 tags then has no more series than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the
+rest is counted as left out. This module sends no requests: its caller passes statuses that the run polls in any case.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.sdo.channel import SdoCounters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client_counters import ClientCounters
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
-from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
+from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread, TaskStatus
+from fieldtwin.service import metric_families as metric
 from fieldtwin.service.exposition import Family
+from fieldtwin.service.metric_families import Metric
+from fieldtwin.twin.site.exported_tags import ExportedTag
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
 MOST_DEVICES = 1000
@@ -29,6 +32,14 @@ MOST_DEVICES = 1000
 
 MOST_NAMED = 256
 """The largest number of buses that have series; the same limit applies to servers, bridges and tasks."""
+
+OLDEST_STATUS_S = 2.0
+"""The age in seconds at which a status of the gateway is too old to call a value good. Usually a status is at most half a second
+old; it is older if a process of the run does not answer.
+"""
+
+STATES = ("ready", "running", "paused", "waiting", "stopped")
+"""The states of a task (`ScanStatus.state`)."""
 
 ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tuple(asdict(CanopenCounters()))}
 """Counters that a bus exports before they first count, because a rate needs the 0."""
@@ -39,7 +50,8 @@ class RunState:
     """The latest known state of a run.
 
     A status is None while its process does not answer. `children`: whether each child process runs. `asked_ago_s`: seconds since
-    the last answer of the gateway or the PLC, whichever answered earlier.
+    the last answer of the gateway or the PLC, whichever answered earlier; `gateway_ago_s`: since that of the gateway.
+    `exported_tags`: the tags whose values are exported.
     """
 
     system: str
@@ -50,6 +62,8 @@ class RunState:
     children: Mapping[str, bool]
     asked_ago_s: float
     thread: PlantThreadStatus | None = None
+    gateway_ago_s: float = 0.0
+    exported_tags: tuple[ExportedTag, ...] = ()
 
 
 class Page:
@@ -58,54 +72,38 @@ class Page:
     def __init__(self) -> None:
         self.families: dict[str, Family] = {}
 
-    def counter(self, name: str, help: str) -> Family:
-        return self._family(Family(f"fieldtwin_{name}_total", "counter", help))
-
-    def gauge(self, name: str, help: str) -> Family:
-        return self._family(Family(f"fieldtwin_{name}", "gauge", help))
-
-    def histogram(self, name: str, help: str) -> Family:
-        return self._family(Family(f"fieldtwin_{name}", "histogram", help))
-
-    def _family(self, family: Family) -> Family:
-        return self.families.setdefault(family.name, family)
+    def family(self, declared: Metric) -> Family:
+        """Return the family of a metric, empty at its first use."""
+        return self.families.setdefault(declared.name, Family(declared.name, declared.kind, declared.help))
 
 
 def families(seen: RunState) -> list[Family]:
     """Return all metrics of `seen`. If a process does not answer, its metrics are left out, and `fieldtwin_up` is 0."""
     page = Page()
-    page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(
-        1, version=__version__, system=seen.system, mode=seen.mode
-    )
-    page.gauge("run_seconds", "Duration of this run.").add(seen.uptime_s)
-    page.gauge("status_age_seconds", "Age of the statuses from which these metrics come.").add(seen.asked_ago_s)
-    up = page.gauge("up", "Whether a process of the run is alive and, for gateway and PLC, answers.")
+    page.family(metric.INFO).add(1, version=__version__, system=seen.system, mode=seen.mode)
+    page.family(metric.RUN_SECONDS).add(seen.uptime_s)
+    page.family(metric.STATUS_AGE).add(seen.asked_ago_s)
+    up = page.family(metric.UP)
     for name, lives in seen.children.items():
         answers = {"gateway": seen.gateway is not None, "plc": seen.plc is not None}.get(name, True)
         up.add(int(lives and answers), process=name)
     if seen.gateway is not None:
         for part in (_buses, _devices, _tags, _writes, _mailboxes, _clients, _watchers):
             part(page, seen.gateway)
+        _values(page, seen, seen.gateway)
     if seen.plc is not None:
         _plc(page, seen.plc)
     if seen.thread is not None:
-        page.counter("thread_dropped", "Events that the digital thread's log lost.").add(seen.thread.dropped)
+        page.family(metric.THREAD_DROPPED).add(seen.thread.dropped)
     return list(page.families.values())
 
 
 def _buses(page: Page, gateway: GatewayStatus) -> None:
-    connected = page.gauge("bus_connected", "Whether the bus's connection is open.")
-    opens = page.counter(
-        "bus_opens", "How often the connection was opened; more than once means that it was lost and recovered."
-    )
-    events = page.counter(
-        "bus_events",
-        "Counters of the gateway on a bus: requests, replies, timeouts, CRC errors, frames, PDOs... by event.",
-    )
-    latency = page.histogram(
-        "bus_latency_seconds", "Response times: from request to reply (Modbus), and whole SDO transfers (CANopen)."
-    )
-    late = page.counter("bus_not_produced", "SYNC, TIME and repeated RPDOs that could not be sent in their period.")
+    connected = page.family(metric.BUS_CONNECTED)
+    opens = page.family(metric.BUS_OPENS)
+    events = page.family(metric.BUS_EVENTS)
+    latency = page.family(metric.BUS_LATENCY)
+    late = page.family(metric.BUS_NOT_PRODUCED)
     for name, bus in _some(gateway.buses):
         connected.add(int(bus.connected), bus=name)
         opens.add(bus.opens, bus=name)
@@ -118,15 +116,13 @@ def _buses(page: Page, gateway: GatewayStatus) -> None:
 
 
 def _devices(page: Page, gateway: GatewayStatus) -> None:
-    online = page.gauge("device_online", "Whether a device answers and has the expected identity.")
-    wrong = page.gauge("device_wrong", "Whether the device that answers differs from the one in the system file.")
-    polls = page.counter("device_polls", "Polls of a device.")
-    errors = page.counter("device_errors", "Polls that failed, and PDOs that were malformed.")
-    boots = page.counter(
-        "device_boots", "Boot-ups received from a CANopen node; more than expected means that the device restarts."
-    )
-    emcys = page.counter("device_emcys", "Emergency messages of a CANopen node.")
-    pdos = page.counter("device_pdos", "Process data frames, by direction from the gateway's view.")
+    online = page.family(metric.DEVICE_ONLINE)
+    wrong = page.family(metric.DEVICE_WRONG)
+    polls = page.family(metric.DEVICE_POLLS)
+    errors = page.family(metric.DEVICE_ERRORS)
+    boots = page.family(metric.DEVICE_BOOTS)
+    emcys = page.family(metric.DEVICE_EMCYS)
+    pdos = page.family(metric.DEVICE_PDOS)
     devices = gateway.devices
     for name, device in islice(devices.items(), MOST_DEVICES):
         labels = {"device": name, "bus": device.bus}
@@ -139,46 +135,56 @@ def _devices(page: Page, gateway: GatewayStatus) -> None:
         if not isinstance(device.tpdos, UnsetType):
             pdos.add(sum(t.frames for t in device.tpdos.values()), **labels, direction="in")
             pdos.add(_set(device.rpdos_sent), **labels, direction="out")
-    page.gauge("devices", "Devices of the system.").add(len(devices))
-    page.gauge("devices_online", "Devices that answer.").add(sum(d.online for d in devices.values()))
-    page.gauge("devices_left_out", "Devices above the limit, which have no series.").add(
-        max(0, len(devices) - MOST_DEVICES)
-    )
+    page.family(metric.DEVICES).add(len(devices))
+    page.family(metric.DEVICES_ONLINE).add(sum(d.online for d in devices.values()))
+    page.family(metric.DEVICES_LEFT_OUT).add(max(0, len(devices) - MOST_DEVICES))
 
 
 def _tags(page: Page, gateway: GatewayStatus) -> None:
     qualities = Counter(tag.quality for tag in gateway.tags.values())
-    counted = page.gauge("tags", "Tags by their present quality.")
+    counted = page.family(metric.TAGS)
     for quality in Quality:
         counted.add(qualities[str(quality)], quality=str(quality))
     ages = [tag.age_s for tag in gateway.tags.values() if tag.age_s is not None]
-    page.gauge("tags_oldest_seconds", "Age of the oldest value.").add(max(ages, default=None))
-    page.counter("published", "Values published.").add(gateway.published)
-    page.counter("logged", "Entries of the exchange log.").add(gateway.logged)
-    page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway.log_dropped)
+    page.family(metric.TAGS_OLDEST).add(max(ages, default=None))
+    page.family(metric.PUBLISHED).add(gateway.published)
+    page.family(metric.LOGGED).add(gateway.logged)
+    page.family(metric.LOG_DROPPED).add(gateway.log_dropped)
     if not isinstance(gateway.config, UnsetType):
-        page.counter("reloads", "Times that a changed configuration was applied.").add(gateway.config.reloads)
-    page.gauge("store_ok", "Whether the last write of the log to disk succeeded.").add(int(not gateway.store_error))
+        page.family(metric.RELOADS).add(gateway.config.reloads)
+    page.family(metric.STORE_OK).add(int(not gateway.store_error))
+
+
+def _values(page: Page, seen: RunState, gateway: GatewayStatus) -> None:
+    """Add the values of the exported tags. A tag whose value is not good has no value here: a scrape without the sample ends the
+    series at once, whereas NaN would be a sample that spoils every average and maximum over time.
+    """
+    values, good = page.family(metric.TAG_VALUE), page.family(metric.TAG_GOOD)
+    recent = seen.gateway_ago_s <= OLDEST_STATUS_S
+    for tag in seen.exported_tags:
+        status = gateway.tags.get(tag.name)
+        value = status.value if status is not None and recent and status.quality == str(Quality.GOOD) else None
+        number = value if isinstance(value, int | float) else None
+        values.add(number, device=tag.device, tag=tag.tag, unit=tag.unit)
+        good.add(int(number is not None), device=tag.device, tag=tag.tag)
 
 
 def _writes(page: Page, gateway: GatewayStatus) -> None:
     writes = gateway.writes
-    page.gauge("writes_allowed", "Whether this run may write.").add(int(writes.allowed))
-    page.gauge("outputs_safe", "Whether the outputs are at their safe values because the PLC was lost.").add(
-        int(writes.safe)
-    )
-    counted = page.counter("writes", "Writes of outputs, by result; `repeated` ones are periodic repetitions.")
+    page.family(metric.WRITES_ALLOWED).add(int(writes.allowed))
+    page.family(metric.OUTPUTS_SAFE).add(int(writes.safe))
+    counted = page.family(metric.WRITES)
     for result in ("done", "failed", "refused", "repeated"):
         counted.add(getattr(writes, result), result=result)
     held = [o for o in gateway.outputs if o.wanted is not None and o.wanted != o.held]
-    page.gauge("outputs_pending", "Outputs whose device does not hold the commanded value yet.").add(len(held))
-    page.gauge("plc_alive", "Whether the gateway receives the PLC's heartbeat.").add(int(gateway.plc.alive))
-    page.counter("plc_losses", "How often the gateway lost the PLC.").add(gateway.plc.losses)
+    page.family(metric.OUTPUTS_PENDING).add(len(held))
+    page.family(metric.PLC_ALIVE).add(int(gateway.plc.alive))
+    page.family(metric.PLC_LOSSES).add(gateway.plc.losses)
 
 
 def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
-    queued = page.gauge("mailbox_queued", "Queued messages of a transmitter.")
-    counted = page.counter("mailbox_messages", "Messages of a transmitter, by result.")
+    queued = page.family(metric.MAILBOX_QUEUED)
+    counted = page.family(metric.MAILBOX_MESSAGES)
     for name, box in _some(gateway.mailboxes):
         queued.add(box.queued, device=name)
         for what in ("received", "sent", "taken", "dropped", "waits", "commands_refused"):
@@ -187,7 +193,7 @@ def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
 
 def _clients(page: Page, gateway: GatewayStatus) -> None:
     """Add the counters of requests that clients sent to the gateway's servers and bridges."""
-    counted = page.counter("server_events", "Counters of a server or bridge, by event.")
+    counted = page.family(metric.SERVER_EVENTS)
     fronts: list[tuple[str, Mapping[str, FrontStatus]]] = [("serve", gateway.serve), ("bridge", gateway.bridge)]
     for kind, servers in fronts:
         for name, server in _some(servers):
@@ -197,48 +203,44 @@ def _clients(page: Page, gateway: GatewayStatus) -> None:
 
 def _watchers(page: Page, gateway: GatewayStatus) -> None:
     """Add the number of devices with each problem, so that an alert need not match texts."""
-    page.gauge("devices_wrong", "Devices that differ from those in the system file.").add(
-        sum(bool(d.identity_error) for d in gateway.devices.values())
-    )
+    page.family(metric.DEVICES_WRONG).add(sum(bool(d.identity_error) for d in gateway.devices.values()))
 
 
 def _plc(page: Page, plc: PlcStatus) -> None:
-    per_task: list[tuple[str, str, Callable[[ScanStatus], Any]]] = [
-        ("scans", "Scans of a task.", lambda t: t.scans),
-        ("missed_periods", "Periods in which a task's scan did not start.", lambda t: t.missed_periods),
-        ("overruns", "Scans that took longer than their period.", lambda t: t.overruns),
-    ]
     tasks: dict[str, ScanStatus] = dict(_some(plc.tasks or {"main": plc}))
-    for name, text, of in per_task:
-        counted = page.counter(f"plc_{name}", text)
-        for task, status in tasks.items():
-            counted.add(of(status), task=task)
-    spreads: list[tuple[str, str, Callable[[ScanStatus], Spread]]] = [
-        (
-            "plc_lateness_seconds",
-            "Start delay of scans since the start, by quantile; 1 is the maximum.",
-            lambda t: t.lateness_us,
-        ),
-        (
-            "plc_scan_seconds",
-            "Duration of scans since the start, by quantile; 1 is the maximum.",
-            lambda t: t.duration_us,
-        ),
+    counts: list[tuple[Metric, Callable[[ScanStatus], int]]] = [
+        (metric.PLC_SCANS, lambda t: t.scans),
+        (metric.PLC_MISSED_PERIODS, lambda t: t.missed_periods),
+        (metric.PLC_OVERRUNS, lambda t: t.overruns),
     ]
-    for name, text, spread_of in spreads:
-        gauge = page.gauge(name, text)
+    for declared, count_of in counts:
+        counted = page.family(declared)
+        for task, status in tasks.items():
+            counted.add(count_of(status), task=task)
+    period = page.family(metric.PLC_PERIOD)
+    for task, status in tasks.items():
+        if not (isinstance(status, TaskStatus) and status.single):  # a task that an event starts has no period
+            period.add(status.cycle_ms / 1e3, task=task)
+    spreads: list[tuple[Metric, Callable[[ScanStatus], Spread]]] = [
+        (metric.PLC_LATENESS, lambda t: t.lateness_us),
+        (metric.PLC_SCAN, lambda t: t.duration_us),
+    ]
+    for declared, spread_of in spreads:
+        gauge = page.family(declared)
         for task, status in tasks.items():
             for quantile, part in (("0.5", "p50"), ("0.99", "p99"), ("0.999", "p999"), ("1", "max")):
                 gauge.add(spread_of(status)[part] / 1e6, task=task, quantile=quantile)
-    running = page.gauge("plc_running", "Whether a task runs; 0 is stopped or failed.")
+    running = page.family(metric.PLC_RUNNING)
     for task, status in tasks.items():
         running.add(int(status.state == "running"), task=task)
-    page.gauge("plc_programs_waiting", "Programs that wait for their inputs and have not started.").add(
-        len(plc.waiting)
-    )
-    page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc.restarts)
-    page.gauge("plc_forces", "Variables that are forced.").add(len(plc.forces))
-    counted = page.counter("plc_events", "Counters of the PLC's process image and messages, by event.")
+    states = page.family(metric.PLC_STATE)
+    for task, status in tasks.items():
+        for state in STATES:
+            states.add(int(status.state == state), task=task, state=state)
+    page.family(metric.PLC_PROGRAMS_WAITING).add(len(plc.waiting))
+    page.family(metric.PLC_RESTARTS).add(plc.restarts)
+    page.family(metric.PLC_FORCES).add(len(plc.forces))
+    counted = page.family(metric.PLC_EVENTS)
     for event, count in plc.counters.items():
         counted.add(count, event=event)
 

@@ -20,8 +20,10 @@ from fieldtwin.gateway.runtime.buses.bus import latency_status
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
-from fieldtwin.service.metrics import MOST_DEVICES, RunState, families
+from fieldtwin.service.metric_families import ALL
+from fieldtwin.service.metrics import MOST_DEVICES, OLDEST_STATUS_S, RunState, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
+from fieldtwin.twin.site.exported_tags import ExportedTag
 from fieldtwin.twin.thread.status import PlantThreadStatus
 
 THREAD = PlantThreadStatus(
@@ -87,10 +89,12 @@ def busy_gateway(devices: int = 1) -> GatewayStatus:
     )
 
 
+SHAPE: Spread = {"count": 4, "min": 1.0, "p50": 10.0, "p99": 20.0, "p999": 30.0, "above_1ms": 0.0, "max": 40.0}
+PLAIN_TASK: dict[str, Any] = {"state": "running", "lateness_us": SHAPE, "duration_us": SHAPE}
+
+
 def plc_status() -> PlcStatus:
-    shape: Spread = {"count": 4, "min": 1.0, "p50": 10.0, "p99": 20.0, "p999": 30.0, "above_1ms": 0.0, "max": 40.0}
-    counts = {"state": "running", "scans": 442, "missed_periods": 1, "overruns": 2}
-    task: dict[str, Any] = {**counts, "lateness_us": shape, "duration_us": shape}
+    task: dict[str, Any] = {**PLAIN_TASK, "scans": 442, "missed_periods": 1, "overruns": 2}
     forces: dict[str, dict[str, Any]] = {"a": {"value": 1}}
     tasks = {"main": TaskStatus(**task)}
     return PlcStatus(**task, tasks=tasks, restarts=3, forces=forces, counters={"messages_missed": 2})
@@ -99,6 +103,14 @@ def plc_status() -> PlcStatus:
 def seen(**changed: Any) -> RunState:
     whole = RunState("observatory", "plant", 12.5, busy_gateway(), plc_status(), {"gateway": True, "plc": True}, 0.1)
     return replace(whole, **changed)
+
+
+PRESSURE = ExportedTag("ctd", "pressure", "dbar")
+
+
+def whole() -> RunState:
+    """Return a state in which every metric has a sample."""
+    return seen(thread=THREAD, exported_tags=(PRESSURE,))
 
 
 def scraped(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -170,17 +182,21 @@ fieldtwin_plc_lateness_seconds gauge quantile,task
 fieldtwin_plc_losses_total counter
 fieldtwin_plc_missed_periods_total counter task
 fieldtwin_plc_overruns_total counter task
+fieldtwin_plc_period_seconds gauge task
 fieldtwin_plc_programs_waiting gauge
 fieldtwin_plc_restarts_total counter
 fieldtwin_plc_running gauge task
 fieldtwin_plc_scan_seconds gauge quantile,task
 fieldtwin_plc_scans_total counter task
+fieldtwin_plc_state gauge state,task
 fieldtwin_published_total counter
 fieldtwin_reloads_total counter
 fieldtwin_run_seconds gauge
 fieldtwin_server_events_total counter event,kind,name
 fieldtwin_status_age_seconds gauge
 fieldtwin_store_ok gauge
+fieldtwin_tag_good gauge device,tag
+fieldtwin_tag_value gauge device,tag,unit
 fieldtwin_tags gauge quality
 fieldtwin_tags_oldest_seconds gauge
 fieldtwin_thread_dropped_total counter
@@ -194,10 +210,20 @@ fieldtwin_writes_total counter result
 def test_names_types_and_labels_are_those_that_dashboards_use() -> None:
     found = {
         " ".join((sample.name, family.type, ",".join(sorted(sample.labels)))).rstrip()
-        for family in text_string_to_metric_families(render(families(seen(thread=THREAD))))
+        for family in text_string_to_metric_families(render(families(whole())))
         for sample in family.samples
     }
     assert sorted(found) == sorted(SERIES.split("\n")[1:-1])
+
+
+def test_each_metric_has_the_labels_that_its_declaration_states() -> None:
+    page = {family.name: family for family in families(whole())}
+    assert page.keys() == {declared.name for declared in ALL}
+    for declared in ALL:
+        family = page[declared.name]
+        extra = {"le"} if declared.kind == "histogram" else set()
+        labels = {frozenset(labels) - extra for _, labels, _ in family.samples}
+        assert labels == {frozenset(declared.labels)}, family.name
 
 
 def test_bounds_of_buckets_are_written_as_dashboards_use_them() -> None:
@@ -221,6 +247,55 @@ def test_no_value_and_no_name_of_a_tag_is_in_it() -> None:
     assert "geheim" not in text
     assert "31337" not in text
     assert "pressure" not in text
+
+
+def test_an_exported_tag_has_its_value_with_unit_and_no_other_tag_has_one() -> None:
+    text = render(families(seen(exported_tags=(PRESSURE,))))
+    got = scraped(text)
+    assert value(got, "tag_value", device="ctd", tag="pressure", unit="dbar") == 31337.25
+    assert value(got, "tag_good", device="ctd", tag="pressure") == 1
+    assert "secret" not in text
+
+
+@pytest.mark.parametrize(
+    ("status", "changes"),
+    [
+        ({"quality": "bad", "reason": "stale"}, {}),
+        ({"quality": "uncertain"}, {}),
+        ({"quality": "simulated"}, {}),
+        ({"value": None}, {}),
+        ({}, {"gateway_ago_s": OLDEST_STATUS_S + 0.1}),
+    ],
+)
+def test_a_value_that_is_not_good_has_no_sample_and_says_so(status: dict[str, Any], changes: dict[str, Any]) -> None:
+    gateway = gateway_status(tags={"ctd.pressure": {"value": 31337.25, "age_s": 0.5} | status})
+    got = scraped(render(families(seen(gateway=gateway, exported_tags=(PRESSURE,), **changes))))
+    assert not [name for name, _ in got if name == "fieldtwin_tag_value"]
+    assert value(got, "tag_good", device="ctd", tag="pressure") == 0
+
+
+def test_a_bit_is_exported_as_0_or_1_and_a_counter_of_64_bits_exactly() -> None:
+    tags = (ExportedTag("d", "bit", ""), ExportedTag("d", "energy", "Wh"), ExportedTag("d", "missing", ""))
+    gateway = gateway_status(tags={"d.bit": {"value": True}, "d.energy": {"value": 2**63 + 1}})
+    text = render(families(seen(gateway=gateway, exported_tags=tags)))
+    assert 'fieldtwin_tag_value{device="d",tag="bit",unit=""} 1\n' in text
+    assert f'fieldtwin_tag_value{{device="d",tag="energy",unit="Wh"}} {2**63 + 1}\n' in text
+    assert 'fieldtwin_tag_good{device="d",tag="missing"} 0\n' in text
+
+
+def test_the_state_of_a_task_is_1_for_its_present_state_only() -> None:
+    got = scraped(render(families(seen())))
+    states = {dict(labels)["state"]: n for (name, labels), n in got.items() if name == "fieldtwin_plc_state"}
+    assert states == {"ready": 0, "running": 1, "paused": 0, "waiting": 0, "stopped": 0}
+
+
+def test_a_task_that_an_event_starts_has_no_period() -> None:
+    cyclic, event = TaskStatus(**PLAIN_TASK, cycle_ms=20.0), TaskStatus(**PLAIN_TASK, cycle_ms=1e9, single="ctd.alarm")
+    plc = PlcStatus(**PLAIN_TASK, tasks={"fast": cyclic, "alarm": event})
+    got = scraped(render(families(seen(plc=plc))))
+    assert {dict(labels)["task"]: n for (name, labels), n in got.items() if name == "fieldtwin_plc_period_seconds"} == {
+        "fast": 0.02
+    }
 
 
 def test_a_process_that_does_not_answer_is_down_and_has_no_metrics() -> None:

@@ -317,6 +317,15 @@ NONE_STATED = InvariantsForm()
 """The invariants of a system whose file states none."""
 
 
+TagPattern = Annotated[str, Field(pattern=r"^[a-zA-Z*?][a-zA-Z0-9_*?]*\.[a-zA-Z*?][a-zA-Z0-9_*?]*$")]
+
+
+class MetricsForm(SiteModel):
+    """The tags whose values are exported to Prometheus by `run --metrics`: names or patterns with * and ?."""
+
+    tags: list[TagPattern] = Field(min_length=1, max_length=1000, examples=[["meter.*"]])
+
+
 class SystemForm(SiteModel):
     """The form of a system file, which describes a plant. The physical twin and its prototype read the same file, byte for
     byte.
@@ -334,6 +343,7 @@ class SystemForm(SiteModel):
     invariants: InvariantsForm = Field(
         default=InvariantsForm(), description="conditions that hold in every run, scenario and campaign"
     )
+    metrics: MetricsForm | None = Field(default=None, description="default: metrics contain no values of tags")
 
 
 class BusMappingForm(SiteModel):

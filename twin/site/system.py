@@ -22,6 +22,7 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from fieldtwin.twin.site.data_files import find
+from fieldtwin.twin.site.exported_tags import ExportedTag, resolve_exported_tags
 from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
 from fieldtwin.twin.site.read_back_warnings import never_read_back, read_only_once
@@ -54,6 +55,7 @@ class System:
     commands: CommandsForm = field(default_factory=CommandsForm)
     warnings: tuple[str, ...] = ()
     invariants: InvariantsForm = field(default_factory=InvariantsForm)
+    exported_tags: tuple[ExportedTag, ...] = ()
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
         """Return the devices of a bus, in the file's order."""
@@ -113,6 +115,7 @@ def _resolve(
         + read_only_once(file, devices)
         + waits_for_its_command(file, form.plc, devices),
         serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc), errors),
+        exported_tags=resolve_exported_tags(file, form.metrics, devices, errors),
     )
     _check_programs(system, errors)
     _check_write_groups(system, errors)

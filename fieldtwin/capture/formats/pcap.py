@@ -1,4 +1,4 @@
-"""Write captures as pcap files, so that other tools (tshark, Wireshark) can read them.
+"""Write captures as pcap files, so that other tools (tshark, Wireshark) can read them; `pcapng` writes the same packets.
 
 A capture contains chunks and frames, not packets. This module creates the missing layers around them, so that a dissector
 finds what it expects: Ethernet, IP and TCP with correct check sums and sequence numbers around Modbus/TCP, nothing at all
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame, parse_frame
@@ -37,8 +37,10 @@ SNAPLEN = 65_535
 MODBUS_PORT = 502
 CLIENT_PORT = 50_200
 MAX_SEGMENT = 1460
-_CLIENT, _SERVER = bytes((192, 0, 2, 1)), bytes((192, 0, 2, 2))  # TEST-NET-1 (RFC 5737): reserved for examples
-_MACS = {_CLIENT: bytes((2, 0, 0, 0, 0, 1)), _SERVER: bytes((2, 0, 0, 0, 0, 2))}
+MAX_SERVERS = 253
+"""Maximum number of servers in one file: the addresses of TEST-NET-1 (192.0.2.0/24, RFC 5737) after the client's."""
+_NETWORK = bytes((192, 0, 2))  # TEST-NET-1: reserved for examples
+_CLIENT = 1
 _SYN, _ACK, _PSH = 0x02, 0x10, 0x08
 
 
@@ -99,10 +101,15 @@ def _endpoint(text: str) -> Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet of a pcap file: its time in nanoseconds, and its bytes from the link layer on."""
+    """One packet of a file: its time in nanoseconds, and its bytes from the link layer on.
+
+    `direction` is that of the gateway, None if it is not known. `comment` explains the packet in words; only pcapng stores both.
+    """
 
     t_ns: int
     data: bytes
+    direction: Direction | None = None
+    comment: str = ""
 
 
 def link_type(endpoint: Endpoint) -> int:
@@ -112,18 +119,29 @@ def link_type(endpoint: Endpoint) -> int:
     return LINKTYPE_ETHERNET if endpoint.scheme == "tcp" else LINKTYPE_USER0
 
 
-def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet]:
+def packets(captured: Iterable[Captured], endpoint: Endpoint, *, server: int = 0) -> Iterator[Packet]:
     """Yield the packets of one endpoint's conversation, in order.
 
     ``tcp``: one connection to port 502, handshake included. If the capture spans several connections, their packets are written
-    as one connection. ``rtu``, ``rtu+tcp``: a packet for each request, and one for all bytes until the next request. ``can``: a
-    packet for each frame.
+    as one connection. `server` (0 to `MAX_SERVERS` - 1) distinguishes the servers of one file by their addresses. ``rtu``,
+    ``rtu+tcp``: a packet for each request, and one for all bytes until the next request. ``can``: a packet for each frame.
     """
-    seen = (c for c in captured if c.endpoint == endpoint)
+    return commented_packets(((c, "") for c in captured), endpoint, server=server)
+
+
+def commented_packets(
+    captured: Iterable[tuple[Captured, str]], endpoint: Endpoint, *, server: int = 0
+) -> Iterator[Packet]:
+    """Yield the packets of one endpoint's conversation, as `packets`, from chunks and frames with their comments."""
+    seen = ((c, comment) for c, comment in captured if c.endpoint == endpoint)
     if endpoint.is_can:
-        return (Packet(c.t_ns, socketcan(c.item)) for c in seen if isinstance(c.item, CanFrame))
-    chunks = ((c.t_ns, c.direction, c.item) for c in seen if isinstance(c.item, bytes))
-    return _tcp_packets(chunks) if endpoint.scheme == "tcp" else _turns(chunks)
+        return (
+            Packet(c.t_ns, socketcan(c.item), c.direction, comment)
+            for c, comment in seen
+            if isinstance(c.item, CanFrame)
+        )
+    chunks = (Chunk(c.t_ns, c.direction, c.item, comment) for c, comment in seen if isinstance(c.item, bytes))
+    return _tcp_packets(chunks, server) if endpoint.scheme == "tcp" else _turns(chunks)
 
 
 def write_pcap(path: Path, captured: Iterable[Captured], endpoint: Endpoint, utc_offset_ns: int = 0) -> int:
@@ -157,65 +175,81 @@ def socketcan(frame: CanFrame) -> bytes:
 
 # -- serial line --------------------------------------------------------------------------------------------------------
 
-Chunk = tuple[int, Direction, bytes]
+
+class Chunk(NamedTuple):
+    """Bytes of a stream as the medium delivered them, with their comment."""
+
+    t_ns: int
+    direction: Direction
+    data: bytes
+    comment: str
 
 
 def _turns(chunks: Iterable[Chunk]) -> Iterator[Packet]:
     """Yield one packet for each sent chunk of a serial line, and one for all bytes received before the next sent chunk."""
-    reply, reply_ns = b"", 0
-    for t_ns, direction, data in chunks:
-        if direction is Direction.RECEIVED:
-            reply_ns = reply_ns if reply else t_ns
-            reply += data
+    reply = list[Chunk]()
+
+    def received() -> Packet:
+        comment = "; ".join(c.comment for c in reply if c.comment)
+        return Packet(reply[0].t_ns, b"".join(c.data for c in reply), Direction.RECEIVED, comment)
+
+    for chunk in chunks:
+        if chunk.direction is Direction.RECEIVED:
+            reply.append(chunk)
             continue
         if reply:
-            yield Packet(reply_ns, reply)
-            reply = b""
-        yield Packet(t_ns, data)
+            yield received()
+            reply.clear()
+        yield Packet(chunk.t_ns, chunk.data, Direction.SENT, chunk.comment)
     if reply:
-        yield Packet(reply_ns, reply)
+        yield received()
 
 
 # -- TCP ----------------------------------------------------------------------------------------------------------------
 
 
-def _tcp_packets(chunks: Iterable[Chunk]) -> Iterator[Packet]:
+def _tcp_packets(chunks: Iterable[Chunk], server: int) -> Iterator[Packet]:
     """Yield the chunks as segments of one connection that the gateway opened just before the first of them."""
-    sequence = {_CLIENT: 1000, _SERVER: 2000}
+    hosts = {Direction.SENT: _CLIENT, Direction.RECEIVED: _CLIENT + 1 + server}
+    ports = {Direction.SENT: CLIENT_PORT + server, Direction.RECEIVED: MODBUS_PORT}
+    sequence = {Direction.SENT: 1000, Direction.RECEIVED: 2000}
 
-    def segment(t_ns: int, source: bytes, flags: int, data: bytes = b"") -> Packet:
-        target = _SERVER if source == _CLIENT else _CLIENT
-        acknowledged = sequence[target] if flags & _ACK else 0
-        packet = Packet(
-            t_ns, _ethernet(source, target, _tcp(source, target, sequence[source], acknowledged, flags, data))
-        )
-        sequence[source] += len(data) + bool(flags & _SYN)
-        return packet
+    def segment(t_ns: int, direction: Direction, flags: int, data: bytes = b"", comment: str = "") -> Packet:
+        other = Direction.RECEIVED if direction is Direction.SENT else Direction.SENT
+        acknowledged = sequence[other] if flags & _ACK else 0
+        words = (ports[direction], ports[other], sequence[direction], acknowledged)
+        packet = _ethernet(hosts[direction], hosts[other], words, flags, data)
+        sequence[direction] = (sequence[direction] + len(data) + bool(flags & _SYN)) & 0xFFFFFFFF
+        return Packet(t_ns, packet, direction, comment)
 
     opened = False
-    for t_ns, direction, data in chunks:
+    for chunk in chunks:
         if not opened:
-            yield segment(t_ns - 3, _CLIENT, _SYN)
-            yield segment(t_ns - 2, _SERVER, _SYN | _ACK)
-            yield segment(t_ns - 1, _CLIENT, _ACK)
+            yield segment(chunk.t_ns - 3, Direction.SENT, _SYN)
+            yield segment(chunk.t_ns - 2, Direction.RECEIVED, _SYN | _ACK)
+            yield segment(chunk.t_ns - 1, Direction.SENT, _ACK)
             opened = True
-        source = _CLIENT if direction is Direction.SENT else _SERVER
-        for at in range(0, len(data), MAX_SEGMENT):
-            yield segment(t_ns, source, _PSH | _ACK, data[at : at + MAX_SEGMENT])
+        for at in range(0, len(chunk.data), MAX_SEGMENT):
+            piece = chunk.data[at : at + MAX_SEGMENT]
+            yield segment(chunk.t_ns, chunk.direction, _PSH | _ACK, piece, "" if at else chunk.comment)
 
 
-def _tcp(source: bytes, target: bytes, sequence: int, acknowledged: int, flags: int, data: bytes) -> bytes:
-    ports = (CLIENT_PORT, MODBUS_PORT) if source == _CLIENT else (MODBUS_PORT, CLIENT_PORT)
-    words = (*ports, sequence & 0xFFFFFFFF, acknowledged & 0xFFFFFFFF, 5 << 4, flags, 0xFFFF)
-    bare = struct.pack(">HHIIBBHHH", *words, 0, 0) + data
-    pseudo = source + target + struct.pack(">BBH", 0, 6, len(bare))
-    return struct.pack(">HHIIBBHHH", *words, internet_checksum(pseudo + bare), 0) + data
-
-
-def _ethernet(source: bytes, target: bytes, tcp: bytes) -> bytes:
-    head = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(tcp), 0, 0x4000, 64, 6, 0, source, target)
+def _ethernet(source: int, target: int, words: tuple[int, int, int, int], flags: int, data: bytes) -> bytes:
+    """Return an Ethernet frame with a TCP segment. `source` and `target` are the last bytes of the addresses, `words` the ports,
+    the sequence number and the acknowledged number.
+    """
+    here, there = _NETWORK + bytes((source,)), _NETWORK + bytes((target,))
+    tcp = _tcp(here, there, words, flags, data)
+    head = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(tcp), 0, 0x4000, 64, 6, 0, here, there)
     head = head[:10] + internet_checksum(head).to_bytes(2) + head[12:]
-    return _MACS[target] + _MACS[source] + b"\x08\x00" + head + tcp
+    return bytes((2, 0, 0, 0, 0, target, 2, 0, 0, 0, 0, source)) + b"\x08\x00" + head + tcp
+
+
+def _tcp(here: bytes, there: bytes, words: tuple[int, int, int, int], flags: int, data: bytes) -> bytes:
+    fields = (*words, 5 << 4, flags, 0xFFFF)
+    bare = struct.pack(">HHIIBBHHH", *fields, 0, 0) + data
+    pseudo = here + there + struct.pack(">BBH", 0, 6, len(bare))
+    return struct.pack(">HHIIBBHHH", *fields, internet_checksum(pseudo + bare), 0) + data
 
 
 def internet_checksum(data: bytes) -> int:

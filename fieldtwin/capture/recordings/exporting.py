@@ -1,4 +1,4 @@
-"""Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap files for Wireshark.
+"""Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap and pcapng files.
 
 The format follows from the kind of the recording and the file's name. Records are processed one by one, so that a recording
 of days needs little memory. Raises `FileInvalid` if a file cannot be written, and `UsageError` for a kind that cannot be
@@ -11,31 +11,34 @@ import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
-from fieldtwin.capture.formats.pcap import read_capture, write_pcap
+from fieldtwin.capture.formats.pcap import read_capture
+from fieldtwin.capture.recordings.exporting_packets import (
+    PCAPNG,
+    capture_packets,
+    exchange_packets,
+    log_packets,
+    utc_offset_ns,
+)
 from fieldtwin.capture.recordings.rotating_file import RotatingFile, exchanges_of, header_of, parts_of
-from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import line_of, read_log
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.profile import DeviceProfile
-from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, SignalRow
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 from fieldtwin.installation import install_hint
 
 BATCH = 10_000
 """Number of rows of a Parquet file that are held in memory."""
-TARGETS = (".csv", ".parquet", ".log", ".pcap")
+_PACKETS = (".pcap", PCAPNG)
+TARGETS = (".csv", ".parquet", ".log", *_PACKETS)
 Cell = Scalar | None
 Rows = Iterator[Sequence[Cell]]
 
@@ -52,7 +55,7 @@ def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, frami
     """Write the recording, log or capture at `path` as `out`, and return the number of records. `out` must not exist.
 
     With `profile`, a table of exchanges has a column for each tag. `framing` (mbap or rtu) is how exchanges are framed in a
-    pcap file. `url` selects one endpoint of a capture that has several.
+    pcap or pcapng file. `url` selects one endpoint of a capture that has several.
     """
     kind = out.suffix.lower()
     if kind not in TARGETS:
@@ -75,8 +78,8 @@ def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, frami
 def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, url: str) -> Callable[[Path], int]:
     first = parts_of(path)[0]
     if path.suffix == ".log":
-        if kind == ".pcap":
-            return lambda out: write_pcap(out, _captured_log(path), _BUS)
+        if kind in _PACKETS:
+            return log_packets(path, kind)
         if kind == ".log":
             return lambda out: _write_log(((t, c, f) for p in parts_of(path) for t, c, f in read_log(p)), out)
         return lambda out: _write_table(out, kind, _FRAME_COLUMNS, _frame_rows(path))
@@ -88,10 +91,10 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
             raise UsageError("signals are exported as a table", expected=".csv or .parquet", got=kind)
         names = [TableColumn(f"{n} ({s.unit})" if s.unit else n, float) for n, s in header.signals.items()]
         return lambda out: _write_table(out, kind, [TableColumn("t_s", float), *names], _signal_rows(path))
-    if kind == ".pcap":
-        return lambda out: _write_exchanges(path, header, out, framing)
+    if kind in _PACKETS:
+        return exchange_packets(path, header, kind, framing)
     if kind == ".log":
-        raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet or .pcap")
+        raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet, .pcap or .pcapng")
     if profile is not None:
         tags = [t for t in profile.tags.values() if t.readable or t.writable]
         columns = [*_EXCHANGE_COLUMNS[:4], *(TableColumn(t.name, str if t.is_text else float) for t in tags)]
@@ -224,15 +227,7 @@ def _cell(value: Cell, kind: type) -> Cell:
     return kind(value)  # type: ignore[no-any-return]
 
 
-# -- pcap and candump -------------------------------------------------------------------------------------------------------
-
-_BUS = Endpoint.parse("can:socketcan/can0")
-
-
-def _captured_log(path: Path) -> Iterator[Captured]:
-    for part in parts_of(path):
-        for t_ns, _, frame in read_log(part):
-            yield Captured(t_ns, _BUS, Direction.RECEIVED, frame)
+# -- candump and captures -----------------------------------------------------------------------------------------------
 
 
 def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path) -> int:
@@ -240,38 +235,6 @@ def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path) -> int:
         for t_ns, channel, frame in frames:
             file.line(t_ns / 1e9, line_of(t_ns, frame, channel))
         return file.lines
-
-
-def _write_exchanges(path: Path, header: RecordingHeader, out: Path, framing: str) -> int:
-    """Write the exchanges as one conversation: Modbus TCP to port 502, or bare RTU frames.
-
-    A broadcast and an unanswered request have no reply.
-    """
-    tcp = framing == "mbap"
-    endpoint = Endpoint.parse("tcp://192.0.2.2:502" if tcp else "rtu:line")
-
-    def frames() -> Iterator[Captured]:
-        for number, e in enumerate(exchanges_of(path)):
-            sent_ns = round(e.t_s * 1e9)
-            said = [(sent_ns, Direction.SENT, e.request)]
-            if e.reply:
-                said.append((sent_ns + round(e.latency_s * 1e9), Direction.RECEIVED, e.reply))
-            for t_ns, direction, pdu in said:
-                if tcp:
-                    adu = (number & 0xFFFF).to_bytes(2) + bytes(2) + (len(pdu) + 1).to_bytes(2) + bytes((e.unit,)) + pdu
-                else:
-                    adu = with_crc(bytes((e.unit,)) + pdu)
-                yield Captured(t_ns, endpoint, direction, adu)
-
-    return write_pcap(out, frames(), endpoint, _start_ns(header))
-
-
-def _start_ns(header: RecordingHeader) -> int:
-    try:
-        return round(datetime.fromisoformat(header.start_utc).timestamp() * 1e9)
-    except (ValueError, OverflowError):
-        # the time is unknown: one second after the start of 1970, so that an earlier handshake can be dated too
-        return NS_PER_S
 
 
 def _is_capture(path: Path) -> bool:
@@ -286,19 +249,25 @@ def _capture_work(path: Path, kind: str, url: str) -> Callable[[Path], int]:
     items = (c for part in parts_of(path) for c in read_capture(part))
     endpoints = list(dict.fromkeys(c.endpoint for c in items))
     chosen = [Endpoint.parse(url)] if url else endpoints
+    if kind == PCAPNG and chosen:
+        return capture_packets(path, kind, chosen)
     if len(chosen) != 1:
         raise UsageError(
-            f"{path.name} holds {len(endpoints)} endpoints", expected=", ".join(map(str, endpoints)), hint="--endpoint"
+            f"{path.name} holds {len(endpoints)} endpoints",
+            expected=", ".join(map(str, endpoints)),
+            hint="--endpoint, or a .pcapng file, which holds all of them",
         )
     endpoint = chosen[0]
-    if kind not in (".pcap", ".log") or (kind == ".log" and not endpoint.is_can):
-        raise UsageError(
-            f"a capture of {endpoint}", expected=".pcap; of a CAN bus .log too", got=kind, hint="import it first"
-        )
-
-    def seen() -> Iterator[Captured]:
-        return (c for part in parts_of(path) for c in read_capture(part) if c.endpoint == endpoint)
-
     if kind == ".pcap":
-        return lambda out: write_pcap(out, seen(), endpoint)
-    return lambda out: _write_log(((c.t_ns, "can0", c.item) for c in seen() if isinstance(c.item, CanFrame)), out)
+        return capture_packets(path, kind, chosen)
+    if kind != ".log" or not endpoint.is_can:
+        raise UsageError(
+            f"a capture of {endpoint}",
+            expected=".pcap or .pcapng; of a CAN bus .log too",
+            got=kind,
+            hint="import it first",
+        )
+    offset_ns = utc_offset_ns(path)
+    seen = (c for part in parts_of(path) for c in read_capture(part) if c.endpoint == endpoint)
+    frames = ((c.t_ns + offset_ns, "can0", c.item) for c in seen if isinstance(c.item, CanFrame))
+    return lambda out: _write_log(frames, out)

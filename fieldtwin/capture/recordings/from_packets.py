@@ -6,6 +6,7 @@ next to the recording (``.bad.jsonl``, which can be read as a capture).
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -30,6 +31,8 @@ LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250
 MAX_SERVERS = 256
 EVERY = 4096
 """Number of packets between two reports of progress."""
+_UNFIT = re.compile(r"[^A-Za-z0-9_.+-]+")
+"""Characters of an interface's name that do not appear in the name of a file or in the column of a CAN log."""
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 
 Progress = Callable[[int, int], None]
@@ -57,7 +60,8 @@ class PacketSummary:
     can_left_out: int = 0
     other_conversations: int = 0
     servers_left_out: int = 0
-    truncated: bool = False
+    cut_off_at: int | None = None
+    """The offset of the truncated last packet, None if the capture is complete."""
     bad_file: Path | None = None
     seconds: float = 0.0
 
@@ -87,7 +91,7 @@ class PacketImport:
         self._zero_ns = -1
         self._last_ns = 0
         self._servers: dict[str, _Server] = {}
-        self._line: Pairer | None = None
+        self._lines: dict[str, Pairer] = {}
         self._can: RotatingFile | None = None
         self._bad = BadFile(out, "rtu:line")
         self._talks = Conversations(self._said, self._ended)
@@ -101,12 +105,12 @@ class PacketImport:
         try:
             with PacketFile(self._source) as source:
                 for t_ns, link, data in source:
-                    self._packet(t_ns, link, data)
+                    self._packet(t_ns, link, data, source.interface)
                     if progress is not None and source.packets % EVERY == 0:
                         progress(source.read_bytes, size)
-                self.summary.truncated = source.truncated
+                self.summary.cut_off_at = source.cut_off_at
             self._talks.finish()
-            self._finish_line()
+            self._finish_lines()
         except FieldtwinError:
             for file in self._files:
                 for path in file.parts:
@@ -128,14 +132,14 @@ class PacketImport:
     def _log_path(self) -> Path:
         return self._out.with_suffix(".log")
 
-    def _packet(self, t_ns: int, link: int, data: bytes) -> None:
+    def _packet(self, t_ns: int, link: int, data: bytes, interface: str) -> None:
         if self._zero_ns < 0:
             self._zero_ns = t_ns
         self._last_ns = max(t_ns, self._last_ns)
         if link == LINK_CAN:
-            self._can_frame(t_ns, data)
+            self._can_frame(t_ns, data, interface)
         elif link in (LINK_USER0, LINK_RTAC):
-            self._serial(t_ns, link, data)
+            self._serial(t_ns, link, data, interface)
         else:
             self._talks.packet(t_ns, link, data)
 
@@ -168,17 +172,20 @@ class PacketImport:
         if exchanges and talk.server is not None:
             self._of(talk.endpoint, exchanges)
 
-    def _of(self, endpoint: str, exchanges: list[RecordedExchange]) -> None:
-        server = self._servers.get(endpoint)
+    def _of(self, endpoint: str, exchanges: list[RecordedExchange], interface: str = "") -> None:
+        """Add exchanges of a server, or of the serial line at `interface`, whose endpoint the capture does not state."""
+        key = endpoint or interface
+        server = self._servers.get(key)
         if server is None:
             if len(self._servers) >= MAX_SERVERS:
                 self.summary.servers_left_out += 1
                 return
-            plain = endpoint.partition("://")[2].replace(":", "-").strip("[]").replace("]", "") or "line"
+            plain = endpoint.partition("://")[2].replace(":", "-").strip("[]").replace("]", "")
+            plain = plain or _UNFIT.sub("-", interface) or "line"
             path = self._out.with_name(f"{self._out.stem}.{plain}{self._out.suffix}")
             while any(s.file.path == path for s in self._servers.values()):
                 path = path.with_name(f"{path.stem}-2{path.suffix}")
-            server = self._servers[endpoint] = _Server(path, endpoint, self._header(endpoint))
+            server = self._servers[key] = _Server(path, endpoint, self._header(endpoint))
         server.add(exchanges)
 
     def _header(self, endpoint: str) -> RecordingHeader:
@@ -193,8 +200,11 @@ class PacketImport:
 
     # -- Modbus on a line ---------------------------------------------------------------------------------------------
 
-    def _serial(self, t_ns: int, link: int, data: bytes) -> None:
-        """Handle serial bytes as line analysers write them: bare, or after the RTAC link header, which states the direction."""
+    def _serial(self, t_ns: int, link: int, data: bytes, interface: str) -> None:
+        """Handle serial bytes as line analysers write them: bare, or after the RTAC link header, which states the direction.
+
+        Each interface is a separate line.
+        """
         self.summary.packets.packets += 1
         sent = True
         if link == LINK_RTAC:
@@ -205,22 +215,24 @@ class PacketImport:
         if not data:
             return
         self.summary.packets.carried += 1
-        if self._line is None:
+        line = self._lines.get(interface)
+        if line is None:
             kind = SerialPairer if link == LINK_RTAC else HalfDuplexPairer
-            self._line = kind("ascii" if data[:1] == b":" else "rtu", self._zero_ns, self._bad.keep)
-        found = self._line.feed(sent, data, t_ns)
+            line = kind("ascii" if data[:1] == b":" else "rtu", self._zero_ns, self._bad.keep)
+            self._lines[interface] = line
+        found = line.feed(sent, data, t_ns)
         if found:
-            self._of("", found)
+            self._of("", found, interface)
 
-    def _finish_line(self) -> None:
-        if self._line is not None:
-            if found := self._line.finish():
-                self._of("", found)
-            self.summary.pairs.add(self._line.counters)
+    def _finish_lines(self) -> None:
+        for interface, line in self._lines.items():
+            if found := line.finish():
+                self._of("", found, interface)
+            self.summary.pairs.add(line.counters)
 
     # -- CAN ----------------------------------------------------------------------------------------------------------
 
-    def _can_frame(self, t_ns: int, data: bytes) -> None:
+    def _can_frame(self, t_ns: int, data: bytes, interface: str) -> None:
         self.summary.packets.packets += 1
         frame = socketcan_frame(data)
         if frame is None:
@@ -228,7 +240,7 @@ class PacketImport:
             return
         if self._can is None:
             self._can = RotatingFile(self._log_path)
-        self._can.line(t_ns / NS_PER_S, line_of(t_ns, frame))
+        self._can.line(t_ns / NS_PER_S, line_of(t_ns, frame, _UNFIT.sub("_", interface)[:64] or "can0"))
         self.summary.can_frames += 1
 
     # -- the end ------------------------------------------------------------------------------------------------------

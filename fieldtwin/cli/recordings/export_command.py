@@ -29,7 +29,7 @@ from fieldtwin.twin.site.data_files import find
     type=click.Choice(["mbap", "rtu"]),
     default="mbap",
     show_default=True,
-    help="pcap of exchanges: as Modbus TCP, or as RTU frames (link type USER0).",
+    help="Exchanges as packets: as Modbus TCP, or as RTU frames (link type USER0).",
 )
 @click.option("--endpoint", default="", metavar="URL", help="Endpoint to export from a capture with several endpoints.")
 @profiles_option
@@ -43,15 +43,15 @@ def command(
     profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
-    """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump) or .pcap.
+    """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump), .pcap or .pcapng.
 
     \b
     meter.jsonl   to .csv or .parquet (with --profile: in the tags' units),
-                  to .pcap for Wireshark
-    bus.log       to .csv, .parquet, .pcap
+                  to .pcap or .pcapng for Wireshark
+    bus.log       to .csv, .parquet, .pcap, .pcapng
     cast.jsonl    recorded signals: to .csv or .parquet
     a capture     of run --capture, record --tap or a command's --log:
-                  to .pcap; of a CAN bus to .log
+                  to .pcapng; of one endpoint to .pcap; of a CAN bus to .log
     """
     from fieldtwin.capture.recordings.exporting import export
 
@@ -62,6 +62,8 @@ def command(
         sys.stdout.write("\n")
     else:
         stdout.print(
-            f"{out}: {count} {'packets' if out.suffix == '.pcap' else 'records'}", soft_wrap=True, markup=False
+            f"{out}: {count} {'packets' if out.suffix.lower() in ('.pcap', '.pcapng') else 'records'}",
+            soft_wrap=True,
+            markup=False,
         )
     return 0

@@ -167,8 +167,8 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
     for count, what in notes:
         if count:
             stderr.print(f"  {count} {what}", soft_wrap=True)
-    if found.truncated:
-        stderr.print("  the file is cut off in its last packet", soft_wrap=True)
+    if found.cut_off_at is not None:
+        stderr.print(f"  the file is cut off in its last packet, at offset {found.cut_off_at}", soft_wrap=True)
     if found.bad_file is not None:
         stderr.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
     if not found.made:

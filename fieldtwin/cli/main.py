@@ -84,6 +84,10 @@ COMMANDS = {
         "fieldtwin.cli.device.infer_command",
         "Infer a draft profile, with confidence, from dumps taken over time.",
     ),
+    "profile": (
+        "fieldtwin.cli.device.profile_command",
+        "Convert device descriptions (EDS, DCF, ...) to profiles, and profiles to such descriptions.",
+    ),
     "compare": ("fieldtwin.cli.recordings.compare_command", "Compare a device, or a recording, with a recording."),
     "import": ("fieldtwin.cli.recordings.import_command", "Convert files of other programs to recordings."),
     "export": ("fieldtwin.cli.recordings.export_command", "Convert recordings to CSV, Parquet, candump logs or pcap."),
@@ -124,7 +128,7 @@ SECTIONS = {
         *("topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (
-        *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
+        *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer", "profile"),
         *("record", "import", "export", "compare", "check", "report"),
     ),
     "Test": ("test", "faults", "trace"),

@@ -13,3 +13,11 @@ def write_text(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as e:
         raise FileInvalid(f"cannot write the file: {e.strerror or e}", path=str(path)) from e
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` to `path`. Raises `FileInvalid` if it cannot be written."""
+    try:
+        path.write_bytes(data)
+    except OSError as e:
+        raise FileInvalid(f"cannot write the file: {e.strerror or e}", path=str(path)) from e

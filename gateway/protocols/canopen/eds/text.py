@@ -32,7 +32,20 @@ _NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "Compact
 """Keys that hold a number, and the default for an empty one (CiA 306, 4.6.3.2); no default if the key is required."""
 
 _DEVICE_TEXT = ("VendorName", "ProductName", "OrderCode")
-_DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO")
+BIT_RATES_KBIT = (10, 20, 50, 125, 250, 500, 800, 1000)
+"""The bit rates for which an EDS has a key, such as ``BaudRate_250`` (CiA 306-1, 4.4), in kbit/s."""
+_DEVICE_ABILITIES = (
+    "SimpleBootUpMaster",
+    "SimpleBootUpSlave",
+    "Granularity",
+    "DynamicChannelsSupported",
+    "GroupMessaging",
+)
+_DEVICE_NUMBERS = (
+    *("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO", "LSS_Supported"),
+    *(*_DEVICE_ABILITIES, *(f"BaudRate_{kbit}" for kbit in BIT_RATES_KBIT)),
+)
+_COMMISSIONING_TEXT = ("NodeName",)
 _COMMISSIONING_NUMBERS = ("NodeID", "Baudrate")
 _AT_MOST = {"NodeID": 127, "Baudrate": 1000}
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
@@ -46,6 +59,7 @@ _CANONICAL = {
         *_NUMBER_KEYS,
         *_DEVICE_TEXT,
         *_DEVICE_NUMBERS,
+        *_COMMISSIONING_TEXT,
         *_COMMISSIONING_NUMBERS,
     )
 }
@@ -127,7 +141,7 @@ def invalid(message: str, section: Section, key: str, path: str, *, expected: st
 
 
 def _commissioning() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    return (), _COMMISSIONING_NUMBERS
+    return _COMMISSIONING_TEXT, _COMMISSIONING_NUMBERS
 
 
 def _order(name: str) -> tuple[int, int, int]:

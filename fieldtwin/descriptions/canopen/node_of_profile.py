@@ -1,0 +1,127 @@
+"""Make the description of a CANopen node from a profile: its object dictionary with the tags' limits, units and scales."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from fieldtwin.descriptions.canopen.eds_reader import read_eds
+from fieldtwin.descriptions.canopen.node import VAR, NodeDescription, NodeObject, NodeValue
+from fieldtwin.descriptions.canopen.tag_names import TAG_TYPES, TYPE_CODES, tag_names, type_name
+from fieldtwin.descriptions.conversion import Loss, losses_of_keys, require_protocol
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.profile import INTEGER_RANGES, DeviceProfile, Tag
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import MAX_EDS_BYTES
+
+NO_PLACE = "the format describes objects, not what a gateway does with them"
+_KEYS = {
+    "source": "the format has no place for it",
+    "timing": NO_PLACE,
+    "identify": NO_PLACE,
+    "commands": NO_PLACE,
+    "behaviours": NO_PLACE,
+    "trigger": NO_PLACE,
+    "sampled": NO_PLACE,
+    "effects": NO_PLACE,
+}
+_WRITABLE = ("rw", "rwr", "rww")
+
+
+def node_of_profile(profile: DeviceProfile, title: str) -> tuple[NodeDescription, list[Loss]]:
+    """Return the description and what it does not have of the profile. `title` names the format, for messages.
+
+    Raises `UsageError` if the profile is not of a CANopen device, `FileInvalid` if its EDS cannot be read.
+    """
+    require_protocol(profile, "canopen", title)
+    path = profile.eds_path
+    if path is None:
+        raise FileInvalid("a CANopen profile needs an EDS", path=profile.path, expected="`eds: FILE.eds`")
+    try:
+        data = read_input(path, MAX_EDS_BYTES)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    node, repairs = read_eds(data, path)
+    losses = [Loss(path.name, f"repaired: {repair}", "the result has the repaired value") for repair in repairs]
+    losses += losses_of_keys(profile, _KEYS)
+    by_object = {tag.object: tag for tag in profile.tags.values() if tag.object is not None}
+    known = {(v.index, v.subindex) for v in node.values()}
+    losses += _names_lost(profile, node)
+    objects = [
+        replace(each, values=tuple(_with_tag(v, by_object.get((v.index, v.subindex)), losses) for v in each.values))
+        for each in node.objects
+    ]
+    objects += _new_objects([tag for key, tag in by_object.items() if key not in known], objects, losses)
+    return replace(node, objects=tuple(sorted(objects, key=lambda each: each.index))), losses
+
+
+def _with_tag(value: NodeValue, tag: Tag | None, losses: list[Loss]) -> NodeValue:
+    """Return the value with the properties of its tag that the format has; note those that it does not have."""
+    if tag is None:
+        return value
+    losses += _tag_losses(tag)
+    kind = TAG_TYPES.get(value.type_code)  # type: ignore[call-overload]
+    if kind != tag.type:
+        losses.append(Loss(f"tag {tag.name}", f"its type {tag.type}", f"the EDS says {type_name(value.type_code)}"))
+    may = "rw" if value.access in _WRITABLE else "wo" if value.access == "wo" else "ro"
+    if may != tag.access:
+        losses.append(Loss(f"tag {tag.name}", f"its access {tag.access}", f"the EDS says {value.access}"))
+    low, high = _limits(tag, losses) if tag.range is not None and kind == tag.type else (value.low, value.high)
+    factor = f"{tag.scale!r}" if tag.scale != 1.0 else value.factor
+    return replace(value, low=low, high=high, unit=tag.unit or value.unit, factor=factor)
+
+
+def _tag_losses(tag: Tag) -> Iterator[Loss]:
+    stated = {
+        "its offset": tag.offset != 0.0,
+        "the names of its values": bool(tag.values),
+        "`scale_by`": tag.scale_by is not None,
+        "`sentinels`": bool(tag.sentinels),
+        "`bits`": tag.bits is not None,
+        "`counter`": tag.counter,
+        "`nonvolatile`": tag.nonvolatile,
+        "`secret`": tag.secret,
+        "`danger`": bool(tag.danger),
+    }
+    for what, present in stated.items():
+        if present:
+            yield Loss(f"tag {tag.name}", what, "the format has no place for it")
+
+
+def _names_lost(profile: DeviceProfile, node: NodeDescription) -> Iterator[Loss]:
+    """Yield the tags whose names or poll groups an import of the result would not find again."""
+    listed = [(v.index, v.subindex, each.name, v.name) for each in node.objects for v in each.values]
+    names = {(i, s): name for (i, s, _, _), name in zip(listed, tag_names(listed), strict=True)}
+    for tag in profile.tags.values():
+        if tag.object is not None and names.get(tag.object) != tag.name:
+            yield Loss(f"tag {tag.name}", "its name", "the object keeps its name in the object dictionary")
+    if len(profile.groups) > 1 or profile.groups != ["values"]:
+        yield Loss("all tags", "the poll groups", NO_PLACE)
+
+
+def _limits(tag: Tag, losses: list[Loss]) -> tuple[str, str]:
+    """Return LowLimit and HighLimit of a tag with a range, as raw values."""
+    assert tag.range is not None
+    raw = sorted((limit - tag.offset) / tag.scale for limit in tag.range)
+    if tag.type not in INTEGER_RANGES:
+        return repr(raw[0]), repr(raw[1])
+    whole = [round(value) for value in raw]
+    if any(abs(a - b) > 1e-6 for a, b in zip(raw, whole, strict=True)):
+        losses.append(
+            Loss(f"tag {tag.name}", "a part of its range", "the limits are raw values, which are whole numbers")
+        )
+    low, high = INTEGER_RANGES[tag.type]
+    return str(max(low, whole[0])), str(min(high, whole[1]))
+
+
+def _new_objects(tags: Iterable[Tag], known: Iterable[NodeObject], losses: list[Loss]) -> Iterator[NodeObject]:
+    """Yield objects for tags that are not in the EDS. A missing sub-object of an object that the EDS has is lost."""
+    indexes = {each.index for each in known}
+    for tag in tags:
+        assert tag.object is not None
+        index, subindex = tag.object
+        if subindex or index in indexes or tag.type not in TYPE_CODES:
+            losses.append(Loss(f"tag {tag.name}", "the tag", f"the EDS has no object {index:04X}h:{subindex:02X}"))
+            continue
+        value = NodeValue(index, 0, tag.name, TYPE_CODES[tag.type], tag.access)
+        yield NodeObject(index, tag.name, VAR, (_with_tag(value, tag, losses),))

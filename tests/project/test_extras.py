@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.capture.formats.mcap_file import McapFile
 from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
 from fieldtwin.commissioning.access.plotting import check_plot
 from fieldtwin.gateway.core.errors import UsageError
@@ -44,11 +45,16 @@ def use_parquet(folder: Path) -> None:
     _write_parquet(folder / "x.parquet", [TableColumn("t", float)], iter([(1.0,)]))
 
 
+def use_mcap(folder: Path) -> None:
+    McapFile(folder / "x.mcap", {})
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "plot": ("matplotlib", use_plot, ""),
     "parquet": ("pyarrow", use_parquet, ""),
+    "mcap": ("mcap", use_mcap, ""),
 }
 
 

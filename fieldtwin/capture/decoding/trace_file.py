@@ -9,10 +9,12 @@ from typing import Any
 import msgspec
 
 from fieldtwin.capture.decoding.decoder import frame_events
-from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture
+from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture, utc_offset_ns
+from fieldtwin.emulators.virtual.clock import EPOCH_UTC_NS
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.results.trace import TraceEvent, TraceKind, decode_event, refusal_data
+from fieldtwin.results.trace_about import read_about
 from fieldtwin.twin.site.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin simulate --trace` writes it"
@@ -36,6 +38,24 @@ def read_events(path: Path, system: System) -> Iterator[TraceEvent]:
         yield from sorted([*frame_events(captured, system, start_ns), *refused], key=lambda event: event.t_ns)
         return
     yield from _trace(path)
+
+
+def start_utc_ns(path: Path) -> int:
+    """Return the time of the start of `read_events` in nanoseconds since 1970, 0 if the file does not state it.
+
+    A trace of a run in virtual time starts on 1 January 2026, as the clock of that run did. Raises `FileInvalid`.
+    """
+    try:
+        with open_input(path) as file:
+            first = file.read(1)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    if first == b"{":
+        offset_ns = utc_offset_ns(path)
+        begin = next(read_capture(path), None)
+        return begin.t_ns + offset_ns if begin is not None and offset_ns else 0
+    about = read_about(path)
+    return EPOCH_UTC_NS if about is not None and about.target == "virtual" else 0
 
 
 def _trace(path: Path) -> Iterator[TraceEvent]:

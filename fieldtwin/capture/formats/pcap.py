@@ -14,6 +14,7 @@ import json
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,6 +92,26 @@ def captured_of(line: dict[str, object]) -> Captured:
     if not isinstance(t_ns, int):
         raise ValueError(f"t_ns is {t_ns!r}")
     return Captured(t_ns, _endpoint(str(line["endpoint"])), Direction(line["direction"]), item)
+
+
+def utc_offset_ns(path: Path) -> int:
+    """Return the nanoseconds from the monotonic times of a capture to UTC, 0 if its first line does not state them.
+
+    Such a line has the time of its writing twice: ``started`` (ISO 8601) and ``t_ns`` (monotonic).
+    """
+    try:
+        with open_input(path) as file:
+            head = json.loads(file.readline(MAX_LINE_BYTES))
+        return utc_ns(str(head["started"])) - int(head["t_ns"])
+    except OSError as e:
+        raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(path)) from e
+    except (ValueError, KeyError, TypeError, OverflowError):
+        return 0
+
+
+def utc_ns(text: str) -> int:
+    """Return an ISO 8601 time as nanoseconds since 1970. Raises `ValueError` or `OverflowError`."""
+    return round(datetime.fromisoformat(text).timestamp() * NS_PER_S)
 
 
 @lru_cache(maxsize=KEPT_ENDPOINTS)

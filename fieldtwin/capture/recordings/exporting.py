@@ -1,4 +1,4 @@
-"""Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap and pcapng files.
+"""Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap, pcapng and MCAP files.
 
 The format follows from the kind of the recording and the file's name. Records are processed one by one, so that a recording
 of days needs little memory. Raises `FileInvalid` if a file cannot be written, and `UsageError` for a kind that cannot be
@@ -16,13 +16,19 @@ from typing import Any
 
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
-from fieldtwin.capture.formats.pcap import read_capture
+from fieldtwin.capture.formats.pcap import read_capture, utc_offset_ns
+from fieldtwin.capture.recordings.exporting_mcap import (
+    capture_mcap,
+    exchanges_mcap,
+    log_mcap,
+    problem_of,
+    signals_mcap,
+)
 from fieldtwin.capture.recordings.exporting_packets import (
     PCAPNG,
     capture_packets,
     exchange_packets,
     log_packets,
-    utc_offset_ns,
 )
 from fieldtwin.capture.recordings.rotating_file import RotatingFile, exchanges_of, header_of, parts_of
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -31,14 +37,15 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import line_of, read_log
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.profile import DeviceProfile
-from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingReader, SignalRow
+from fieldtwin.gateway.core.files.recording import RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.installation import install_hint
 
 BATCH = 10_000
 """Number of rows of a Parquet file that are held in memory."""
 _PACKETS = (".pcap", PCAPNG)
-TARGETS = (".csv", ".parquet", ".log", *_PACKETS)
+_MCAP = ".mcap"
+TARGETS = (".csv", ".parquet", ".log", *_PACKETS, _MCAP)
 Cell = Scalar | None
 Rows = Iterator[Sequence[Cell]]
 
@@ -54,8 +61,8 @@ class TableColumn:
 def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, framing: str = "mbap", url: str = "") -> int:
     """Write the recording, log or capture at `path` as `out`, and return the number of records. `out` must not exist.
 
-    With `profile`, a table of exchanges has a column for each tag. `framing` (mbap or rtu) is how exchanges are framed in a
-    pcap or pcapng file. `url` selects one endpoint of a capture that has several.
+    With `profile`, a table of exchanges has a column for each tag, and an MCAP file a topic with tags. `framing` (mbap or rtu) is
+    how exchanges are framed in a pcap or pcapng file. `url` selects one endpoint of a capture that has several.
     """
     kind = out.suffix.lower()
     if kind not in TARGETS:
@@ -80,6 +87,8 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
     if path.suffix == ".log":
         if kind in _PACKETS:
             return log_packets(path, kind)
+        if kind == _MCAP:
+            return log_mcap(path)
         if kind == ".log":
             return lambda out: _write_log(((t, c, f) for p in parts_of(path) for t, c, f in read_log(p)), out)
         return lambda out: _write_table(out, kind, _FRAME_COLUMNS, _frame_rows(path))
@@ -87,14 +96,18 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
         return _capture_work(path, kind, url)
     header = header_of(path)
     if header.kind == "signals":
+        if kind == _MCAP:
+            return signals_mcap(path, header)
         if kind not in (".csv", ".parquet"):
-            raise UsageError("signals are exported as a table", expected=".csv or .parquet", got=kind)
+            raise UsageError("signals are exported as a table", expected=".csv, .parquet or .mcap", got=kind)
         names = [TableColumn(f"{n} ({s.unit})" if s.unit else n, float) for n, s in header.signals.items()]
         return lambda out: _write_table(out, kind, [TableColumn("t_s", float), *names], _signal_rows(path))
     if kind in _PACKETS:
         return exchange_packets(path, header, kind, framing)
+    if kind == _MCAP:
+        return exchanges_mcap(path, header, profile)
     if kind == ".log":
-        raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet, .pcap or .pcapng")
+        raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet, .pcap, .pcapng or .mcap")
     if profile is not None:
         tags = [t for t in profile.tags.values() if t.readable or t.writable]
         columns = [*_EXCHANGE_COLUMNS[:4], *(TableColumn(t.name, str if t.is_text else float) for t in tags)]
@@ -126,7 +139,7 @@ def _exchange_rows(path: Path) -> Rows:
         latency_ms = round(1000 * e.latency_s, 3) if e.reply else None
         at = (span.table, span.address, span.count) if span else ("", None, None)
         reply = e.reply.hex() if e.reply is not None else ""
-        yield e.t_s, e.unit, _outcome(e), latency_ms, asked.service, *at, text, e.request.hex(), reply
+        yield e.t_s, e.unit, problem_of(e) or "ok", latency_ms, asked.service, *at, text, e.request.hex(), reply
 
 
 def _tag_rows(path: Path, profile: DeviceProfile, names: list[str]) -> Rows:
@@ -140,7 +153,7 @@ def _tag_rows(path: Path, profile: DeviceProfile, names: list[str]) -> Rows:
         if e.reply and asked.read_span is not None and (read := parse_reply(asked, e.request, e.reply).read):
             found |= tags.of_registers(asked.read_span, read, t_ns)
         latency_ms = round(1000 * e.latency_s, 3) if e.reply else None
-        yield (e.t_s, e.unit, _outcome(e), latency_ms, *(found.get(name) for name in names))
+        yield (e.t_s, e.unit, problem_of(e) or "ok", latency_ms, *(found.get(name) for name in names))
 
 
 def _signal_rows(path: Path) -> Rows:
@@ -156,12 +169,6 @@ def _frame_rows(path: Path) -> Rows:
         for t_ns, channel, f in read_log(part):
             kind = "remote" if f.remote else "extended" if f.extended else "standard"
             yield t_ns / 1e9, channel, f.can_id, kind, f.dlc, f.data.hex()
-
-
-def _outcome(e: RecordedExchange) -> str:
-    if e.reply is None:
-        return e.error or "lost"
-    return f"exception {e.reply[1]:02X}" if len(e.reply) == 2 and e.reply[0] & 0x80 else "ok"
 
 
 _FORMULA = frozenset("=+-@\t\r\n\0")
@@ -249,13 +256,13 @@ def _capture_work(path: Path, kind: str, url: str) -> Callable[[Path], int]:
     items = (c for part in parts_of(path) for c in read_capture(part))
     endpoints = list(dict.fromkeys(c.endpoint for c in items))
     chosen = [Endpoint.parse(url)] if url else endpoints
-    if kind == PCAPNG and chosen:
-        return capture_packets(path, kind, chosen)
+    if kind in (PCAPNG, _MCAP) and chosen:
+        return capture_mcap(path, chosen) if kind == _MCAP else capture_packets(path, kind, chosen)
     if len(chosen) != 1:
         raise UsageError(
             f"{path.name} holds {len(endpoints)} endpoints",
             expected=", ".join(map(str, endpoints)),
-            hint="--endpoint, or a .pcapng file, which holds all of them",
+            hint="--endpoint, or a .pcapng or .mcap file, which holds all of them",
         )
     endpoint = chosen[0]
     if kind == ".pcap":
@@ -263,11 +270,11 @@ def _capture_work(path: Path, kind: str, url: str) -> Callable[[Path], int]:
     if kind != ".log" or not endpoint.is_can:
         raise UsageError(
             f"a capture of {endpoint}",
-            expected=".pcap or .pcapng; of a CAN bus .log too",
+            expected=".pcap, .pcapng or .mcap; of a CAN bus .log too",
             got=kind,
             hint="import it first",
         )
-    offset_ns = utc_offset_ns(path)
+    offset_ns = utc_offset_ns(parts_of(path)[0])
     seen = (c for part in parts_of(path) for c in read_capture(part) if c.endpoint == endpoint)
     frames = ((c.t_ns + offset_ns, "can0", c.item) for c in seen if isinstance(c.item, CanFrame))
     return lambda out: _write_log(frames, out)

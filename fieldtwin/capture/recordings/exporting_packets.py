@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
 
 from fieldtwin.capture.formats.pcap import (
-    MAX_LINE_BYTES,
     MAX_SERVERS,
     commented_packets,
     link_type,
     packets,
     read_capture,
+    utc_ns,
+    utc_offset_ns,
     write_pcap,
 )
 from fieldtwin.capture.formats.pcapng import Wire, interface_names, write_pcapng
@@ -24,7 +23,6 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
-from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.recording import RecordingHeader
 from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
@@ -59,7 +57,7 @@ def _logged(path: Path, channel: str = "") -> Iterator[Captured]:
 
 def capture_packets(path: Path, kind: str, endpoints: Sequence[Endpoint]) -> Write:
     """Return the function that writes the traffic of a capture with these endpoints as `kind`. A pcap file has one endpoint."""
-    offset_ns = utc_offset_ns(path)
+    offset_ns = utc_offset_ns(parts_of(path)[0])
     if kind != PCAPNG:
         (endpoint,) = endpoints
         return lambda out: write_pcap(out, _captured(path), endpoint, offset_ns)
@@ -75,26 +73,6 @@ def capture_packets(path: Path, kind: str, endpoints: Sequence[Endpoint]) -> Wri
 def _captured(path: Path) -> Iterator[Captured]:
     for part in parts_of(path):
         yield from read_capture(part)
-
-
-def utc_offset_ns(path: Path) -> int:
-    """Return the nanoseconds from the monotonic times of a capture to UTC, 0 if its first line does not state them.
-
-    Such a line has the time of its writing twice: ``started`` (ISO 8601) and ``t_ns`` (monotonic).
-    """
-    try:
-        with open_input(parts_of(path)[0]) as file:
-            head = json.loads(file.readline(MAX_LINE_BYTES))
-        return utc_ns(str(head["started"])) - int(head["t_ns"])
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    except (ValueError, KeyError, TypeError, OverflowError):
-        return 0
-
-
-def utc_ns(text: str) -> int:
-    """Return an ISO 8601 time as nanoseconds since 1970. Raises `ValueError` or `OverflowError`."""
-    return round(datetime.fromisoformat(text).timestamp() * NS_PER_S)
 
 
 def start_ns(header: RecordingHeader) -> int:

@@ -13,6 +13,8 @@ from fieldtwin.console import stdout
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.twin.site.data_files import find
 
+_UNITS = {".pcap": "packets", ".pcapng": "packets", ".mcap": "messages"}
+
 
 @click.command("export")
 @click.argument("recording", type=click.Path(path_type=Path))
@@ -22,7 +24,7 @@ from fieldtwin.twin.site.data_files import find
     "profile_name",
     default="",
     metavar="NAME",
-    help="Profile whose tags become the columns of a table of exchanges.",
+    help="Profile whose tags become columns of a table, or a topic of an MCAP file.",
 )
 @click.option(
     "--framing",
@@ -43,15 +45,18 @@ def command(
     profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
-    """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump), .pcap or .pcapng.
+    """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump), .pcap, .pcapng or .mcap.
 
     \b
-    meter.jsonl   to .csv or .parquet (with --profile: in the tags' units),
-                  to .pcap or .pcapng for Wireshark
-    bus.log       to .csv, .parquet, .pcap, .pcapng
-    cast.jsonl    recorded signals: to .csv or .parquet
+    meter.jsonl   to .csv, .parquet or .mcap (with --profile: in the tags'
+                  units), to .pcap or .pcapng for Wireshark
+    bus.log       to .csv, .parquet, .pcap, .pcapng, .mcap
+    cast.jsonl    recorded signals: to .csv, .parquet or .mcap
     a capture     of run --capture, record --tap or a command's --log:
-                  to .pcapng; of one endpoint to .pcap; of a CAN bus to .log
+                  to .pcapng or .mcap; of one endpoint to .pcap;
+                  of a CAN bus to .log
+
+    A trace of simulate becomes .pcapng or .mcap by `fieldtwin trace`.
     """
     from fieldtwin.capture.recordings.exporting import export
 
@@ -62,7 +67,7 @@ def command(
         sys.stdout.write("\n")
     else:
         stdout.print(
-            f"{out}: {count} {'packets' if out.suffix.lower() in ('.pcap', '.pcapng') else 'records'}",
+            f"{out}: {count} {_UNITS.get(out.suffix.lower(), 'records')}",
             soft_wrap=True,
             markup=False,
         )

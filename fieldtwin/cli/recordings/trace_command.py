@@ -1,16 +1,16 @@
-"""`fieldtwin trace`: show the events of a run as text, as JSON, or as waveforms."""
+"""`fieldtwin trace`: show the events of a run as text or JSON, or write them for GTKWave, Foxglove or Wireshark."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
 
 from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
-from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.capture.decoding.trace_file import read_events, start_utc_ns
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.recordings.regression_options import ToleranceOptions
@@ -19,6 +19,8 @@ from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.trace import TraceEvent, TraceKind
+from fieldtwin.results.trace_about import read_about
+from fieldtwin.twin.site.system import System
 
 
 @click.command("trace", cls=GroupedCommand)
@@ -53,6 +55,8 @@ from fieldtwin.results.trace import TraceEvent, TraceKind
 @group(
     "Output",
     click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead."),
+    click.option("--mcap", type=click.Path(path_type=Path), help="Write an MCAP file for Foxglove instead."),
+    click.option("--pcapng", type=click.Path(path_type=Path), help="Write the frames for Wireshark instead."),
     json_option,
 )
 def command(
@@ -63,6 +67,8 @@ def command(
     end_s: float | None,
     problems: bool,
     vcd: Path | None,
+    mcap: Path | None,
+    pcapng: Path | None,
     against: Path | None,
     as_scenario: Path | None,
     seed: int | None,
@@ -90,7 +96,7 @@ def command(
     if against is not None or as_scenario is not None:
         from fieldtwin.cli.recordings import regression_view
 
-        if vcd is not None or only or problems or (against is not None and as_scenario is not None):
+        if any((vcd, mcap, pcapng, only, problems)) or (against is not None and as_scenario is not None):
             raise UsageError("--against and --as-scenario use the whole run, without other options")
         allowed = regression_view.allowed_of(tolerance)
         if against is not None:
@@ -99,18 +105,22 @@ def command(
         return regression_view.write_scenario(
             plant, file, as_scenario, system, allowed=allowed, seed=seed, values=set_values
         )
-    events = read_events(file, plant)
     start_ns, end_ns = round(start_s * NS_PER_S), None if end_s is None else round(end_s * NS_PER_S)
-    if vcd is not None:
-        if only or problems or as_json:
-            raise UsageError("--vcd takes the whole trace", expected="--vcd without --only, --problems or --json")
-        from fieldtwin.reports.run.machines import machines_of
-        from fieldtwin.reports.run.vcd import write_vcd
+    outputs = {"--vcd": vcd, "--mcap": mcap, "--pcapng": pcapng}
+    if chosen := [option for option, out in outputs.items() if out is not None]:
+        if len(chosen) > 1 or only or problems or as_json:
+            raise UsageError(
+                f"{chosen[0]} takes the whole trace",
+                expected="one of --vcd, --mcap and --pcapng, without --only, --problems and --json",
+            )
 
-        inside = [e for e in events if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns)]
-        write_vcd(vcd, inside, plant, machines_of(plant), f"{plant.name}, {file.name}")
-        stderr.print(f"{len(inside)} events  →  {vcd}", soft_wrap=True)
+        def inside() -> Iterator[TraceEvent]:
+            return (e for e in read_events(file, plant) if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns))
+
+        (out,) = (out for out in outputs.values() if out is not None)
+        stderr.print(f"{_written(chosen[0], out, inside, plant, file)}  →  {out}", soft_wrap=True)
         return 0
+    events = read_events(file, plant)
     decoder = Decoder(plant)
     for event, decoded in _decoded(decoder, events, end_ns):
         if event.t_ns < start_ns:
@@ -123,6 +133,28 @@ def command(
     if as_json or problems:
         _show_exchanges(decoder.finish(), only, problems=problems, as_json=as_json)
     return 0
+
+
+def _written(option: str, out: Path, events: Callable[[], Iterator[TraceEvent]], plant: System, file: Path) -> str:
+    """Write the events of `file` in the format of the option; return what was written, in words."""
+    title = f"{plant.name}, {file.name}"
+    if option == "--vcd":
+        from fieldtwin.reports.run.machines import machines_of
+        from fieldtwin.reports.run.vcd import write_vcd
+
+        found = list(events())
+        write_vcd(out, found, plant, machines_of(plant), title)
+        return f"{len(found)} events"
+    start = start_utc_ns(file)
+    if option == "--pcapng":
+        from fieldtwin.reports.run.packets import write_packets
+
+        return f"{write_packets(out, events, plant, start_utc_ns=start, comment=title)} packets"
+    from fieldtwin.reports.run.mcap import write_mcap
+
+    about = {"source": file.name}
+    count = write_mcap(out, events, plant, start_utc_ns=start, about=about, description=read_about(file))
+    return f"{count} messages"
 
 
 def _decoded(

@@ -39,6 +39,7 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEX
 
 _OTHER_FILES = (
     (b'{"fieldtwin_dump"', " but a dump: fieldtwin infer, diff and report read it"),
+    (b"[", " but a trace: fieldtwin trace shows and converts it"),
     (b'{"started"', " but raw traffic: fieldtwin import makes a recording of it"),
 )
 """Files that users give by mistake, recognised by their first bytes."""

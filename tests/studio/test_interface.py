@@ -14,7 +14,9 @@ import websockets
 from msgspec import structs
 from studio_rig import OPERATE, VIEW, Studio, until
 
+from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.pcap import MAGIC_NS
+from fieldtwin.emulators.virtual.clock import EPOCH_UTC_NS
 from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, read_record, write_record
 
@@ -96,11 +98,17 @@ def test_requests_are_linked_with_their_replies(observatory: Studio) -> None:
         assert request["bytes"].startswith("0103")
 
 
-def test_frames_are_exported_as_pcap_and_candump(observatory: Studio) -> None:
+def test_frames_are_exported_as_packets_and_candump(observatory: Studio, tmp_path: Path) -> None:
     with observatory.client(VIEW) as client:
         until(lambda: client.get(f"{NAME}/frames", params={"bus": "can0"}).json()["total"], "CAN frames")
         packets = client.get(f"{NAME}/frames/export", params={"bus": "lan", "format": "pcap"})
         assert packets.content[:4] == MAGIC_NS.to_bytes(4, "big")
+        every_bus = client.get(f"{NAME}/frames/export", params={"format": "pcapng"})
+        (tmp_path / "frames.pcapng").write_bytes(every_bus.raise_for_status().content)
+        with PacketFile(tmp_path / "frames.pcapng") as file:
+            found = [(file.interface, t_ns) for t_ns, _, _ in file]
+        assert {bus for bus, _ in found} == {"line1", "can0", "lan"}
+        assert all(t_ns > EPOCH_UTC_NS for _, t_ns in found)
         text = client.get(f"{NAME}/frames/export", params={"bus": "can0", "format": "candump"}).text
         assert text.splitlines()[0].split()[1] == "can0"
         mixed = client.get(f"{NAME}/frames/export", params={"format": "pcap"})
@@ -119,7 +127,7 @@ def test_a_selection_is_exported_as_a_recording_that_can_be_read(observatory: St
         assert can.status_code == 400
         assert "candump" in can.json()["error"]["message"]
         unknown = client.get(f"{NAME}/frames/export", params={"format": "xls"})
-        assert "pcap, candump, recording" in unknown.json()["error"]["message"]
+        assert "pcapng, pcap, candump, recording" in unknown.json()["error"]["message"]
     with RecordingReader(file) as recording:
         assert recording.header.prototype
         assert [e for e in recording.exchanges() if e.reply is not None]

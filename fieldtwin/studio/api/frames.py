@@ -11,6 +11,7 @@ import msgspec
 from starlette.requests import Request
 from starlette.responses import Response
 
+from fieldtwin.capture.decoding.decoder import frame_events
 from fieldtwin.capture.formats.pcap import write_pcap
 from fieldtwin.capture.recordings.importing import import_capture
 from fieldtwin.gateway.connections.tap import Captured, TapFile
@@ -18,6 +19,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.recording import RecordingHeader
+from fieldtwin.reports.run.packets import write_packets
 from fieldtwin.studio.api.common import INSTANCE, attached
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, Parameter, whole, yes
@@ -30,7 +32,7 @@ MOST_ROWS = 500
 MOST_EXPORTED = 200_000
 AT_ONCE = 2_000
 """Number of frames that an export reads before the server answers other requests in between."""
-FORMATS = ("pcap", "candump", "recording")
+FORMATS = ("pcapng", "pcap", "candump", "recording")
 FILTERS = (
     Parameter("bus", "string", "only frames of this bus"),
     Parameter("device", "string", "only frames of this device"),
@@ -44,7 +46,7 @@ PAGE = (
     *FILTERS,
 )
 EXPORT = (
-    Parameter("format", "string", "pcap, candump or recording"),
+    Parameter("format", "string", "pcapng, pcap, candump or recording"),
     Parameter("first", "integer", "number of the first frame"),
     Parameter("last", "integer", "number of the last frame"),
     *FILTERS,
@@ -112,7 +114,7 @@ async def list_services(request: Request) -> list[str]:
 
 
 async def export_frames(request: Request) -> Response:
-    """Return a selection of frames as a file: pcap or recording (one bus), or candump (CAN buses)."""
+    """Return a selection of frames as a file: pcapng (all buses), pcap or recording (one bus), or candump (CAN buses)."""
     attachment = await attached(request)
     record = attachment.record
     offset_ns = record.started_utc_ns - record.started_ns
@@ -140,6 +142,9 @@ async def file_of(request: Request, frames: FrameLog, system: System, offset_ns:
     if kind == "candump":
         content = await asyncio.to_thread(_candump, captured, offset_ns)
         return _file(content, "frames.log", "text/plain")
+    if kind == "pcapng":
+        content = await asyncio.to_thread(_pcapng, captured, system, offset_ns)
+        return _file(content, "frames.pcapng", "application/x-pcapng")
     endpoint = _only_endpoint(captured, system)
     if kind == "recording":
         content = await asyncio.to_thread(_recording, captured, endpoint, prototype)
@@ -159,6 +164,7 @@ def _only_endpoint(captured: list[Captured], system: System) -> Endpoint:
             "a pcap file or a recording has the frames of one bus",
             expected="the choice of one bus",
             got=f"frames of {', '.join(buses)}",
+            hint="a pcapng file has the frames of all buses",
         )
     return next(iter(endpoints.values()))
 
@@ -172,6 +178,14 @@ def _candump(captured: list[Captured], offset_ns: int) -> bytes:
     if not lines:
         raise UsageError("there are no CAN frames in the selection", hint="export other buses as pcap or recording")
     return "".join(lines).encode("ascii")
+
+
+def _pcapng(captured: list[Captured], system: System, offset_ns: int) -> bytes:
+    events = frame_events(captured, system)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frames.pcapng"
+        write_packets(path, lambda: events, system, start_utc_ns=offset_ns, comment=system.name)
+        return path.read_bytes()
 
 
 def _pcap(captured: list[Captured], endpoint: Endpoint, offset_ns: int) -> bytes:

@@ -323,7 +323,7 @@ function Exports({ path, selection }) {
     });
   return html`<span class="exports">
       <span class="soft">Export as</span>
-      ${["pcap", "candump", "recording"].map((kind) => html`<button class="quiet" disabled=${busy} onClick=${() => save(kind)}>${kind}</button>`)}
+      ${["pcapng", "pcap", "candump", "recording"].map((kind) => html`<button class="quiet" disabled=${busy} onClick=${() => save(kind)}>${kind}</button>`)}
     </span>
     ${error && html`<p class="error wide" role="alert">${error}</p>`}`;
 }

@@ -22,8 +22,9 @@ def everything() -> tuple[Explanation, ...]:
     from fieldtwin.explain.modbus_exceptions import EXCEPTIONS
     from fieldtwin.explain.qualities import QUALITIES
     from fieldtwin.explain.sdo_aborts import ABORTS
+    from fieldtwin.explain.verdicts import VERDICTS
 
-    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *CASES)
+    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *VERDICTS, *CASES)
 
 
 def explain(text: str) -> Sequence[Explanation]:
@@ -43,6 +44,7 @@ def explain(text: str) -> Sequence[Explanation]:
     near = nearest(word, known, most=3)
     raise UsageError(
         f"no explanation of {text!r}",
-        expected="a test case (MB-015), a fault, `exception 02`, an SDO abort code, a quality or its reason, an error, `exit 4`",
+        expected="a test case (MB-015), a fault, `exception 02`, an SDO abort code, a quality or its reason, a verdict, "
+        "an error, `exit 4`",
         hint=f"similar: {', '.join(near)}" if near else "`fieldtwin explain` without a word lists all",
     )

@@ -19,6 +19,7 @@ from fieldtwin.explain.lookup import everything, explain
 from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.protocols.canopen.sdo.abort_codes import MEANINGS
+from fieldtwin.results.model import Verdict
 
 
 def kinds_of_errors(base: type[FieldtwinError] = FieldtwinError) -> Iterator[type[FieldtwinError]]:
@@ -36,6 +37,7 @@ PRINTED = {
     "errors": sorted({kind.__name__ for kind in kinds_of_errors()}),
     "exit codes": [f"exit {code}" for code in (0, 1, 2, 3, 4, 5, 70, 130)],
     "faults": list(FAULTS),
+    "verdicts": [*(verdict.name for verdict in Verdict), "robustness", "field problem"],
     "cases": [
         *(case.id for cases in (MODBUS_DEVICES, CANOPEN_DEVICES) for case in cases),
         *(case.about.id for case in MODBUS_CLIENTS),

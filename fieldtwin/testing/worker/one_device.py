@@ -15,6 +15,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
+from fieldtwin.testing.worker.sheet_profile import SHEETS, write_profile
 from fieldtwin.twin.site.data_files import find, find_recording
 
 DEVICE, BUS = "device", "wire"
@@ -47,10 +48,12 @@ def write_system(
 ) -> Path:
     """Write the system file and its prototype file into `folder`; return the path of the system file.
 
-    `beside` is the folder of the test, which may contain its own profiles and recordings. Raises `UsageError` for a
-    missing file, `FileInvalid` for an invalid profile.
+    `beside` is the folder of the test, which may contain its own profiles, data sheets and recordings. Raises `UsageError`
+    for a missing file, `FileInvalid` for an invalid profile or data sheet.
     """
     path = find("devices", wanted.device, beside=beside / "x" if beside else None, extra=profiles)
+    if path.suffix.lower() in SHEETS:
+        path = write_profile(path, folder)
     profile = load_profile(path)
     plant, listen = _wires(wanted.on or _usual(profile), profile)
     can = plant.startswith("can")
@@ -107,9 +110,11 @@ def _stand_in(wanted: DeviceRequest, profile: DeviceProfile, path: Path, beside:
     common: dict[str, Any] = {"identity": wanted.identity} if wanted.identity else {}
     if profile.inbox is not None:
         return {"model": "mailbox", "far": "tcp://127.0.0.1:0", **common}
+    if wanted.values and profile.protocol == "canopen":
+        raise UsageError("values for a CANopen node", expected="values= of a Modbus device, or device.set(TAG, VALUE)")
     named = wanted.recording
-    model = profile.sampled is None and profile.protocol == "modbus"
-    if not named and not model:
+    model = profile.sampled is None
+    if not named and (not model or profile.protocol == "canopen"):
         named = _shipped(path.stem)
     if named and wanted.values and model:
         raise UsageError("a recording and values", expected="one of them, and set() for single values")

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from fieldtwin.twin.site.schema import Name, SiteModel
+from fieldtwin.twin.site.base_forms import Name, SiteModel
 
 WATER = "water"
 """The name of the acoustic channel in faults, where it takes the place of a bus name."""

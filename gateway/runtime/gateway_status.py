@@ -193,8 +193,10 @@ class FrontStatus(msgspec.Struct, frozen=True, kw_only=True):
 class ServerStatus(FrontStatus, frozen=True, kw_only=True):
     """A server of tags."""
 
-    unit: int
-    """The unit ID for which the server answers."""
+    kind: str = "modbus"
+    """The kind of the server, as the `serve` section of the system file names it."""
+    unit: int | UnsetType = UNSET
+    """For a Modbus server: the unit ID for which it answers."""
 
 
 class BridgeStatus(FrontStatus, frozen=True, kw_only=True):

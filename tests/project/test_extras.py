@@ -19,6 +19,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
+from fieldtwin.northbound.opcua.config import require_library
 from fieldtwin.run.processes import event_loop as loops
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import twin_carrier
@@ -37,6 +38,10 @@ def use_postgres(folder: Path) -> None:
     asyncio.run(open_knowledge("postgresql://nobody@127.0.0.1:1/none"))
 
 
+def use_opcua(folder: Path) -> None:
+    require_library("scada")
+
+
 def use_plot(folder: Path) -> None:
     check_plot(folder / "x.png")
 
@@ -51,6 +56,7 @@ def use_mcap(folder: Path) -> None:
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
+    "opcua": ("asyncua", use_opcua, ""),
     "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "plot": ("matplotlib", use_plot, ""),
     "parquet": ("pyarrow", use_parquet, ""),

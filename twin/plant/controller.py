@@ -2,7 +2,7 @@
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
 instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
-write, command, reload, stop.
+write, command, report, reload, stop.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
 from fieldtwin.twin.plant.physical import EmbeddedControlSystem, attached, gateway_config
 from fieldtwin.twin.plant.refusal_places import RefusalPlaces
 from fieldtwin.twin.plant.reloading import compare, limits_changed
+from fieldtwin.twin.plant.server_reports import ServerReports
 from fieldtwin.twin.plant.watching import TagWatch
 from fieldtwin.twin.site.resolved import read_resolved, write_resolved
 from fieldtwin.twin.site.system import System, load_system
@@ -132,6 +133,7 @@ class GatewayProcess:
                 self._learnt.load()
                 journal = self._gateway.outputs.journal
                 self._places = RefusalPlaces(journal, run_dir / "plc.sock", tap.on_refusal if tap else None)
+                self._reports = ServerReports(system.serving, self._clock)
                 self._watching = TagWatch(self._gateway.tags, self._clock, journal)
                 await self._serve(run_dir / "gateway.sock")
         finally:
@@ -151,6 +153,7 @@ class GatewayProcess:
                 "gate": self._gate,
                 "write": self._write,
                 "command": self._command,
+                "report": self._reports.report,
                 "reload": self._reload,
                 "stop": self._request_stop,
             }
@@ -197,8 +200,10 @@ class GatewayProcess:
         return self._status(brief=args.get("brief") is True)
 
     def _status(self, *, brief: bool = False) -> GatewayStatus:
+        status = describe(self._gateway, self._clock.monotonic_ns(), brief=brief)
         return msgspec.structs.replace(
-            describe(self._gateway, self._clock.monotonic_ns(), brief=brief),
+            status,
+            serve=status.serve | self._reports.statuses(),
             learnt=learnt_statuses(self._gateway.drivers.values()),
             store_error=self._store_error,
             config=ConfigStatus(

@@ -7,19 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
-Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
-Pause = Annotated[int, Field(ge=0, le=60_000)]
-Address = Annotated[int, Field(ge=0, le=0xFFFF)]
-TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z0-9_]*$")]
-
-
-class SiteModel(BaseModel):
-    """Base class: unknown keys are refused, and values are not coerced."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+from fieldtwin.twin.site.base_forms import Milliseconds, Name, Pause, SiteModel, TagName
+from fieldtwin.twin.site.serve_forms import ServeForm
 
 
 class SyncForm(SiteModel):
@@ -109,8 +100,8 @@ class DeviceForm(SiteModel):
     bus: Name = Field(examples=["line1"])
     unit: int | None = Field(default=None, ge=1, le=255)
     node: int | None = Field(default=None, ge=1, le=127)
-    expect: dict[Name, str] = {}
-    poll: dict[Name, PollForm] = {}
+    expect: dict[Name, str] = Field(default={})
+    poll: dict[Name, PollForm] = Field(default={})
     timeout_ms: Milliseconds | None = Field(default=None, description="default: the profile's, else the bus's")
     retries: int | None = Field(default=None, ge=0, le=10, description="default: the bus's")
     spacing_ms: Pause | None = Field(
@@ -121,7 +112,7 @@ class DeviceForm(SiteModel):
     )
     backoff_limit_ms: Milliseconds = Field(default=10_000, description="the pause doubles up to this limit, ms")
     stale_after_ms: Milliseconds = 5000
-    writable: list[Name] = []
+    writable: list[Name] = Field(default=[])
     safe: dict[Name, bool | int | float | str] = Field(
         default={}, description="tag -> its safe value: a number, true or false, or the value's name"
     )
@@ -180,8 +171,8 @@ class ProgramForm(SiteModel):
     source: str = Field(examples=["control.st"])
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
-    inputs: dict[Name, InputForm] = {}
-    outputs: dict[Name, TagName] = {}
+    inputs: dict[Name, InputForm] = Field(default={})
+    outputs: dict[Name, TagName] = Field(default={})
 
 
 class TaskForm(SiteModel):
@@ -217,48 +208,12 @@ class PlcForm(SiteModel):
     )
 
 
-class ServedTagForm(SiteModel):
-    """The place at which a tag is served: exactly one of the four tables, at a PDU address.
-
-    `type` is the type of the served value. A quality register holds 0 for good quality.
-    """
-
-    input: Address | None = None
-    holding: Address | None = None
-    discrete: Address | None = None
-    coil: Address | None = None
-    type: Literal["bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] | None = None
-    order: Literal["ABCD", "CDAB", "BADC", "DCBA"] = "ABCD"
-    quality: Address | None = Field(default=None, description="address of the tag's quality register")
-    write: bool = Field(default=False, description="clients may write it if the plant allows writes")
-
-
-class ServeForm(SiteModel):
-    """The process image as Modbus TCP registers, for HMIs and other controllers."""
-
-    url: str = Field(examples=["tcp://127.0.0.1:1502"])
-    unit: int = Field(default=1, ge=0, le=255)
-    tags: dict[TagName, ServedTagForm] = Field(min_length=1)
-    if_bad: Literal["exception", "nan"] = "exception"
-    networks: list[str] = Field(
-        default=["0.0.0.0/0", "::/0"], alias="from", description="the addresses that may connect"
-    )
-    clients: int = Field(default=16, ge=1, le=1000)
-    roles: list[str] | None = Field(
-        default=None, description="TLS: roles whose clients may read; default: every client"
-    )
-    write_roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may write as well")
-    idle_s: int = Field(
-        default=0, ge=0, le=86_400, description="silent clients are disconnected after this time; 0: never"
-    )
-
-
 class AllowForm(SiteModel):
     """The requests that clients of some networks may send. Units and addresses are numbers, or ranges such as 0..99."""
 
     networks: list[str] = Field(default=["127.0.0.0/8", "::1/128"], alias="from", min_length=1)
     units: list[int | str] | None = None
-    functions: list[int | Literal["read", "write"]] = ["read"]
+    functions: list[int | Literal["read", "write"]] = Field(default=["read"])
     addresses: dict[Literal["coil", "discrete", "input", "holding"], list[int | str]] | None = None
     roles: list[str] | None = Field(default=None, description="TLS: the roles that it is for; default: every client")
 
@@ -338,8 +293,8 @@ class SystemForm(SiteModel):
     plc: PlcForm = Field(default=PlcForm(), description="default: no programs, only the gateway")
     remote: Literal["local", "remote"] = "local"
     commands: CommandsForm = CommandsForm()
-    serve: dict[Name, ServeForm] = {}
-    bridge: dict[Name, BridgeForm] = {}
+    serve: dict[Name, ServeForm] = Field(default={})
+    bridge: dict[Name, BridgeForm] = Field(default={})
     invariants: InvariantsForm = Field(
         default=InvariantsForm(), description="conditions that hold in every run, scenario and campaign"
     )
@@ -417,7 +372,7 @@ class EmulatedForm(SiteModel):
     speed: float = Field(default=1.0, gt=0, le=10_000)
     at_end: Literal["hold", "loop", "error"] = "hold"
     latency_ms: float = Field(default=0.0, ge=0, le=60_000)
-    identity: dict[Name, str] = {}
+    identity: dict[Name, str] = Field(default={})
     values: dict[Name, int | float | str] = Field(
         default={}, description="model profile, Modbus: tag -> its initial value"
     )
@@ -436,5 +391,5 @@ class PrototypeForm(SiteModel):
     unmapped: Literal["refuse"] = "refuse"
     seed: int = 1
     buses: dict[Name, BusMappingForm | Literal["plant"]]
-    simulations: dict[Name, SimulationForm] = {}
+    simulations: dict[Name, SimulationForm] = Field(default={})
     devices: dict[Name, EmulatedForm]

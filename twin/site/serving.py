@@ -23,7 +23,9 @@ from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, network
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
 from fieldtwin.twin.site.references import no_device
-from fieldtwin.twin.site.schema import AllowForm, BridgeForm, ServedTagForm, ServeForm
+from fieldtwin.twin.site.schema import AllowForm, BridgeForm
+from fieldtwin.twin.site.serve_forms import ModbusServeForm, OpcuaServeForm, ServedTagForm, ServeForm
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig, resolve_opcua
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000
@@ -35,7 +37,15 @@ class Serving:
     """The sections `serve` and `bridge` of a system file, resolved, with the addresses that the file states."""
 
     serve: tuple[ServeConfig, ...] = ()
+    """The servers of kind `modbus`, which run in the gateway's process."""
     bridges: tuple[BridgeConfig, ...] = ()
+    opcua: tuple[OpcuaServeConfig, ...] = ()
+    """The servers of kind `opcua`, each of which runs in a separate process."""
+
+    @property
+    def separate(self) -> tuple[OpcuaServeConfig, ...]:
+        """Return the servers that run in separate processes."""
+        return self.opcua
 
     def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
         """Return the sections as a gateway runs them.
@@ -45,10 +55,11 @@ class Serving:
         """
         bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
         if not free_ports:
-            return Serving(self.serve, tuple(bridges))
+            return Serving(self.serve, tuple(bridges), self.opcua)
         return Serving(
             tuple(replace(s, listen=_free(s.listen)) for s in self.serve),
             tuple(replace(b, listen=_free(b.listen)) for b in bridges),
+            tuple(o.on_free_port() for o in self.opcua),
         )
 
 
@@ -68,9 +79,13 @@ def resolve_serving(
     """Resolve and check both sections. Errors are added to `errors`; the result contains the entries without error."""
     outputs = set(plc_outputs)
     servers: list[ServeConfig] = []
+    opcua: list[OpcuaServeConfig] = []
     for name, form in serve.items():
         with errors.collect():
-            servers.append(_server(file, name, form, devices, outputs, errors))
+            if isinstance(form, OpcuaServeForm):
+                opcua.append(resolve_opcua(file, name, form))
+            else:
+                servers.append(_server(file, name, form, devices, outputs, errors))
     bridges: list[BridgeConfig] = []
     for name, bridge_form in bridge.items():
         with errors.collect():
@@ -85,7 +100,14 @@ def resolve_serving(
         if str(listen) in taken:
             errors.add(file.error((section, name, "url"), f"{listen} is taken by {taken[str(listen)]}"))
         taken[str(listen)] = f"{section} {name!r}"
-    return Serving(tuple(servers), tuple(bridges))
+    fronts = [*(s.listen for s in servers), *(b.listen for b in bridges)]
+    places = {(listen.host, listen.port): taken[str(listen)] for listen in fronts if str(listen) in taken}
+    for server in opcua:
+        place = (server.host, server.port)
+        if server.port and place in places:
+            errors.add(file.error(("serve", server.name, "url"), f"{server.url} is taken by {places[place]}"))
+        places[place] = f"serve {server.name!r}"
+    return Serving(tuple(servers), tuple(bridges), tuple(opcua))
 
 
 # -- serve ---------------------------------------------------------------------------------------------------------------
@@ -94,7 +116,7 @@ def resolve_serving(
 def _server(
     file: YamlFile,
     name: str,
-    form: ServeForm,
+    form: ModbusServeForm,
     devices: Mapping[str, DeviceConfig],
     outputs: set[str],
     errors: ErrorCollector,

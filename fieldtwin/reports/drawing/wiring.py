@@ -151,6 +151,8 @@ def _servers(system: System, *, free_ports: bool) -> Iterator[Server]:
     for serve in serving.serve:
         count = len(serve.tags)
         yield Server(serve.name, str(serve.listen), f"{count} tag{'s' if count > 1 else ''} as registers")
+    for opcua in serving.opcua:
+        yield Server(opcua.name, opcua.url, "every tag as a variable")
     for bridge in serving.bridges:
         reached = ", ".join(bus for bus in system.buses if bus in bridge.buses)
         yield Server(bridge.name, str(bridge.listen), f"units of {reached}")

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.northbound.opcua.config import OpcuaProcessConfig
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.processes.run_record import RunRecord
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapping_to_json
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.place import delegated_transmitter
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
@@ -81,6 +83,11 @@ def gateway_config(
         delegated=(delegated,) if delegated else (),
         resolved=resolved,
     )
+
+
+def server_config(o: RunOptions, run_dir: Path, server: OpcuaServeConfig, resolved: str) -> OpcuaProcessConfig:
+    """Return the configuration of the process of a server of tags."""
+    return OpcuaProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=o.prototype)
 
 
 def thread_config(

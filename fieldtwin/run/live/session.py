@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,18 +26,21 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, StoppedGateway
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.opcua.config import require_library
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
 from fieldtwin.run.live.child_configs import (
     field_config,
     gateway_config,
     run_record,
+    server_config,
     thread_config,
     transmitter_of_thread,
 )
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
 from fieldtwin.run.live.scheduling_watch import SchedulingWatch
+from fieldtwin.run.live.server_process import ServerProcess
 from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.children import Child, ChildFailed, naming_failures
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_local
@@ -51,6 +55,7 @@ from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.thread.place import MODEM
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
@@ -86,6 +91,8 @@ class RunSession(AsyncResource):
         self.options = options
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
+        for server in self.system.serving.opcua:
+            require_library(server.name)
         self.twin = PhysicalTwin(self.system)
         self.delegated = transmitter_of_thread(options, self.system)
         self._prototype: Prototype | None = None
@@ -212,6 +219,7 @@ class RunSession(AsyncResource):
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         if self.options.thread:
             await self._start_thread(run_dir)
+        self._start_servers()
         self.started_ns = self.clock.monotonic_ns()
         write_record(run_dir, run_record(self.options, self.system, self.capture, self.started_ns, self.clock.utc_ns()))
         await self._put_faults_in()
@@ -221,6 +229,18 @@ class RunSession(AsyncResource):
         if self._field is not None:
             for fault in self.faults:  # each fault says when it begins and ends
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
+
+    def _start_servers(self) -> None:
+        """Start the servers of tags that run in separate processes. The gateway's status states when they listen."""
+        for server in self.system.serving.separate:
+            process = ServerProcess(partial(self._server_child, server), lambda error: self.note_error(str(error)))
+            self._stack.push_async_callback(process.end)
+            self._nursery.start(process.run(), f"process of server {server.name}")
+
+    def _server_child(self, server: OpcuaServeConfig) -> Child:
+        name, run_dir = f"{server.kind}-{server.name}", self.instance.dir
+        config = self._write(f"{name}.json", server_config(self.options, run_dir, server, self._resolved))
+        return Child(name, "fieldtwin.northbound.opcua.process", config, run_dir)
 
     async def _start_thread(self, run_dir: Path) -> None:
         """Start the plant's side of the digital thread, which observes the process image."""

@@ -30,7 +30,7 @@ from fieldtwin.twin.model.mape.plan import Planner, PlanRule, RulePlanner
 from fieldtwin.twin.model.mape.what_if import Question
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.variables import Limits
-from fieldtwin.twin.site.schema import SiteModel, TagName
+from fieldtwin.twin.site.base_forms import SiteModel, TagName
 from fieldtwin.twin.site.system import System
 
 Finding = Literal["agree", "mismatch", "outside", "inside", "bad", "good", "stale", "fresh", "unreadable"]

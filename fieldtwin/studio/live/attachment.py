@@ -25,7 +25,6 @@ from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, read_record
-from fieldtwin.studio.live.channel import Channel
 from fieldtwin.studio.live.frame_log import FrameLog
 from fieldtwin.studio.live.instances import FIELD_SOCKET, GATEWAY_SOCKET, PLC_SOCKET, FoundInstance
 from fieldtwin.studio.live.marks import FaultMarks
@@ -36,6 +35,7 @@ from fieldtwin.studio.live.process_image import ProcessImage
 from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.studio.live.subscription import Publisher
 from fieldtwin.studio.live.tag_history import Point, TagHistory
+from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System

@@ -13,7 +13,7 @@ import msgspec
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.plc.status import WholePlcStatus
-from fieldtwin.studio.live.channel import Channel
+from fieldtwin.twin.plant.channel import Channel
 
 MOST_TRANSITIONS = 200
 """Largest number of transitions that are kept of each program; the oldest are dropped first."""

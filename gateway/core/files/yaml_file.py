@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -277,6 +277,12 @@ def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) 
         return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}", expected=expected)
     if error["type"] == "too_short" and not error["input"]:
         return file.error(loc, f"{name} is empty")
+    if error["type"] == "union_tag_invalid":
+        # a union is discriminated by a function that is named after the key that it reads, such as kind_of
+        key = str(error["ctx"]["discriminator"]).strip("'").removesuffix("_of()")
+        known, tag = re.findall(r"'([^']*)'", str(error["ctx"]["expected_tags"])), str(error["ctx"]["tag"])
+        hint = did_you_mean(tag, known)
+        return file.error((*loc, key), f"{name}.{key}", expected=" or ".join(known), got=repr(tag)[:80], hint=hint)
     got = "" if error["type"] == "value_error" else repr(error["input"])[:80]
     if error["type"] == "literal_error":
         known = re.findall(r"'([^']*)'", str(error["ctx"]["expected"]))
@@ -310,6 +316,9 @@ def _model_at(model: type[BaseModel], loc: tuple[Key, ...]) -> type[BaseModel]:
         fields = getattr(current, "model_fields", None)
         if fields and part in fields:
             current = fields[part].annotation
+        if tagged := _tagged_models(current):
+            current = tagged.get(part, current)
+            continue
         for candidate in _models_in(current):
             current = candidate
             break
@@ -332,6 +341,17 @@ def _example(model: type[BaseModel], loc: tuple[Key, ...], key: str) -> str:
 def _kind_of(annotation: Any) -> str:
     kind = get_origin(annotation) or annotation
     return {str: "string"}.get(kind, getattr(kind, "__name__", ""))
+
+
+def _tagged_models(annotation: Any) -> dict[Key, type[BaseModel]]:
+    """Return the models of a union whose members have tags, by their tag; none if the annotation holds no such union."""
+    found: dict[Key, type[BaseModel]] = {}
+    for tag in getattr(annotation, "__metadata__", ()):
+        if isinstance(tag, Tag):
+            found[tag.tag] = annotation.__origin__
+    for arg in getattr(annotation, "__args__", ()):
+        found |= _tagged_models(arg)
+    return found
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -1,0 +1,1 @@
+"""The OPC UA server of a run (`serve` of kind `opcua`, extra `opcua`)."""

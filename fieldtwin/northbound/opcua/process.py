@@ -1,0 +1,143 @@
+"""The process of an OPC UA server: ``python -m fieldtwin.northbound.opcua.process CONFIG.json``.
+
+It reads numbers from the process image and texts from the gateway's control channel, and reports its status there. The gateway
+does nothing else for it, so that neither the library nor a client can delay the polling of a bus.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
+from fieldtwin.gateway.core.errors import Bug, EndpointBusy, FieldtwinError, Unreachable
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.opcua.config import OpcuaProcessConfig
+from fieldtwin.northbound.opcua.samples import ImageSamples, TextSamples
+from fieldtwin.northbound.opcua.server import OpcuaServer
+from fieldtwin.twin.plant.channel import Channel
+from fieldtwin.twin.plant.child_main import child_main
+from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
+from fieldtwin.twin.site.resolved import read_resolved
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.system import System
+
+TEXTS_EVERY_NS = NS_PER_S // 2
+REPORT_EVERY_NS = NS_PER_S
+LISTEN_EVERY_S = 1.0
+"""Pause in seconds before the server tries again to listen at an address that is taken."""
+STOPS_WITHIN_S = 1.0
+
+
+class OpcuaProcess:
+    """One OPC UA server with its connections to the run, which runs until it is stopped."""
+
+    def __init__(self, config: OpcuaProcessConfig) -> None:
+        run_dir = Path(config.run_dir)
+        [system] = read_resolved(config.resolved)
+        assert isinstance(system, System)
+        self._system = system
+        self._config = _server_of(system, config)
+        self._image = run_dir / "image"
+        self._clock = WallClock()
+        self._server = OpcuaServer(self._config, system, self._clock)
+        self._gateway = Channel(run_dir / "gateway.sock", "gateway")
+        self._reports = Channel(run_dir / "gateway.sock", "gateway")
+
+    async def run(self) -> int:
+        stop = stop_signal()
+        with attached(image_layout(self._system), self._image) as image:
+            async with Nursery() as nursery:
+                nursery.start(self._report(), "status reports")
+                serving = nursery.start(self._serve(image.reader(INPUTS), image.reader(OUTPUTS)), "server")
+                stopping = asyncio.ensure_future(stop.wait())
+                await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
+                stopping.cancel()
+                if serving.done():
+                    serving.result()
+            try:
+                async with asyncio.timeout(STOPS_WITHIN_S):
+                    await self._server.aclose()
+            except TimeoutError:
+                pass  # a client that does not read must not delay the end of the run
+        await self._gateway.aclose()
+        await self._reports.aclose()
+        return 0
+
+    async def _serve(self, inputs: RegionReader, outputs: RegionReader) -> None:
+        await self._server.build()
+        async with Nursery() as nursery:
+            nursery.start(self._follow_image(inputs, outputs), "process image")
+            if self._server.variables.texts:
+                nursery.start(self._follow_texts(), "texts")
+            nursery.start(self._listen(), "listener")
+            await nursery.wait()
+
+    async def _listen(self) -> None:
+        while True:
+            try:
+                return await self._server.listen()
+            except (EndpointBusy, Unreachable) as e:
+                self._server.error = str(e)
+            await asyncio.sleep(LISTEN_EVERY_S)
+
+    async def _follow_image(self, inputs: RegionReader, outputs: RegionReader) -> None:
+        variables, server = self._server.variables, self._server
+        every_ns = self._config.every_ms * NS_PER_MS
+        tags = ImageSamples(variables.inputs, gateway_lost_ms(self._system) * NS_PER_MS, Reason.GATEWAY_DEAD)
+        plc = ImageSamples(variables.outputs, plc_lost_ms(self._system) * NS_PER_MS, Reason.HEARTBEAT_LOST)
+        next_ns = self._clock.monotonic_ns()
+        while True:
+            now_ns = self._clock.monotonic_ns()
+            await server.publish(variables.inputs, tags.changes(inputs.snapshot(), now_ns))
+            await server.publish(variables.outputs, plc.changes(outputs.snapshot(), now_ns))
+            next_ns = max(next_ns + every_ns, now_ns)
+            await self._clock.sleep_until_ns(next_ns)
+
+    async def _follow_texts(self) -> None:
+        """Ask the gateway for all texts twice a second. They are bad while it does not answer."""
+        server, names = self._server, {name: name for name in self._server.variables.texts}
+        binary = [name for name in names if server.variables.data_types[name] == "ByteString"]
+        texts = TextSamples(names, binary)
+        while True:
+            now_ns = self._clock.monotonic_ns()
+            try:
+                answer = await self._gateway.call("watch", since=None, names=texts.names)
+            except FieldtwinError:
+                await server.publish(names, texts.lost(now_ns))
+            else:
+                await server.publish(names, texts.changes(answer["tags"], answer["now_ns"]))
+            await self._clock.sleep_until_ns(now_ns + TEXTS_EVERY_NS)
+
+    async def _report(self) -> None:
+        """Report the status to the gateway once a second. Without a gateway no client of its status exists either."""
+        while True:
+            try:
+                status = msgspec.to_builtins(self._server.status())
+                await self._reports.call("report", server=self._config.name, status=status)
+            except FieldtwinError:
+                pass
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + REPORT_EVERY_NS)
+
+
+def _server_of(system: System, config: OpcuaProcessConfig) -> OpcuaServeConfig:
+    for server in system.serving.for_run(allow_writes=False, free_ports=config.free_port).opcua:
+        if server.name == config.server:
+            return server
+    raise Bug(f"the system has no OPC UA server {config.server!r}")
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; an error is printed to stderr as one line."""
+    return child_main(argv, OpcuaProcessConfig, lambda config: OpcuaProcess(config).run())
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,177 @@
+"""The OPC UA server: its address space, and the present samples as values of its variables.
+
+Clients read and subscribe only. asyncua refuses every write, because no variable has the access level for it, and every change of
+the address space, because no client is an administrator.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import socket
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from asyncua import Server, ua
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, os_reason
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.northbound.opcua.address_space import Variables, build
+from fieldtwin.northbound.opcua.data_types import fitted
+from fieldtwin.northbound.opcua.node_writer import NodeWriter
+from fieldtwin.northbound.opcua.samples import Sample
+from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode
+from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig, url_of
+from fieldtwin.twin.site.system import System
+
+MAX_SUBSCRIPTIONS = 1000
+MAX_QUEUE = 1000
+"""The largest number of values that wait for a client for each monitored item; the oldest ones are dropped first."""
+MAX_LOGGED = 1000
+"""The largest number of messages of the library in the log of a run."""
+CLOCK_STEP_NS = 10 * NS_PER_MS
+"""If UTC differs by more than this from the expected time, the host's clock was set, and later source times follow it."""
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class OpcuaServer:
+    """The server of one `serve` section. Call `build`, then `listen`; `aclose` ends it."""
+
+    def __init__(self, config: OpcuaServeConfig, system: System, clock: Clock) -> None:
+        self.variables = Variables()
+        self.updates = 0
+        """Number of samples that were written to variables."""
+        self.error = ""
+        """The reason why the server does not listen; empty while it starts or listens."""
+        self._config = config
+        self._system = system
+        self._clock = clock
+        self._server = Server()
+        self._nodes: NodeWriter | None = None
+        self._listening = ""
+        self._utc_offset_ns = clock.utc_ns() - clock.monotonic_ns()
+        self._statuses: dict[StatusCode, ua.StatusCode] = {}
+        logging.getLogger("asyncua").addFilter(_FirstMessages())
+
+    async def build(self) -> None:
+        """Create the address space. Until its first sample, each variable waits for initial data."""
+        server = self._server
+        await server.init()
+        await server.set_application_uri(f"urn:fieldtwin:{self._system.name}:{self._config.name}")
+        server.set_server_name(f"fieldtwin {self._system.name}")
+        server.set_endpoint(self._config.url)
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        server.set_identity_tokens([ua.AnonymousIdentityToken])
+        server.iserver.max_connections = self._config.clients
+        server.iserver.max_subscriptions = MAX_SUBSCRIPTIONS
+        server.iserver.max_monitored_item_queue_size = MAX_QUEUE
+        await server.set_build_info(
+            "urn:fieldtwin", "fieldtwin", "fieldtwin gateway", __version__, "", datetime.fromtimestamp(0, UTC)
+        )
+        self._nodes, self.variables = await build(server, self._system)
+        waiting = Sample(None, BAD_CODES[Reason.NEVER_READ], 0)
+        for name in self.variables.data_types:
+            await self._write(name, waiting)
+
+    async def listen(self) -> None:
+        """Accept clients. Raises `EndpointBusy` or `Unreachable`; a later call tries again."""
+        port = self._config.port
+        try:
+            self._probe(port)
+            await self._server.start()
+        except OSError as e:
+            kind = EndpointBusy if e.errno == errno.EADDRINUSE else Unreachable
+            raise kind(f"cannot listen: {os_reason(e)}", where=self._config.url) from e
+        binary = self._server.bserver
+        assert binary is not None
+        self._listening = url_of(self._config.host, binary.port)
+        self.error = ""
+
+    def _probe(self, port: int) -> None:
+        """Raise `OSError` if the port is taken. asyncua cannot be started a second time after it has failed."""
+        family = socket.AF_INET6 if ":" in self._config.host else socket.AF_INET
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((self._config.host, port))
+
+    async def aclose(self) -> None:
+        """Disconnect the clients."""
+        if self._listening:
+            self._listening = ""
+            await self._server.stop()
+
+    def status(self) -> ServerStatus:
+        """Return where the server listens, its clients and its counters."""
+        binary = self._server.bserver
+        clients = [str(each.peer_name) for each in binary.clients] if binary is not None and self._listening else []
+        return ServerStatus(
+            listening=self._listening or None,
+            error=self.error,
+            counters={"updates": self.updates},
+            clients=clients,
+            kind="opcua",
+        )
+
+    async def publish(self, names: dict[str, str], changes: Iterable[tuple[str, Sample]]) -> None:
+        """Write samples to variables. `names` gives the variable of each tag."""
+        self._follow_utc()
+        for tag, sample in changes:
+            await self._write(names[tag], sample)
+            self.updates += 1
+
+    def _follow_utc(self) -> None:
+        offset_ns = self._clock.utc_ns() - self._clock.monotonic_ns()
+        if abs(offset_ns - self._utc_offset_ns) > CLOCK_STEP_NS:
+            self._utc_offset_ns = offset_ns
+
+    async def _write(self, name: str, sample: Sample) -> None:
+        kind = self.variables.data_types[name]
+        value = None if sample.value is None else fitted(sample.value, kind)
+        status = sample.status
+        if value is None and status.number < 0x8000_0000:  # the data type cannot hold the value
+            status = BAD_CODES[Reason.OUT_OF_RANGE]
+        await self._set(name, self._variant(value, kind), status, sample.source_ns)
+        if name in self.variables.words:
+            text = self.variables.words[name].get(int(value), "") if isinstance(value, int) else ""
+            shown = self._variant(ua.LocalizedText(text), "LocalizedText")
+            await self._set(f"{name}/{VALUE_AS_TEXT}", shown, status, sample.source_ns)
+        if name in self.variables.serials and value is not None:
+            shown = self._variant(str(value), "String")
+            await self._set(self.variables.serials[name], shown, status, sample.source_ns)
+
+    async def _set(self, name: str, value: ua.Variant, status: StatusCode, source_ns: int) -> None:
+        assert self._nodes is not None
+        data = ua.DataValue(
+            value,
+            self._statuses.setdefault(status, ua.StatusCode(status.number)),
+            SourceTimestamp=self._utc(source_ns),
+            ServerTimestamp=self._utc(self._clock.monotonic_ns()),
+        )
+        await self._server.write_attribute_value(self._nodes.id(name), data)
+
+    @staticmethod
+    def _variant(value: Any, kind: str) -> ua.Variant:
+        return ua.Variant(value, ua.VariantType.Null if value is None else ua.VariantType[kind])
+
+    def _utc(self, monotonic_ns: int) -> datetime | None:
+        """Return a monotonic time as UTC, to the microsecond; None for 0, which stands for no time."""
+        if not monotonic_ns:
+            return None
+        return _EPOCH + timedelta(microseconds=(monotonic_ns + self._utc_offset_ns) // 1000)
+
+
+class _FirstMessages(logging.Filter):
+    """Lets the first `MAX_LOGGED` messages pass, because a client can cause any number of them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed = 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        self._passed += 1
+        return self._passed <= MAX_LOGGED

@@ -1,0 +1,74 @@
+"""The forms of the `serve` section of a system file, one for each kind of server.
+
+A new kind is a form here with its own `kind`, an entry in `KINDS` and in `ServeForm`, and a resolver in
+`fieldtwin.twin.site.serving`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from fieldtwin.twin.site.base_forms import Address, SiteModel, TagName
+
+KINDS = ("modbus", "opcua")
+"""The kinds of servers. The first one is that of a server without `kind`."""
+
+
+class ServedTagForm(SiteModel):
+    """The place at which a tag is served: exactly one of the four tables, at a PDU address.
+
+    `type` is the type of the served value. A quality register holds 0 for good quality.
+    """
+
+    input: Address | None = None
+    holding: Address | None = None
+    discrete: Address | None = None
+    coil: Address | None = None
+    type: Literal["bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] | None = None
+    order: Literal["ABCD", "CDAB", "BADC", "DCBA"] = "ABCD"
+    quality: Address | None = Field(default=None, description="address of the tag's quality register")
+    write: bool = Field(default=False, description="clients may write it if the plant allows writes")
+
+
+class ModbusServeForm(SiteModel):
+    """The process image as Modbus TCP registers, for HMIs and other controllers."""
+
+    kind: Literal["modbus"] = "modbus"
+    url: str = Field(examples=["tcp://127.0.0.1:1502"])
+    unit: int = Field(default=1, ge=0, le=255)
+    tags: dict[TagName, ServedTagForm] = Field(min_length=1)
+    if_bad: Literal["exception", "nan"] = "exception"
+    networks: list[str] = Field(
+        default=["0.0.0.0/0", "::/0"], alias="from", description="the addresses that may connect"
+    )
+    clients: int = Field(default=16, ge=1, le=1000)
+    roles: list[str] | None = Field(
+        default=None, description="TLS: roles whose clients may read; default: every client"
+    )
+    write_roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may write as well")
+    idle_s: int = Field(
+        default=0, ge=0, le=86_400, description="silent clients are disconnected after this time; 0: never"
+    )
+
+
+class OpcuaServeForm(SiteModel):
+    """Every tag as a variable of an OPC UA server (IEC 62541), read-only. It listens on loopback only."""
+
+    kind: Literal["opcua"]
+    url: str = Field(examples=["opc.tcp://127.0.0.1:4840"])
+    every_ms: int = Field(default=100, ge=10, le=60_000, description="interval at which the process image is read, ms")
+    clients: int = Field(default=16, ge=1, le=1000)
+
+
+def kind_of(section: Any) -> Any:
+    """Return the kind that a server of the file states; that of a server without `kind` is `modbus`."""
+    return section.get("kind", KINDS[0]) if isinstance(section, dict) else getattr(section, "kind", KINDS[0])
+
+
+ServeForm = Annotated[
+    Annotated[ModbusServeForm, Tag("modbus")] | Annotated[OpcuaServeForm, Tag("opcua")],
+    Discriminator(kind_of),
+]
+"""One server of the `serve` section."""

@@ -1,0 +1,71 @@
+"""The servers of kind `opcua` in the `serve` section of a system file, resolved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from ipaddress import ip_address
+from urllib.parse import SplitResult, urlsplit
+
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
+from fieldtwin.twin.site.serve_forms import OpcuaServeForm
+
+SCHEME = "opc.tcp"
+URL = f"{SCHEME}://HOST:PORT, such as {SCHEME}://127.0.0.1:4840"
+
+
+@dataclass(frozen=True)
+class OpcuaServeConfig:
+    """The configuration of one OPC UA server. It reads the process image every `every_ms` milliseconds."""
+
+    name: str
+    host: str
+    port: int
+    every_ms: int = 100
+    clients: int = 16
+    kind: str = "opcua"
+
+    @property
+    def url(self) -> str:
+        """Return the address at which the server listens; with port 0 the operating system chooses a free one."""
+        return url_of(self.host, self.port)
+
+    def on_free_port(self) -> OpcuaServeConfig:
+        """Return the same server on a free port of its host."""
+        return replace(self, port=0)
+
+
+def url_of(host: str, port: int) -> str:
+    """Return the URL of an OPC UA server, with an IPv6 address in brackets."""
+    return f"{SCHEME}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def resolve_opcua(file: YamlFile, name: str, form: OpcuaServeForm) -> OpcuaServeConfig:
+    """Resolve and check one server. Raises `FileInvalid` with the place of its URL."""
+    loc: tuple[Key, ...] = ("serve", name, "url")
+    try:
+        parts = urlsplit(form.url)
+        port = parts.port
+    except ValueError:
+        raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url) from None
+    if parts.scheme != SCHEME or not parts.hostname or port is None or _has_more(parts):
+        raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url)
+    if not _is_loopback(parts.hostname):
+        raise file.error(
+            loc,
+            "an OPC UA server listens on loopback only, because it does not authenticate its clients",
+            expected="127.0.0.1 or ::1",
+            got=parts.hostname,
+            hint="use an SSH tunnel to reach it from a different computer",
+        )
+    return OpcuaServeConfig(name, parts.hostname, port, form.every_ms, form.clients)
+
+
+def _has_more(parts: SplitResult) -> bool:
+    return parts.path not in ("", "/") or bool(parts.query or parts.fragment or parts.username or parts.password)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

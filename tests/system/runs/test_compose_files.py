@@ -54,6 +54,7 @@ def test_profiles_have_the_services_that_they_are_for() -> None:
     assert profile("twin") == {"field", "controller-twin", "topside-twin", "broker", "shadow", "twin"}
     assert profile("vcan") == {"vcan", "field-vcan", "controller-vcan"}
     assert profile("own-plc") == {"field-own-plc"}
+    assert profile("monitoring") == {"field", "controller-monitored", "prometheus", "grafana"}
     assert (CHECKOUT / ".env").read_text(encoding="utf-8").splitlines()[-1] == "COMPOSE_PROFILES=prototype"
 
 
@@ -64,7 +65,7 @@ def test_a_dependency_starts_in_the_same_profile() -> None:
             assert set(service["profiles"]) <= set(SERVICES[other]["profiles"]), (name, other)
 
 
-def test_no_privileges_but_one_and_no_published_ports_but_one() -> None:
+def test_no_privileges_but_one_and_ports_are_published_on_loopback_only() -> None:
     for name, service in SERVICES.items():
         assert service["read_only"] is True, name
         assert service["cap_drop"] == ["ALL"], name
@@ -77,14 +78,20 @@ def test_no_privileges_but_one_and_no_published_ports_but_one() -> None:
         "controller-physical", *profile("vcan"),
     }  # fmt: skip
     ports = {n: s["ports"] for n, s in SERVICES.items() if "ports" in s}
-    assert ports == {"field-own-plc": ["${FIELDTWIN_BIND:-127.0.0.1}:${FIELDTWIN_PORT:-1502}:1502"]}
+    assert ports == {
+        "field-own-plc": ["${FIELDTWIN_BIND:-127.0.0.1}:${FIELDTWIN_PORT:-1502}:1502"],
+        "prometheus": ["127.0.0.1:${FIELDTWIN_PROMETHEUS_PORT:-9090}:9090"],
+        "grafana": ["127.0.0.1:${FIELDTWIN_GRAFANA_PORT:-3000}:3000"],
+    }
     assert COMPOSE["networks"]["field"] == {"internal": True}
     assert re.search(r"^USER fieldtwin$", DOCKERFILE, re.MULTILINE)
 
 
-def test_one_image_and_the_broker_s() -> None:
-    images = {service["image"] for service in SERVICES.values()}
-    assert images == {"fieldtwin:compose", "eclipse-mosquitto:2"}
+def test_one_image_of_ours_and_three_public_ones() -> None:
+    images = {re.sub(VARIABLE, r"\1", service["image"]) for service in SERVICES.values()}
+    assert images == {
+        "fieldtwin:compose", "eclipse-mosquitto:2", "prom/prometheus:v3.5.0", "grafana/grafana:12.0.2",
+    }  # fmt: skip
     assert {s["build"] for s in OURS.values()} == {"."}
 
 
@@ -147,10 +154,28 @@ def test_the_memory_disk_is_the_run_directory_and_belongs_to_the_image_s_user() 
     plain = [f"{match[1]}/observatory/{p}.sock" for p in ("gateway", "plc")]
     assert checked["field"] == checked["field-vcan"] == [f"{match[1]}/observatory-field/field.sock"]
     assert checked["controller"] == checked["controller-twin"] == checked["controller-vcan"] == plain
+    assert checked["controller-monitored"] == plain
     assert checked["controller-physical"] == [f"{match[1]}/plant/{p}.sock" for p in ("gateway", "plc")]
     assert checked["field-own-plc"] == [f"{match[1]}/field/field.sock"]
     assert checked["shadow"] == [f"{match[1]}/observatory-shadow/{Shadowing.kind}.sock"]
     assert checked["twin"] == [f"{match[1]}/observatory-twin/{Twinning.kind}.sock"]
+
+
+def test_prometheus_and_grafana_find_what_the_profile_mounts() -> None:
+    monitoring = CHECKOUT / "packaging" / "monitoring"
+    config = yaml.safe_load((monitoring / "prometheus.yml").read_text(encoding="utf-8"))
+    (job,) = config["scrape_configs"]
+    metrics = SERVICES["controller-monitored"]["environment"]["FIELDTWIN_RUN_METRICS"]
+    assert job["static_configs"] == [{"targets": [f"controller-monitored:{metrics.partition(':')[2]}"]}]
+    assert all((monitoring / name).is_file() for name in config["rule_files"])
+    (source,) = yaml.safe_load((monitoring / "grafana/datasources/prometheus.yml").read_text())["datasources"]
+    assert source["url"] == "http://prometheus:9090"
+    assert source["jsonData"]["timeInterval"] == config["global"]["scrape_interval"]
+    (provider,) = yaml.safe_load((monitoring / "grafana/dashboards/fieldtwin.yml").read_text())["providers"]
+    inside = [volume.split(":")[1] for volume in SERVICES["grafana"]["volumes"]]
+    assert inside == ["/etc/grafana/provisioning", f"{provider['options']['path']}/fieldtwin.dashboard.json"]
+    home = SERVICES["grafana"]["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"]
+    assert home == inside[1]
 
 
 def test_stores_are_in_folders_that_the_images_user_may_write() -> None:

@@ -44,6 +44,12 @@ _OBJECTS = {
     "objects": "which objects become tags: application (2000h to 9FFFh, and the identity), pdo (mapped into PDOs), or all",
 }
 
+_ONE_DEVICE = {
+    "device": "name of the profile, MAKER/TYPE",
+    "select": "the device, if the file has several: its name, unit ID, or NAME/UNIT",
+}
+_ENDPOINT = {"endpoint": "endpoint of the device, such as tcp://192.168.0.7 or rtu:/dev/ttyUSB0"}
+
 FORMATS: dict[str, Format] = {
     row.name: row
     for row in (
@@ -66,6 +72,67 @@ FORMATS: dict[str, Format] = {
             | {
                 "bitrate": "bit rate in kbit/s, 10 to 1000",
                 "OBJECT": "value that the DCF sets, for instance 1017:00=500",
+            },
+        ),
+        Format(
+            "telegraf",
+            ".conf",
+            "inputs.modbus of Telegraf",
+            "the registers that Telegraf reads",
+            "fieldtwin.descriptions.maps.telegraf",
+            import_settings=_ONE_DEVICE,
+            export_settings=_ENDPOINT | {"style": "request (usual) or register"},
+        ),
+        Format(
+            "home-assistant",
+            ".yaml",
+            "modbus of Home Assistant",
+            "sensors, binary sensors and switches",
+            "fieldtwin.descriptions.maps.home_assistant",
+            import_settings=_ONE_DEVICE,
+            export_settings=_ENDPOINT,
+        ),
+        Format(
+            "thingsboard",
+            ".json",
+            "Modbus connector of ThingsBoard's gateway",
+            "attributes, time series, attribute updates and RPC",
+            "fieldtwin.descriptions.maps.thingsboard",
+            import_settings=_ONE_DEVICE,
+            export_settings=_ENDPOINT,
+        ),
+        Format(
+            "neuron",
+            ".csv",
+            "tags of EMQX Neuron's Modbus drivers",
+            "groups of tags",
+            "fieldtwin.descriptions.maps.neuron",
+            import_settings=_ONE_DEVICE | {"start": "start address of the driver, 0 or 1 (usual)"},
+        ),
+        Format(
+            "node-red",
+            ".json",
+            "flow of Node-RED with node-red-contrib-modbus",
+            "requests without types",
+            "fieldtwin.descriptions.maps.node_red",
+            import_settings=_ONE_DEVICE,
+            export_settings=_ENDPOINT,
+        ),
+        Format(
+            "sunspec",
+            ".json",
+            "SunSpec model definition",
+            "the points of one model at a base address",
+            "fieldtwin.descriptions.maps.sunspec",
+            import_settings={
+                "device": "name of the profile, MAKER/TYPE",
+                "base": "register of the point ID, as sent",
+                "repeat": "repetitions of repeating groups, 0 to 100; default 1",
+            },
+            export_settings={
+                "model": "number of the model",
+                "base": "register of the point ID, as sent",
+                "length": "registers after the point L; default: up to the last tag",
             },
         ),
     )

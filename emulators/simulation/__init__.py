@@ -1,3 +1,3 @@
-"""Simulated values for emulated devices, instead of recordings: from formulas or a Python model, in steps of the emulator's
-clock.
+"""Simulated values for emulated devices, instead of recordings: from formulas, a Python model or an FMU, in steps of the
+emulator's clock.
 """

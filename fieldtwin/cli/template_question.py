@@ -18,7 +18,7 @@ from fieldtwin.run.template import Ask, ForeignParts
 SHOWN = 5
 TRUST: dict[str, Any] = {
     "is_flag": True,
-    "help": "Do not ask before running a template's Python code and opening its endpoints.",
+    "help": "Do not ask before running a template's code and opening its endpoints.",
 }
 """The arguments of the option --trust."""
 
@@ -43,11 +43,19 @@ def shown(what: tuple[str, ...], between: str = ", ") -> str:
     return escape(between.join(what[:SHOWN])) + more
 
 
+def code_of(files: tuple[str, ...]) -> list[str]:
+    """Return what a message calls the code files of a template: control logic, and FMUs if there are any."""
+    native = tuple(file for file in files if file.lower().endswith(".fmu"))
+    python = tuple(file for file in files if file not in native)
+    texts = [f"control logic in Python: {shown(python)}"] if python else []
+    return texts + ([f"FMUs, which are native code: {shown(native)}"] if native else [])
+
+
 def ask_about(template: ForeignParts) -> bool:
     """Print what a template contains and ask whether it may run. Without a terminal the answer is no."""
-    if template.code:
+    for code in code_of(template.code):
         stderr.print(
-            f"{escape(str(template.path))} contains control logic in Python: {shown(template.code)}.\n"
+            f"{escape(str(template.path))} contains {code}.\n"
             "When run, this program can do everything on this computer that you can do.",
             soft_wrap=True,
         )

@@ -152,12 +152,16 @@ def _beside(system: System) -> Path | None:
 
 
 def _of_prototype(system: System, file: Path, folders: Iterable[Path]) -> tuple[list[str], tuple[str, ...]]:
-    """Return the Python simulations from outside the templates, and the resources of this computer that the prototype uses."""
+    """Return the Python simulations and FMUs from outside the templates, and the resources of this computer that the prototype
+    uses.
+    """
     from fieldtwin.twin.prototype.file import load_prototype
     from fieldtwin.twin.template.reach import reach
 
     prototype = load_prototype(system, file)
-    named = [form.python.rpartition(":")[0] for form in prototype.form.simulations.values() if form.python is not None]
+    simulations = prototype.form.simulations.values()
+    named = [form.python.rpartition(":")[0] for form in simulations if form.python is not None]
+    named += [form.fmu for form in simulations if form.fmu is not None]
     sources = [(file.parent / name).resolve() for name in named]
     outside = [str(source) for source in sources if not any(source.is_relative_to(folder) for folder in folders)]
     return outside, reach(system, prototype)

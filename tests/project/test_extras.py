@@ -15,6 +15,7 @@ import pytest
 from fieldtwin.capture.formats.mcap_file import McapFile
 from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
 from fieldtwin.commissioning.access.plotting import check_plot
+from fieldtwin.emulators.simulation.fmu.description import describe
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
@@ -54,11 +55,17 @@ def use_mcap(folder: Path) -> None:
     McapFile(folder / "x.mcap", {})
 
 
+def use_fmi(folder: Path) -> None:
+    (folder / "tank.fmu").write_bytes(b"")
+    describe(folder / "tank.fmu")
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "opcua": ("asyncua", use_opcua, ""),
     "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "plot": ("matplotlib", use_plot, ""),
+    "fmi": ("fmpy", use_fmi, ""),
     "parquet": ("pyarrow", use_parquet, ""),
     "mcap": ("mcap", use_mcap, ""),
 }

@@ -7,6 +7,7 @@ of that bus. This module connects the emulators to the system file; it does not 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,6 +128,7 @@ class FieldSimulator:
         self._water = water or {}
         self._tracks: dict[Path, SignalTrack] = {}
         self._replays: dict[tuple[Path, str, str, EndOfRecording], tuple[ExchangeReplay, int]] = {}
+        self._to_close = ExitStack()
 
     async def open(self) -> None:
         """Create the emulators and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays
@@ -136,6 +138,7 @@ class FieldSimulator:
             self._simulations = Simulations(
                 self.prototype.file, self.prototype.form, self.system, self._clock.monotonic_ns()
             )
+            self._to_close.callback(self._simulations.close)
             for bus in self.prototype.buses.values():
                 if bus.listen is not None:
                     await self._open_bus(bus, bus.listen)
@@ -154,8 +157,15 @@ class FieldSimulator:
         await self._host.run()
 
     async def aclose(self) -> None:
-        """Stop every emulator and close every connection."""
-        await self._host.aclose()
+        """Stop every emulator, close every connection, and end the simulations."""
+        try:
+            await self._host.aclose()
+        finally:
+            self._to_close.close()
+
+    def end_simulations(self) -> None:
+        """End the processes of simulations, of devices that are not served any more."""
+        self._to_close.close()
 
     async def join(self, bus: str, name: str) -> CanConnection:
         """Join an emulated CAN bus as a passive listener. The caller closes the connection."""

@@ -226,6 +226,7 @@ class FieldProcess:
     async def _recreate(self) -> None:
         """Create all devices again from the same prototype, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
+        old.end_simulations()
         prototype = _listening_as(self._twin.prototype, old)
         self._field = FieldSimulator(old.system, prototype, Path(self._config.run_dir), self._clock)
         try:

@@ -4,23 +4,26 @@ to these devices.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 
 from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.models.modbus.sampled_sensor import sampled_tags
+from fieldtwin.emulators.simulation.fmu.process import FmuProcess
 from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula, uses_time
 from fieldtwin.emulators.simulation.inputs import number_of
 from fieldtwin.emulators.simulation.python_model import PythonModel
 from fieldtwin.emulators.simulation.signals import SimulatedSignals
-from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
+from fieldtwin.emulators.simulation.simulation import Simulation, Step, by_formulas, by_model
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.yaml_file import YamlFile
+from fieldtwin.twin.prototype.fmus import bind_fmu, fmu_process
 from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm, SimulationForm
 from fieldtwin.twin.site.system import System
 
@@ -52,8 +55,13 @@ def check_simulations(file: YamlFile, form: PrototypeForm, system: System, error
 
 def _check_source(file: YamlFile, simulation: SimulationForm, name: str) -> None:
     loc = ("simulations", name)
-    if (simulation.python is None) == (not simulation.formulas):
-        raise file.error(loc, f"the simulation of {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`")
+    if [bool(simulation.formulas), simulation.python is not None, simulation.fmu is not None].count(True) != 1:
+        expected = "one of `formulas:`, `python: FILE.py:CLASS` and `fmu: FILE.fmu`"
+        raise file.error(loc, f"the source of the simulation {name!r}", expected=expected)
+    if simulation.fmu is None and simulation.variables:
+        raise file.error((*loc, "variables"), "`variables` belongs to an FMU", expected="`fmu: FILE.fmu` beside it")
+    if simulation.fmu is not None:
+        bind_fmu(file, simulation, name)
     if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
         raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
 
@@ -79,10 +87,22 @@ def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceP
                 hint=did_you_mean(tag, numbers),
             )
             errors.add(error)
-        simulation = form.simulations.get(device.simulation or "")
-        formulas = simulation.formulas if simulation is not None else {}
-        if formulas and value not in formulas:
-            errors.add(file.error(loc, f"no formula or step computes {value!r}", expected=", ".join(formulas)))
+        computed = _computed(file, form, device.simulation or "")
+        if computed and value not in computed:
+            errors.add(file.error(loc, f"no formula or step computes {value!r}", expected=", ".join(computed)))
+
+
+def _computed(file: YamlFile, form: PrototypeForm, name: str) -> tuple[str, ...]:
+    """Return the names that a simulation computes, as far as they are known before it runs."""
+    simulation = form.simulations.get(name)
+    if simulation is None:
+        return ()
+    if simulation.fmu is None:
+        return tuple(simulation.formulas)
+    try:
+        return tuple(bind_fmu(file, simulation, name).outputs)
+    except FieldtwinError:  # check_simulations reports it
+        return ()
 
 
 def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> None:
@@ -125,18 +145,28 @@ def _python(file: YamlFile, text: str) -> tuple[Path, str]:
 
 
 class Simulations:
-    """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that fails."""
+    """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that fails.
+
+    An FMU runs from the first step until `close`.
+    """
 
     def __init__(self, file: YamlFile, form: PrototypeForm, system: System, start_ns: int) -> None:
         self._file, self._form, self._system = file, form, system
+        self._fmus: list[FmuProcess] = []
         self._made = {name: self._make(name, simulation, start_ns) for name, simulation in form.simulations.items()}
 
     def _make(self, name: str, form: SimulationForm, start_ns: int) -> Simulation:
         inputs = tuple(form.inputs)
-        if form.python is None:
-            step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
-        else:
+        step: Step
+        if form.fmu is not None:
+            binding = bind_fmu(self._file, form, name)
+            fmu = fmu_process(name, form, binding)
+            self._fmus.append(fmu)
+            step, start = fmu.step, dict.fromkeys(binding.outputs, math.nan)  # the first step reads the outputs
+        elif form.python is not None:
             step, start = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
+        else:
+            step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
         of_time = any(uses_time(text) for text in form.formulas.values())
         return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS), of_time)
 
@@ -171,6 +201,11 @@ class Simulations:
                     got=", ".join(plays),
                 )
         return SimulatedSignals(simulation, plays, self._file.path)
+
+    def close(self) -> None:
+        """End the processes of the FMUs."""
+        for fmu in self._fmus:
+            fmu.close()
 
     def connect(self, journals: Mapping[str, DeviceValueLog]) -> None:
         """Feed values that are written to devices into the simulations, from now on."""

@@ -341,14 +341,23 @@ Formula = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | 
 
 
 class SimulationForm(SiteModel):
-    """A simulation: values that formulas or a Python class compute step by step."""
+    """A simulation: values that formulas, a Python class or an FMU compute step by step."""
 
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
     formulas: dict[Name, Formula] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
     python: str | None = Field(
         default=None, description="FILE.py:CLASS, beside this file; it has step(t_s, dt_s, inputs)"
     )
-    start: dict[Name, float] = Field(default={}, description="name -> its value before the first step")
+    fmu: str | None = Field(
+        default=None, description="FILE.fmu, beside this file: FMI 2.0 or 3.0, co-simulation", examples=["tank.fmu"]
+    )
+    variables: dict[Name, str] = Field(
+        default={}, description="FMU: name -> the FMU's variable; default: equal names", examples=[{"level": "tank.h"}]
+    )
+    limit_ms: Milliseconds = Field(default=5000, description="FMU: the longest real time of one step")
+    start: dict[Name, float] = Field(
+        default={}, description="name -> its value before the first step; FMU: also the values of parameters"
+    )
     inputs: dict[Name, TagName] = Field(default={}, description="name -> DEVICE.TAG, as the device holds it")
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)

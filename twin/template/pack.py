@@ -140,6 +140,8 @@ def _prototype(got: Collected, system: System, path: Path) -> None:
         if device.form.profile is not None:
             _profile(got, path, device.form.profile, device.profile)
     for simulation in prototype.form.simulations.values():
+        if simulation.fmu is not None:
+            got.add(_place("systems", simulation.fmu, path), Item("program", path.parent / simulation.fmu))
         if simulation.python is not None:
             name = simulation.python.rpartition(":")[0]
             source = path.parent / name

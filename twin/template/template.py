@@ -37,8 +37,10 @@ Kind = Literal[
     "system", "prototype", "program", "profile", "eds", "dcf", "recording", "model", "software", "document"
 ]  # fmt: skip
 DocumentKind = Literal["", "blueprint", "technical-manual", "bill-of-materials", "generic"]
-CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth")
-"""Suffixes of files that Python runs when a module is imported, or when the file is named as a simulation."""
+CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth", ".fmu")
+"""Suffixes of files that Python runs when a module is imported, or when the file is named as a simulation, and of FMUs, which
+contain native code.
+"""
 
 _BAD_CHARACTER = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 _DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
@@ -47,7 +49,7 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 
 
 def is_code(path: str) -> bool:
-    """Return whether Python would run the file when it is imported or named as a simulation."""
+    """Return whether the file can be run when it is imported or named as a simulation."""
     return path.lower().endswith(CODE_SUFFIXES)
 
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
-from fieldtwin.cli.template_question import ask_about, shown
+from fieldtwin.cli.template_question import ask_about, code_of
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.escaping import escape_controls
@@ -116,11 +116,8 @@ def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
     stderr.print(
         f"{escape(str(out))}: {len(manifest.files)} files, as packed; template {manifest.id[:16]}", soft_wrap=True
     )
-    if manifest.code:
-        stderr.print(
-            f"control logic in Python, not run: {shown(manifest.code)}. Read it before you run it.",
-            soft_wrap=True,
-        )
+    for code in code_of(manifest.code):
+        stderr.print(f"not run: {code}. Read it, or know its author, before you run it.", soft_wrap=True)
     return 0
 
 

@@ -1,0 +1,112 @@
+"""FMUs in runs: the same trace each time, two FMUs that are coupled through devices, and failures that end a run."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from fmu_rig import build_fmu, in_prototype, needs_gcc, tank_site
+
+from fieldtwin.cli.main import cli
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
+
+pytestmark = needs_gcc
+
+
+def scenario(system: Path, target: str, *steps: str) -> ScenarioResult:
+    path = system.with_name("test.scenario.yaml")
+    lines = ["scenario: a test", f"system: {system.name}", "steps:", *(f"  - {step}" for step in steps)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return run_scenario(load_scenario(path), ScenarioTarget(target))
+
+
+def trace_of(system: Path) -> str:
+    out = system.with_name("run.trace.jsonl")
+    ended = CliRunner().invoke(
+        cli, ["simulate", str(system), "--for", "8s", "--seed", "3", "--trace", str(out)], standalone_mode=False
+    )
+    assert ended.exit_code == 0, (ended.output, ended.exception)
+    return hashlib.sha256(out.read_bytes()).hexdigest()
+
+
+def test_the_same_seed_and_fmu_give_the_same_trace(tmp_path: Path) -> None:
+    first, again = trace_of(tank_site(tmp_path / "a")), trace_of(tank_site(tmp_path / "b"))
+    assert first == again
+    other = tank_site(tmp_path / "c")
+    in_prototype(other, "area: 0.8", "area: 0.9")
+    assert trace_of(other) != first, "the trace contains the values of the FMU"
+
+
+def test_the_pump_of_the_plant_fills_the_tank_of_the_fmu(tmp_path: Path) -> None:
+    result = scenario(
+        tank_site(tmp_path, 3), "virtual", 'wait: {until: "pump.run", within: 30s}',
+        'wait: {until: "sensor.level > 1.4", within: 20s}',
+    )  # fmt: skip
+    assert result.verdict is Verdict.PASSED, result
+
+
+def test_two_fmus_are_coupled_through_devices(tmp_path: Path) -> None:
+    """The outflow that the first device measures flows into the second tank, which has no outlet: no water is lost."""
+    system = tank_site(tmp_path)
+    build_fmu(tmp_path / "lower.fmu", 3)
+    text = system.read_text()
+    system.write_text(
+        text.replace("  pump:", "  lower: {profile: ./level.yaml, bus: line1, unit: 3, poll: {values: {every_ms: 250}}}\n  pump:")
+    )  # fmt: skip
+    in_prototype(
+        system,
+        "devices:\n",
+        "  basin:\n    fmu: lower.fmu\n    step_ms: 50\n    variables: {outlet: outlet.k}\n"
+        "    start: {level: 0.2, area: 0.8, outlet: 0}\n    inputs: {inflow: sensor.outflow}\n"
+        "devices:\n  lower: {simulation: basin}\n",
+    )
+    result = scenario(
+        system, "virtual", 'wait: {until: "lower.level > 0.5", within: 15s}',
+        'expect: {that: "sensor.level + lower.level > 1.66 and sensor.level + lower.level < 1.74", during: 1s}',
+    )  # fmt: skip
+    assert result.verdict is Verdict.PASSED, result
+
+
+@pytest.mark.parametrize(
+    ("fails", "message"),
+    [
+        ("crash", "its process has ended during the step to 0.7 s: SIGSEGV"),
+        ("error", "the step to 0.7 s failed: fmi2DoStep failed with status 3"),
+        ("not a number", "the output 'outflow' is nan at 0.7 s"),
+        ("endless", "the step to "),
+    ],
+)
+def test_a_failure_ends_a_scenario_with_its_reason(tmp_path: Path, fails: str, message: str) -> None:
+    system = tank_site(tmp_path, fails=fails)
+    in_prototype(system, "step_ms: 100", "step_ms: 100\n    limit_ms: 3000")
+    result = scenario(system, "virtual", 'expect: {that: "sensor.level > 0", during: 5s}')
+    assert result.verdict is Verdict.ERROR, result
+    assert f"tank.fmu: the FMU of the simulation 'water' failed: {message}" in result.reason
+
+
+@pytest.mark.long
+def test_a_failure_ends_a_run_in_real_time_too(tmp_path: Path) -> None:
+    result = scenario(tank_site(tmp_path, fails="crash"), "local", 'expect: {that: "sensor.level > 0", during: 5s}')
+    assert result.verdict is Verdict.ERROR, result
+    assert "during the step to 0.7 s: SIGSEGV" in result.reason
+
+
+def test_an_fmu_of_a_template_runs_after_a_confirmation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "run"))
+    system, zipped = tank_site(tmp_path / "site"), tmp_path / "T.zip"
+    prototype = system.with_name("tank.prototype.yaml")
+    for argv in (
+        ["template", "pack", str(system), "-o", str(zipped), "--prototype-file", str(prototype)],
+        ["simulate", str(zipped), "--for", "1s"],
+        ["simulate", str(zipped), "--for", "1s", "--trust"],
+    ):
+        ended = CliRunner().invoke(cli, argv, standalone_mode=False)
+        if argv[-1] == "1s":
+            assert "contains FMUs, which are native code: systems/tank.fmu" in ended.stderr
+            assert "nothing of this template was run" in str(ended.exception)
+        else:
+            assert ended.exit_code == 0, (ended.output, ended.exception)

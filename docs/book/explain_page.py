@@ -14,6 +14,7 @@ HEADINGS = {
     "quality reason": "Reasons for a quality",
     "error": "Errors",
     "exit code": "Exit codes",
+    "verdict": "Verdicts of test cases",
     "fault": "Faults",
 }
 

@@ -14,6 +14,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
+from fieldtwin.gateway.devices.data_sheet import check_data_sheet
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
 from fieldtwin.new_site.limits import NEVER_POLLED, Limits, Output, commanded, limits_of, supervised
 from fieldtwin.new_site.wishes import EXAMPLE, LONGEST_NAME, MOST_DEVICES, DeviceWish, name_from
@@ -163,6 +164,7 @@ def _profile(wish: DeviceWish, profiles: tuple[Path, ...]) -> tuple[DeviceProfil
     if is_shipped(path):
         return load_profile(path), path.stem, {}
     profile = load_profile(path)
+    check_data_sheet(profile)
     file_name = f"{wish.name}.yaml"
     files = {file_name: _text(path)}
     if profile.eds_path is not None:

@@ -24,6 +24,7 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.gateway.devices.data_sheet import check_data_sheet
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.scenarios.judging.waiving import ids_of
 from fieldtwin.scenarios.language.form import load_scenario
@@ -124,7 +125,7 @@ class _Site:
     def check(self) -> None:
         for path in self._of("device"):
             with self._errors.collect():
-                load_profile(path)
+                check_data_sheet(load_profile(path))
         for path in self._of("system"):
             self._check_system(path)
         for path in self._of("prototype"):
@@ -179,7 +180,8 @@ class _Site:
             system = load_system(str(path), self._profiles, self._errors)
             self._systems[path] = system
             invariants_of(system, errors=self._errors)
-            if len(self._errors.errors) == before:
+            complete = system.devices.keys() == system.file.data["devices"].keys()  # else a device has an error
+            if complete and len(self._errors.errors) == before:
                 self._found.warnings += system.warnings
                 image_layout(system)
 

@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from fieldtwin.gateway.devices.data_sheet import check_data_sheet
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.exported_tags import ExportedTag, resolve_exported_tags
@@ -160,7 +161,11 @@ def _device(
         )
     try:
         found = find("devices", d.profile, beside=path, extra=profiles)
-        profile = known[found] if found in known else known.setdefault(found, load_profile(found))
+        if found not in known:
+            profile = load_profile(found)
+            check_data_sheet(profile)
+            known[found] = profile
+        profile = known[found]
     except UsageError as e:
         raise file.error((*loc, "profile"), e.message, expected=e.expected, hint=e.hint) from e
     is_can = buses[d.bus].endpoint.is_can

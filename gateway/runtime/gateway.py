@@ -42,7 +42,8 @@ _NUMBERS = (int, float)
 class GatewayConfig:
     """The configuration of a gateway.
 
-    When the PLC's last scan is older than `plc_lost_ms`, the gateway no longer follows its outputs.
+    When the PLC's last scan is older than `plc_lost_ms`, the gateway no longer follows its outputs. `allow_writes` applies to all
+    buses except those in `read_only`.
     """
 
     buses: dict[str, BusConfig]
@@ -52,11 +53,16 @@ class GatewayConfig:
     outputs: frozenset[str] = field(default_factory=frozenset)
     log_tags: frozenset[str] = field(default_factory=frozenset)
     allow_writes: bool = False
+    read_only: frozenset[str] = frozenset()
     remote: bool = False
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()
     delegated: frozenset[str] = frozenset()
     """Names of the transmitters (modems) whose mailboxes a digital thread reads and writes instead of the gateway."""
+
+    def may_write(self, bus: str) -> bool:
+        """Return whether the gateway may write to the devices of a bus."""
+        return self.allow_writes and bus not in self.read_only
 
 
 def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
@@ -115,13 +121,15 @@ class Gateway:
         for n, bus in enumerate(config.buses.values()):
             self._make_bus(bus, connector, n / len(config.buses))
         self.bridges = [Bridge(b, self._modbus, connector, clock, audit, self._blocked, listen) for b in config.bridges]
-        self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
+        self.outputs = OutputWriter(
+            self._make_outputs(), self.tags, audit, config.allow_writes, read_only=config.read_only
+        )
         self.pumps = [
             MailboxPump(
                 d,
                 self._modbus[d.config.bus],
                 audit,
-                allow_writes=config.allow_writes,
+                allow_writes=config.may_write(d.config.bus),
                 remote=config.remote,
                 delegated=d.config.name in config.delegated,
                 taken=taken,
@@ -145,14 +153,21 @@ class Gateway:
         """Allow or forbid the driver to write the register that starts a measurement of its device, as configured."""
         device, trigger = driver.config, driver.config.profile.form.trigger
         if isinstance(driver, RegisterDriver) and trigger is not None:
-            driver.may_trigger = self.config.allow_writes and trigger.tag in device.writable
+            driver.may_trigger = self.config.may_write(device.bus) and trigger.tag in device.writable
 
     def _make_bus(self, bus: BusConfig, connector: Connector, offset: float) -> None:
         on_it = [d for d in self.drivers.values() if d.config.bus == bus.name]
         if bus.endpoint.is_can:
             nodes = [d for d in on_it if isinstance(d, CanopenDriver)]
             self.buses[bus.name] = CanopenBus(
-                bus, nodes, connector, self.clock, self.tags, self._audit, self.config.allow_writes, self._on_offline
+                bus,
+                nodes,
+                connector,
+                self.clock,
+                self.tags,
+                self._audit,
+                self.config.may_write(bus.name),
+                self._on_offline,
             )
         elif on_it or any(bus.name in b.buses for b in self.config.bridges):
             units = [d for d in on_it if isinstance(d, RegisterDriver)]

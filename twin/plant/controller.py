@@ -61,12 +61,13 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of the process.
 
     `mapping` gives for each endpoint of the plant the endpoint that is opened instead; None on a plant. `capture` is the file
-    in which bus traffic is recorded; empty for none.
+    in which bus traffic is recorded; empty for none. `allow_writes` does not apply to the buses in `read_only`.
     """
 
     system: str
     run_dir: str
     allow_writes: bool
+    read_only: tuple[str, ...] = ()
     mapping: dict[str, str] | None = None
     profiles: tuple[str, ...] = ()
     capture: str = ""
@@ -124,6 +125,7 @@ class GatewayProcess:
                     audit,
                     log,
                     allow_writes=self._config.allow_writes,
+                    read_only=self._config.read_only,
                     free_ports=self._config.mapping is not None,
                     delegated=self._config.delegated,
                     taken=AckedCommandStore(run_dir / f"taken{of}.json"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -197,18 +197,19 @@ def gateway_config(
     system: System,
     *,
     allow_writes: bool,
+    read_only: Collection[str] = (),
     free_ports: bool = False,
     true_silences: bool | None = None,
     delegated: Sequence[str] = (),
 ) -> GatewayConfig:
-    """Return the gateway's configuration.
+    """Return the gateway's configuration. With `allow_writes` it may write to the devices of all buses but `read_only`.
 
     With `free_ports` it serves and bridges on free ports, so that several gateways can run on one host. Without
     `true_silences` no serial line checks the pauses in RTU frames, because pauses on virtual ports carry no information;
     `free_ports` implies this by default. The mailboxes of the transmitters in `delegated` are delegated to a digital thread.
     """
     true_silences = not free_ports if true_silences is None else true_silences
-    serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
+    serving = system.serving.for_run(allow_writes=allow_writes, read_only=read_only, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
         buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
@@ -218,6 +219,7 @@ def gateway_config(
         outputs=frozenset(outputs),
         log_tags=frozenset(f"{name}.log" for name in system.plc.programs),
         allow_writes=allow_writes,
+        read_only=frozenset(read_only),
         remote=system.remote == "remote",
         serve=serving.serve,
         bridges=serving.bridges,
@@ -308,6 +310,7 @@ class EmbeddedControlSystem:
         log: ExchangeLog,
         *,
         allow_writes: bool,
+        read_only: Collection[str] = (),
         free_ports: bool = False,
         true_silences: bool | None = None,
         listen: Listen = TcpListener.open,
@@ -322,6 +325,7 @@ class EmbeddedControlSystem:
         config = gateway_config(
             self.system,
             allow_writes=allow_writes,
+            read_only=read_only,
             free_ports=free_ports,
             true_silences=true_silences,
             delegated=delegated,

@@ -7,7 +7,7 @@ registers, unknown buses, invalid ranges. Nothing is opened here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from fieldtwin.gateway.connections.sockets.tls_listen import check_files
@@ -47,13 +47,16 @@ class Serving:
         """Return the servers that run in separate processes."""
         return self.opcua
 
-    def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
-        """Return the sections as a gateway runs them.
+    def for_run(self, *, allow_writes: bool, free_ports: bool, read_only: Collection[str] = ()) -> Serving:
+        """Return the sections as a gateway runs them. A bridge to a bus in `read_only` passes no writes.
 
         With `free_ports` (a prototype) sockets take a free port of the same host. In a prototype the connector also opens a
         different port in place of a serial line.
         """
-        bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
+        bridges = [
+            replace(b, policy=replace(b.policy, allow_writes=allow_writes and b.buses.isdisjoint(read_only)))
+            for b in self.bridges
+        ]
         if not free_ports:
             return Serving(self.serve, tuple(bridges), self.opcua)
         return Serving(

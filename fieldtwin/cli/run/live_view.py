@@ -40,9 +40,11 @@ def print_mapping(session: RunSession) -> None:
         f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}",
         soft_wrap=True,
     )
+    read_only = {session.system.buses[name].endpoint for name in session.read_only}
     for plant, target in session.mapping.items():
+        note = ", read-only without --allow-writes" if plant in read_only else ""
         stderr.print(
-            f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's endpoint)", soft_wrap=True
+            f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's endpoint{note})", soft_wrap=True
         )
     for bridge, cable in session.cables.items():
         stderr.print(f"  clients of bridge {bridge}  →  {cable.master}", soft_wrap=True)

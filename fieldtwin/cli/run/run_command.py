@@ -52,7 +52,8 @@ class PlaceOptions:
     allow_writes: bool = option(
         "--allow-writes",
         is_flag=True,
-        help="With --plant: enable writes of the tags that the system file marks writable.",
+        help="With --plant, or with a bus that the prototype file sets to `plant`: enable writes of the tags that the "
+        "system file marks writable.",
     )
     duration_s: float = option(
         "--for", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run until Ctrl-C."
@@ -64,8 +65,6 @@ class PlaceOptions:
         """Raise `UsageError` unless the user has chosen either the plant or a prototype, and only options that apply to it."""
         if self.prototype == self.plant:
             raise UsageError(NEITHER if not self.plant else "--plant and --prototype exclude each other")
-        if self.prototype and self.allow_writes:
-            raise UsageError("--allow-writes needs --plant", hint="a prototype's emulators always accept writes")
 
 
 @dataclass(frozen=True)
@@ -198,6 +197,8 @@ def command(
     }  # fmt: skip
     systems = systems_of(system, sources, others, OF_A_GROUP, plant=place.plant, virtual=False)
     if systems is not None:
+        if place.allow_writes:
+            raise UsageError("--allow-writes needs --plant", hint="a prototype's emulators always accept writes")
         # imported here, because a plant has no emulators installed
         from fieldtwin.emulators.faults.schema import load_faults
         from fieldtwin.run.virtual.group_kinds import LiveRequest, kind_named

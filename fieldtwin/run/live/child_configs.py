@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,26 @@ def transmitter_of_thread(o: RunOptions, system: System) -> str:
     return delegated
 
 
+def read_only_buses(o: RunOptions, system: System, real: Collection[str], delegated: str) -> tuple[str, ...]:
+    """Return the buses to which a prototype run may not write: without --allow-writes, those that the prototype file sets to
+    `plant` (`real`). Raises `UsageError` if no bus is real and writes to real devices are allowed, or if the transmitter
+    `delegated`, into whose mailbox the digital thread writes, is on a read-only bus.
+    """
+    if o.allow_writes and not real:
+        raise UsageError(
+            "--allow-writes needs --plant, or a bus that the prototype file sets to `plant`",
+            hint="emulators always accept writes",
+        )
+    read_only = () if o.allow_writes else tuple(sorted(real))
+    if delegated and system.devices[delegated].bus in read_only:
+        raise UsageError(
+            f"a thread over {delegated!r} writes into its mailbox, and the prototype file sets its bus to `plant`",
+            expected="--allow-writes",
+            got=f"--thread {o.thread}",
+        )
+    return read_only
+
+
 def field_config(o: RunOptions, system: System, run_dir: Path) -> FieldConfig:
     """Return the configuration of the field simulator."""
     from fieldtwin.twin.prototype.field_process import FieldConfig  # here, because a plant has no emulators installed
@@ -68,15 +89,18 @@ def gateway_config(
     run_dir: Path,
     *,
     mapping: dict[Endpoint, Endpoint],
+    read_only: tuple[str, ...],
     capture: Path | None,
     delegated: str,
     resolved: str,
 ) -> ControllerConfig:
-    """Return the configuration of the gateway. `delegated` names the transmitter that the digital thread uses, if any."""
+    """Return the configuration of the gateway, which writes to no device of the buses in `read_only`. `delegated` names the
+    transmitter that the digital thread uses, if any."""
     return ControllerConfig(
         system=str(system.path.resolve()),
         run_dir=str(run_dir),
         allow_writes=o.prototype or o.allow_writes,
+        read_only=read_only,
         mapping=mapping_to_json(mapping) if o.prototype else None,
         profiles=tuple(str(p.resolve()) for p in o.profiles),
         capture=str(capture.resolve()) if capture else "",

@@ -32,6 +32,7 @@ from fieldtwin.results.trace import Trace
 from fieldtwin.run.live.child_configs import (
     field_config,
     gateway_config,
+    read_only_buses,
     run_record,
     server_config,
     thread_config,
@@ -112,6 +113,8 @@ class RunSession(AsyncResource):
         self.instance = Instance(options.instance or self.system.name)
         self.capture = options.capture or (capture_path(self.instance.name) if options.record_frames else None)
         self.mapping: dict[Endpoint, Endpoint] = {}
+        self.read_only: tuple[str, ...] = ()
+        """The buses of a prototype whose devices are real and are not written to."""
         self.far: dict[str, Endpoint] = {}
         self.cables: dict[str, BridgeCable] = {}
         self.counted_before: dict[str, dict[str, int]] = {}
@@ -213,7 +216,7 @@ class RunSession(AsyncResource):
         self._resolved = write_resolved(self.instance.path(SYSTEM_FILE), self.system)
         gateway = gateway_config(
             self.options, self.system, run_dir,
-            mapping=self.mapping, capture=self.capture, delegated=self.delegated, resolved=self._resolved,
+            mapping=self.mapping, read_only=self.read_only, capture=self.capture, delegated=self.delegated, resolved=self._resolved,
         )  # fmt: skip
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
@@ -300,6 +303,7 @@ class RunSession(AsyncResource):
             self._field = await contact_local(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
+        self.read_only = read_only_buses(self.options, self.system, self._field.real_buses, self.delegated)
         self.counted_before, self.clients_before = self._field.counted_before, self._field.clients_before
         for remark in self._field.remarks:
             stderr.print(remark, soft_wrap=True, markup=False)

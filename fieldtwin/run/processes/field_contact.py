@@ -28,6 +28,8 @@ class FieldContact:
         self.client = client
         self.mapping = mapping
         self.far = far
+        self.real_buses: frozenset[str] = frozenset()
+        """The buses that the prototype file sets to `plant`: their devices are real."""
         self.links: list[LinkChild] = []
         self.life = ""
         """The identity of the simulator's process: a restarted field simulator has a different one."""
@@ -98,10 +100,9 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
     except BaseException:
         await contact.aclose()
         raise
-    for name, bus in system.buses.items():
-        if name not in status.listening:
-            # the prototype file has `plant` for this bus, whose devices are real
-            contact.mapping[bus.endpoint] = bus.endpoint
+    contact.real_buses = frozenset(system.buses) - status.listening.keys()
+    for name in contact.real_buses:
+        contact.mapping[system.buses[name].endpoint] = system.buses[name].endpoint
     return contact
 
 

@@ -10,7 +10,7 @@ is sent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
@@ -34,11 +34,20 @@ AWAY_REPORTED = -1
 class OutputWriter:
     """The writer of wanted values to the devices. `tick` starts writes and never waits for their end."""
 
-    def __init__(self, outputs: list[Output], tags: TagTable, audit: AuditLog, allow_writes: bool) -> None:
+    def __init__(
+        self,
+        outputs: list[Output],
+        tags: TagTable,
+        audit: AuditLog,
+        allow_writes: bool,
+        read_only: Collection[str] = (),
+    ) -> None:
+        """`read_only` names the buses to whose devices nothing is written although `allow_writes` is set."""
         self.outputs = outputs
         self._groups = groups_of(outputs)
         self._group_of = {output.tag: group for group in self._groups for output in group.outputs}
         self.allow_writes = allow_writes
+        self._read_only = frozenset(read_only)
         self.journal = Refusals(audit)
         """The journal of every write that did not reach its device, with its cause."""
         self.writes = self.refusals = self.failures = self.rewrites = self.superseded = 0
@@ -354,7 +363,7 @@ class OutputWriter:
 
     def _cause(self, output: Output) -> RefusalCause:
         """Return why a check refused a value of this output."""
-        if not self.allow_writes:
+        if not self._may_write(output):
             return RefusalCause.READ_ONLY
         if output.local not in output.driver.config.writable:
             return RefusalCause.NOT_WRITABLE
@@ -403,10 +412,13 @@ class OutputWriter:
             where = output.driver.config.where
             raise NotAllowed(f"writes are blocked: {output.driver.identity_error}", where=where)
 
+    def _may_write(self, output: Output) -> bool:
+        return self.allow_writes and output.driver.config.bus not in self._read_only
+
     def _check_allowed(self, output: Output) -> None:
         """Raise `NotAllowed` if the configuration forbids the write, independently of the device."""
         where = output.driver.config.where
-        if not self.allow_writes:
+        if not self._may_write(output):
             raise NotAllowed("this plant is read-only", where=where, hint="start with --allow-writes")
         if output.local not in output.driver.config.writable:
             raise NotAllowed(f"{output.tag} is not marked writable in the system file", where=where)

@@ -308,3 +308,6 @@ def test_the_two_sections_of_a_right_file(tmp_path: Path) -> None:
     assert 6 in rule.functions
     assert rule.addresses == {"holding": ((0, 9),)}
     assert not bridge.policy.allow_writes
+    for read_only, writes in (((), True), (("ctd0",), True), (("lan",), False)):  # a real bus of a prototype
+        (bridge,) = serving.for_run(allow_writes=True, read_only=read_only, free_ports=True).bridges  # type: ignore[attr-defined]
+        assert bridge.policy.allow_writes is writes

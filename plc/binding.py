@@ -176,10 +176,22 @@ def _plant_tag(bound: BoundProgram, variable: Variable, tag: str, plant: Mapping
     spec = plant.get(tag)
     if spec is None:
         raise FileInvalid(f"{where} is bound to {tag}, which does not exist")
-    source, sink = (spec.kind, variable.kind) if variable.role is Role.INPUT else (variable.kind, spec.kind)
-    if source is not sink and not (source is TagKind.INT and sink is TagKind.REAL):
-        raise FileInvalid(f"{where} and {tag} differ in kind", expected=variable.kind.value, got=spec.kind.value)
+    check_kind(bound.name, variable, spec)
     return spec
+
+
+def check_kind(program: str, variable: Variable, spec: TagSpec) -> None:
+    """Raise `FileInvalid` if a variable and the tag to which it is bound differ in kind. An integer may go into a REAL."""
+    source, sink = (spec.kind, variable.kind) if variable.role is Role.INPUT else (variable.kind, spec.kind)
+    if source is sink or (source is TagKind.INT and sink is TagKind.REAL):
+        return
+    bit = (variable.kind, spec.kind) == (TagKind.BOOL, TagKind.INT) and spec.limits == (0, 1)
+    raise FileInvalid(
+        f"{variable.role.value} {variable.name!r} of program {program} and {spec.name} differ in kind",
+        expected=f"a variable of kind {spec.kind.value}, as the tag",
+        got=variable.kind.value,
+        hint="a bit of a register is a bool with `type: bool` in the profile" if bit else "",
+    )
 
 
 def substitute(spec: TagSpec, if_bad: str | float) -> Scalar | None:

@@ -52,7 +52,8 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     if tag.type == "bytes":
         return TagValue(data, _GOOD, _NO_REASON, t_ns, data)
     if tag.type == "bool":
-        return TagValue(bool(int.from_bytes(data)), _GOOD, _NO_REASON, t_ns, data)
+        held = int.from_bytes(data) if tag.bits is None else _odd_number(tag, reorder(data, tag.order))
+        return TagValue(bool(held), _GOOD, _NO_REASON, t_ns, data)
     return _decode_number(tag, reorder(data, tag.order), data, t_ns)
 
 

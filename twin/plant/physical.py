@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_drive
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
-from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_for
 from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
@@ -144,8 +144,10 @@ def bound_programs(system: System, errors: ErrorCollector) -> list[BoundProgram]
             bound.append(config.bind((str(system.path.parent),)))
         except FieldtwinError as e:
             errors.add(system.file.error(("plc", "programs", config.name, "source"), str(e)))
+    plant = plant_tags(system)
     for program in bound:
         _check_variables(system, program, errors)
+        _check_kinds(system, program, plant, errors)
     published = {program.name: [tag for _, tag in program.published()] for program in bound}
     for program in bound:
         for variable, binding in program.inputs.items():
@@ -176,6 +178,20 @@ def _check_tasks(system: System, errors: ErrorCollector) -> None:
     if system.plc.tasks and all(form.single for form in system.plc.tasks.values()):
         error = system.file.error(("plc", "tasks"), "only SINGLE tasks", expected="at least one with interval_ms")
         errors.add(error)
+
+
+def _check_kinds(system: System, bound: BoundProgram, plant: Mapping[str, TagSpec], errors: ErrorCollector) -> None:
+    """Check that each variable fits the tag of a device to which it is bound."""
+    inputs = {name: binding.tag for name, binding in bound.inputs.items()}
+    for key, role, names in (("inputs", Role.INPUT, inputs), ("outputs", Role.OUTPUT, bound.outputs)):
+        for variable in bound.variables(role):
+            tag = names.get(variable.name, "")
+            if tag in plant:
+                try:
+                    check_kind(bound.name, variable, plant[tag])
+                except FileInvalid as e:
+                    at = ("plc", "programs", bound.name, key, variable.name, *(("tag",) if role is Role.INPUT else ()))
+                    errors.add(system.file.error(at, e.message, expected=e.expected, got=e.got, hint=e.hint))
 
 
 def _check_variables(system: System, bound: BoundProgram, errors: ErrorCollector) -> None:

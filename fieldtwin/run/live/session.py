@@ -104,6 +104,8 @@ class RunSession(AsyncResource):
 
             # errors in the files are reported before anything starts
             self._prototype = resolve(field_config(options, self.system, Path()), self.system).prototype
+            real = [bus.name for bus in self._prototype.buses.values() if bus.listen is None]
+            read_only_buses(options, self.system, real, self.delegated)
         self.faults = options.faults
         if options.fault_file is not None:
             from fieldtwin.emulators.faults.schema import load_faults
@@ -216,7 +218,8 @@ class RunSession(AsyncResource):
         self._resolved = write_resolved(self.instance.path(SYSTEM_FILE), self.system)
         gateway = gateway_config(
             self.options, self.system, run_dir,
-            mapping=self.mapping, read_only=self.read_only, capture=self.capture, delegated=self.delegated, resolved=self._resolved,
+            mapping=self.mapping, read_only=self.read_only, capture=self.capture, delegated=self.delegated,
+            resolved=self._resolved,
         )  # fmt: skip
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))

@@ -77,8 +77,8 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
             raise file.error(loc, f"the tag {name!r} is a {kind}", expected="`registers: N`, its length")
         first = _address(file, (*loc, "at"), form, t.at, t.registers or REGISTERS_OF[kind])
         indexes = None
-    if t.bits is not None and not (kind == "uint16" and 0 <= t.bits[0] <= t.bits[1] <= 15):
-        raise file.error((*loc, "bits"), f"the bits of {name!r}", expected="type uint16 and [low, high] within 0 to 15")
+    if t.bits is not None:
+        _check_bits(file, loc, form, kind, t.bits)
     match = re.fullmatch(r"(.*?)([0-9]+)\.\.([0-9]+)", name)
     names = [name]
     if match:
@@ -110,6 +110,23 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
             sentinels=tuple(t.sentinels),
             nonvolatile=t.nonvolatile,
         )
+
+
+def _check_bits(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, kind: str, bits: tuple[int, int]) -> None:
+    name, (low, high) = str(loc[-1]), bits
+    if form.protocol == "canopen" and kind != "uint16":
+        raise file.error(
+            (*loc, "bits"),
+            f"{name!r} is a part of a CANopen object",
+            expected="a tag of the whole object",
+            hint="a program takes its bits: declare a BYTE or WORD, and use `outputs AND 1`",
+        )
+    if kind not in ("uint16", "bool") or not 0 <= low <= high <= 15:
+        raise file.error(
+            (*loc, "bits"), f"the bits of {name!r}", expected="type uint16 or bool, and [low, high] within 0 to 15"
+        )
+    if kind == "bool" and low != high:
+        raise file.error((*loc, "bits"), f"the tag {name!r} is a bool", expected=f"one bit, [{low}, {low}]")
 
 
 def _address(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | str, count: int) -> RegisterRange:

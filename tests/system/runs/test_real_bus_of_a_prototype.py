@@ -12,6 +12,10 @@ from pathlib import Path
 import pytest
 from procs import fieldtwin, free_port, run_to_end, wait_for
 
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.session import RunSession
+
 SYSTEM = """\
 fieldtwin: 1
 system: site
@@ -36,6 +40,17 @@ devices: {b: {model: profile}}
 """,
 }
 
+REAL_MODEM = """\
+prototype_of: observatory.yaml
+buses:
+  line1: {listen: "pty:line1"}
+  can0: {listen: "can:fieldtwin/127.0.0.1:0"}
+  lan: plant
+devices:
+  ctd: {recording: cast.jsonl, identity: {serial: "0042"}}
+  inclinometer: {recording: incl.jsonl, identity: {serial: "1005"}}
+"""
+
 
 @pytest.fixture
 def lamp(tmp_path: Path) -> Iterator[str]:
@@ -59,7 +74,9 @@ def held(endpoint: str, folder: Path) -> object:
 
 def outputs_of(folder: Path, *options: str) -> tuple[dict[str, object], str]:
     """Run the site, and return the last values of its tags and the console's output."""
-    run = run_to_end(folder / "r", "run", str(folder / "site.yaml"), "--prototype", "--for", "3s", "--json", *options, within_s=100)
+    run = run_to_end(
+        folder / "r", "run", str(folder / "site.yaml"), "--prototype", "--for", "3s", "--json", *options, within_s=100
+    )
     return json.loads(run.out), run.err
 
 
@@ -78,6 +95,15 @@ def test_real_device_of_a_prototype_is_written_to_with_allow_writes(lamp: str, t
     assert held(lamp, tmp_path) == 7
 
 
-def test_allow_writes_is_refused_for_a_prototype_without_a_real_bus(tmp_path: Path) -> None:
-    ended = run_to_end(tmp_path / "r", "run", "observatory", "--prototype", "--allow-writes", "--for", "1s")
-    assert (ended.process.returncode, "--allow-writes needs --plant" in ended.err) == (2, True), ended.err
+def test_allow_writes_is_refused_for_a_prototype_without_a_real_bus() -> None:
+    with pytest.raises(
+        UsageError, match="--allow-writes needs --plant, or a bus that the prototype file sets to `plant`"
+    ):
+        RunSession(RunOptions("observatory", prototype=True, allow_writes=True))
+
+
+def test_thread_over_the_modem_of_a_real_bus_needs_allow_writes(tmp_path: Path) -> None:
+    path = tmp_path / "observatory.prototype.yaml"
+    path.write_text(REAL_MODEM, encoding="utf-8")
+    with pytest.raises(UsageError, match="its bus to `plant`; expected --allow-writes"):
+        RunSession(RunOptions("observatory", prototype=True, prototype_file=path, thread="modem:"))

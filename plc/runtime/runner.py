@@ -412,18 +412,27 @@ class TaskRunner:
             return [(b.program, v) for b in self.programs for v, binding in b.inputs.items() if binding.tag == tag]
         return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
+    def _published(self, name: str) -> str:
+        """Return the tag to which an output ``PROGRAM.VARIABLE`` is bound, and every other name unchanged."""
+        return next((to for b in self.programs for v, to in b.published() if f"{b.name}.{v.name}" == name), name)
+
     def waits(self, tag: str) -> str:
         """Return in words the inputs and programs for which the program that writes `tag` waits; "" if it has started."""
+        tag = self._published(tag)
         owner = next((b.name for b in self.programs if tag in (t for _, t in b.published())), "")
         return next((start.reason() for start in self.starts.waiting if start.name == owner), "")
 
     def why(self, tag: str) -> list[dict[str, Any]]:
         """Return the last changes of an output or local, the newest first. Raises `UsageError` for a tag that no
         program writes."""
+        tag = self._published(tag)
         if tag not in self.outputs.last():
-            bound = {f"{b.name}.{v.name}": to for b in self.programs for v, to in b.published()}
-            hint = f"this output is the tag {bound[tag]!r}" if tag in bound else did_you_mean(tag, self.outputs.last())
-            raise UsageError(f"no program writes {tag!r}", expected="an output or local of a program", hint=hint)
+            what = f"no program writes {tag!r}"
+            hint = did_you_mean(tag, self.outputs.last())
+            if tag in self.inputs():
+                what = f"{tag!r} is an input, which its device determines"
+                hint = f"`fieldtwin plc watch {tag} --once` shows its value, quality and age"
+            raise UsageError(what, expected="an output or local of a program", hint=hint)
         now_ns = self._now_ns()
         return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
 

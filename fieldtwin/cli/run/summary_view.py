@@ -80,12 +80,22 @@ def _print_refused(summary: dict[str, Any]) -> None:
     if by_design:
         text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
         stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
-    others = [e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]]
+    others = _newest([e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]])
     for entry in others[:MAX_REFUSED]:
         text = refusal_text(entry["tag"], entry)
         stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
     if len(others) > MAX_REFUSED:
         stdout.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
+
+
+def _newest(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return one entry for each tag, cause and line of a program: the newest value, with the number of all values."""
+    found: dict[tuple[object, ...], dict[str, Any]] = {}
+    for entry in entries:
+        key = (entry["tag"], entry["cause"], entry.get("by"), entry.get("place"))
+        before = found.pop(key, {"count": 0})
+        found[key] = {**entry, "first": entry.get("value"), "count": before["count"] + entry.get("count", 1)}
+    return list(found.values())
 
 
 def print_faults(faults: list[dict[str, Any]]) -> None:

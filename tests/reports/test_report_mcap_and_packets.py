@@ -192,8 +192,19 @@ def test_the_trace_command_writes_mcap_and_pcapng(tmp_path: Path) -> None:
     for wrong in (["--vcd", "x.vcd"], ["--problems"], ["--only", "ctd"], ["--json"], ["--against", str(trace)]):
         with pytest.raises(UsageError, match="whole"):
             run(trace, "observatory", "--pcapng", tmp_path / "b.pcapng", *wrong)
-    with pytest.raises(FileInvalid, match="cannot write the pcapng file"):
+    with pytest.raises(UsageError, match="would overwrite the trace"):
+        run(trace, "observatory", "--mcap", trace)
+    assert len(trace.read_bytes().splitlines()) == len(run_trace(20))
+    with pytest.raises(FileInvalid, match="its folder does not exist"):
         run(trace, "observatory", "--pcapng", tmp_path / "no" / "b.pcapng")
+    with trace.open("ab") as file:
+        file.write(b"damage\n")
+    (tmp_path / "older").write_text("of another run")
+    for option in ("--mcap", "--pcapng", "--vcd"):
+        with pytest.raises(FileInvalid, match="no event"):
+            run(trace, "observatory", option, tmp_path / "older")
+        assert (tmp_path / "older").read_text() == "of another run"
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_times_are_utc_where_the_file_states_them(tmp_path: Path) -> None:

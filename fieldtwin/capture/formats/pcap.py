@@ -38,8 +38,8 @@ SNAPLEN = 65_535
 MODBUS_PORT = 502
 CLIENT_PORT = 50_200
 MAX_SEGMENT = 1460
-MAX_SERVERS = 253
-"""Maximum number of servers in one file: the addresses of TEST-NET-1 (192.0.2.0/24, RFC 5737) after the client's."""
+MAX_SERVERS = 64
+"""Maximum number of conversations in one file. Each server has an address of TEST-NET-1 (192.0.2.0/24, RFC 5737)."""
 _NETWORK = bytes((192, 0, 2))  # TEST-NET-1: reserved for examples
 _CLIENT = 1
 _SYN, _ACK, _PSH = 0x02, 0x10, 0x08

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.capture.formats.pcap import SNAPLEN, Packet
+from fieldtwin.capture.formats.pcap import MAX_SERVERS, SNAPLEN, Packet
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 MAX_TEXT = 4_096
 """Maximum number of bytes of a name, a description or a comment; longer texts are cut at a character."""
@@ -44,8 +44,11 @@ def write_pcapng(path: Path, wires: Sequence[Wire], *, comment: str = "", utc_of
     """Write the packets of all wires, ordered by time; return their number.
 
     `comment` describes the whole file. `utc_offset_ns` is added to the times of the packets to convert them to UTC; a time before
-    1970 becomes 0. Raises `FileInvalid` if the file cannot be written.
+    1970 becomes 0. Raises `FileInvalid` if the file cannot be written, and `UsageError` for more than `MAX_SERVERS` wires, each
+    of which usually reads its source separately.
     """
+    if len(wires) > MAX_SERVERS:
+        raise UsageError("too many interfaces for one pcapng file", expected=str(MAX_SERVERS), got=str(len(wires)))
     count = 0
     try:
         with path.open("wb") as file:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from fieldtwin.capture.formats.pcap import (
-    MAX_SERVERS,
     commented_packets,
     link_type,
     packets,
@@ -21,14 +20,11 @@ from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.recording import RecordingHeader
 from fieldtwin.gateway.protocols.modbus.frames.crc import with_crc
 
 PCAPNG = ".pcapng"
-MAX_CHANNELS = 1_024
-"""Maximum number of channels of a CAN log that become interfaces: more than these are refused."""
 _BUS = Endpoint.parse("can:socketcan/can0")
 
 Write = Callable[[Path], int]
@@ -40,8 +36,6 @@ def log_packets(path: Path, kind: str) -> Write:
     if kind != PCAPNG:
         return lambda out: write_pcap(out, _logged(path), _BUS)
     channels = list(dict.fromkeys(channel for part in parts_of(path) for _, channel, _ in read_log(part)))
-    if len(channels) > MAX_CHANNELS:
-        raise FileInvalid("too many channels", path=str(path), expected=str(MAX_CHANNELS), got=str(len(channels)))
     link = link_type(_BUS)
     wires = [Wire(link, name, "CAN", packets(_logged(path, name), _BUS)) for name in channels]
     return lambda out: write_pcapng(out, wires, comment=path.name)
@@ -61,8 +55,6 @@ def capture_packets(path: Path, kind: str, endpoints: Sequence[Endpoint]) -> Wri
     if kind != PCAPNG:
         (endpoint,) = endpoints
         return lambda out: write_pcap(out, _captured(path), endpoint, offset_ns)
-    if len(endpoints) > MAX_SERVERS:
-        raise UsageError(f"{path.name} holds too many endpoints", expected=str(MAX_SERVERS), hint="--endpoint")
     wires = [
         Wire(link_type(endpoint), name, str(endpoint), packets(_captured(path), endpoint, server=number))
         for number, (endpoint, name) in enumerate(zip(endpoints, interface_names(endpoints), strict=True))

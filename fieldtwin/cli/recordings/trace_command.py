@@ -13,6 +13,7 @@ from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
 from fieldtwin.capture.decoding.trace_file import read_events, start_utc_ns
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.output_files import replacing
 from fieldtwin.cli.recordings.regression_options import ToleranceOptions
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
@@ -118,7 +119,11 @@ def command(
             return (e for e in read_events(file, plant) if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns))
 
         (out,) = (out for out in outputs.values() if out is not None)
-        stderr.print(f"{_written(chosen[0], out, inside, plant, file)}  →  {out}", soft_wrap=True)
+        if out.exists() and file.exists() and out.samefile(file):
+            raise UsageError(f"{chosen[0]} would overwrite the trace", got=str(out), expected="another file")
+        with replacing(out) as part:
+            said = _written(chosen[0], part, inside, plant, file)
+        stderr.print(f"{said}  →  {out}", soft_wrap=True)
         return 0
     events = read_events(file, plant)
     decoder = Decoder(plant)

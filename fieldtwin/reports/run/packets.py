@@ -24,12 +24,13 @@ Events = Callable[[], Iterable[TraceEvent]]
 def write_packets(path: Path, events: Events, system: System, *, start_utc_ns: int = 0, comment: str = "") -> int:
     """Write the frames of the system's buses; return the number of packets.
 
-    `start_utc_ns` is the time of the run's start in ns since 1970. Frames of other buses are left out. Raises `FileInvalid` if
-    the file cannot be written.
+    `start_utc_ns` is the time of the run's start in ns since 1970. Buses without frames, and frames of other buses, are left out.
+    Raises `FileInvalid` if the file cannot be written, and `UsageError` for too many buses.
     """
+    seen = {event.where for event in events() if event.kind is TraceKind.FRAME}
     wires = []
-    for number, (bus, config) in enumerate(system.buses.items()):
-        endpoint = config.endpoint
+    for number, bus in enumerate(bus for bus in system.buses if bus in seen):
+        endpoint = system.buses[bus].endpoint
         explained = _explained(events(), bus, endpoint, system)
         made = commented_packets(explained, endpoint, server=number)
         wires.append(Wire(link_type(endpoint), bus, str(endpoint), made))

@@ -22,7 +22,7 @@ from fieldtwin.gateway.connections.tap import TapFile
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import read_log
 
 needs_wireshark = pytest.mark.skipif(
@@ -217,6 +217,14 @@ def test_the_channels_of_a_can_log_come_back(tmp_path: Path) -> None:
     assert export(log, tmp_path / "bus.pcapng") == 3
     PacketImport(tmp_path / "bus.pcapng", tmp_path / "again.jsonl").run()
     assert (tmp_path / "again.log").read_bytes() == log.read_bytes()
+
+
+def test_more_interfaces_than_one_file_holds_are_refused(tmp_path: Path) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text("".join(f"({n}.000001) can{n} 123#\n" for n in range(65)))
+    with pytest.raises(UsageError, match="too many interfaces"):
+        export(log, tmp_path / "bus.pcapng")
+    assert not (tmp_path / "bus.pcapng").exists()
 
 
 # -- Wireshark's tools ----------------------------------------------------------------------------------------------------

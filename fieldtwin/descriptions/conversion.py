@@ -33,10 +33,14 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file to import: its path, for messages and for names, and its content, at most `MAX_DESCRIPTION_BYTES` bytes."""
+    """A file to import: its path, for messages and for names, and its content, at most `MAX_DESCRIPTION_BYTES` bytes.
+
+    `modified_ns` is the time of its last change, in ns since 1970: the date of a file that is made from it.
+    """
 
     path: Path
     data: bytes
+    modified_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,10 @@ _OBJECTS = {
     "device": "name of the profile, MAKER/TYPE",
     "objects": "which objects become tags: application (2000h to 9FFFh, and the identity), pdo (mapped into PDOs), or all",
 }
+_CONFIGURED = _NODE | {
+    "bitrate": "bit rate in kbit/s, 10 to 1000",
+    "OBJECT": "value that the file sets, for instance 1017:00=500",
+}
 
 _ONE_DEVICE = {
     "device": "name of the profile, MAKER/TYPE",
@@ -68,11 +72,35 @@ FORMATS: dict[str, Format] = {
             "an object dictionary with the values and the node ID of one node",
             "fieldtwin.descriptions.canopen.dcf",
             import_settings=_NODE | _OBJECTS,
-            export_settings=_NODE
-            | {
-                "bitrate": "bit rate in kbit/s, 10 to 1000",
-                "OBJECT": "value that the DCF sets, for instance 1017:00=500",
-            },
+            export_settings=_CONFIGURED,
+        ),
+        Format(
+            "xdd",
+            ".xdd",
+            "XML device description (CiA 311)",
+            "the object dictionary of a CANopen device, with units and names of values",
+            "fieldtwin.descriptions.canopen.xdd",
+            import_settings=_NODE | _OBJECTS,
+        ),
+        Format(
+            "xdc",
+            ".xdc",
+            "XML device configuration (CiA 311)",
+            "an XDD with the values and the node ID of one node",
+            "fieldtwin.descriptions.canopen.xdc",
+            import_settings=_NODE | _OBJECTS,
+            export_settings=_CONFIGURED,
+        ),
+        Format(
+            "dbc",
+            ".dbc",
+            "CAN database (Vector)",
+            "the PDOs of a CANopen node as messages and signals",
+            "fieldtwin.descriptions.canopen.dbc",
+            imports=False,
+            one_way="it has frames, but no object dictionary from which a profile could be made",
+            extra="dbc",
+            export_settings=_NODE,
         ),
         Format(
             "telegraf",

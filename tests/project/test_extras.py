@@ -15,8 +15,10 @@ import pytest
 from fieldtwin.capture.formats.mcap_file import McapFile
 from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
 from fieldtwin.commissioning.access.plotting import check_plot
+from fieldtwin.descriptions.canopen.dbc import export_description
 from fieldtwin.emulators.simulation.fmu.description import describe
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
@@ -60,6 +62,10 @@ def use_fmi(folder: Path) -> None:
     describe(folder / "tank.fmu")
 
 
+def use_dbc(folder: Path) -> None:
+    export_description(load_profile(CHECKOUT / "profiles/devices/io-cia401.yaml"), {})
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "opcua": ("asyncua", use_opcua, ""),
@@ -68,6 +74,7 @@ USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "fmi": ("fmpy", use_fmi, ""),
     "parquet": ("pyarrow", use_parquet, ""),
     "mcap": ("mcap", use_mcap, ""),
+    "dbc": ("cantools", use_dbc, ""),
 }
 
 

@@ -63,10 +63,10 @@ def import_command(
     check_settings(chosen, row.import_settings, row)
     convert = importer(row)
     try:
-        data = read_input(file, MAX_DESCRIPTION_BYTES)
+        source = Source(file, read_input(file, MAX_DESCRIPTION_BYTES), file.stat().st_mtime_ns)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(file)) from e
-    result = convert(Source(file, data), chosen)
+    result = convert(source, chosen)
     text = profile_text(result.profile, f"Imported by `fieldtwin profile import {row.name}` from {file.name}.")
     checked_profile(text, str(out or "the new profile"))
     if not as_json:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from fieldtwin.descriptions.canopen.eds_reader import read_eds
 from fieldtwin.descriptions.canopen.eds_writer import write_eds
+from fieldtwin.descriptions.canopen.node import NodeDescription
 from fieldtwin.descriptions.canopen.node_of_profile import node_of_profile
 from fieldtwin.descriptions.canopen.profile_of_node import profile_of_node
 from fieldtwin.descriptions.conversion import Exported, Imported, Loss, Settings, Source
@@ -24,9 +26,16 @@ def import_description(source: Source, settings: Settings) -> Imported:
 def export_description(profile: DeviceProfile, settings: Settings) -> Exported:
     """Return the EDS of a profile. Raises `FileInvalid` and `UsageError`."""
     node, losses = node_of_profile(profile, TITLE)
+    text = write_eds(node, f"{Path(profile.path).stem}.eds", modified_ns(profile))
+    return Exported(text, (*losses, *values_lost(node)))
+
+
+def values_lost(node: NodeDescription) -> Iterator[Loss]:
+    """Yield a loss if the description sets values, for a format without them."""
     if any(v.configured for v in node.values()):
-        losses.append(Loss("the object dictionary", "the values that a DCF sets", "an EDS describes a type of device"))
-    return Exported(write_eds(node, f"{Path(profile.path).stem}.eds", modified_ns(profile)), tuple(losses))
+        yield Loss(
+            "the object dictionary", "the values that are set", "the format describes a type of device, not one node"
+        )
 
 
 def modified_ns(profile: DeviceProfile) -> int:

@@ -11,7 +11,7 @@ from fieldtwin.gateway.protocols.canopen.eds.text import BIT_RATES_KBIT
 
 MANDATORY = (0x1000, 0x1001, 0x1018)
 """The objects that every node has (CiA 301, 7.5.2); they are in [MandatoryObjects]."""
-_MANUFACTURER = range(0x2000, 0x6000)
+MANUFACTURER = range(0x2000, 0x6000)
 _DEVICE_KEYS = (
     *("VendorName", "VendorNumber", "ProductName", "ProductNumber", "RevisionNumber", "OrderCode"),
     *(f"BaudRate_{kbit}" for kbit in BIT_RATES_KBIT),
@@ -97,8 +97,8 @@ def _lists(objects: Sequence[NodeObject]) -> Iterator[tuple[str, Mapping[str, st
     indexes = [each.index for each in objects]
     lists = {
         "MandatoryObjects": [i for i in indexes if i in MANDATORY],
-        "OptionalObjects": [i for i in indexes if i not in MANDATORY and i not in _MANUFACTURER],
-        "ManufacturerObjects": [i for i in indexes if i in _MANUFACTURER],
+        "OptionalObjects": [i for i in indexes if i not in MANDATORY and i not in MANUFACTURER],
+        "ManufacturerObjects": [i for i in indexes if i in MANUFACTURER],
     }
     for title, listed in lists.items():
         numbered = {str(number): f"0x{index:04X}" for number, index in enumerate(listed, 1)}

@@ -21,6 +21,7 @@ class NodeValue:
     `type_code` is that of CiA 301, 7.4.7 (see `datatypes.DataType`). `access` is ro, wo, rw, rwr, rww or const. `default`, `low`,
     `high` and `configured` are texts in the notation of CiA 306, empty if not stated. A DCF or XDC sets the value `configured`.
     `unit`, `factor` and `remark` are the keys Unit, Factor and Description of the `canopen` package, which are not in CiA 306.
+    `offset` is added to raw value x factor, and `names` are the names of raw values; only an XDD has a place for them.
     """
 
     index: int
@@ -36,6 +37,8 @@ class NodeValue:
     unit: str = ""
     factor: str = ""
     remark: str = ""
+    offset: str = ""
+    names: tuple[tuple[int, str], ...] = ()
 
     @property
     def place(self) -> str:

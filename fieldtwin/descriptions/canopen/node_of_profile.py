@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 from fieldtwin.descriptions.canopen.eds_reader import read_eds
@@ -28,12 +28,37 @@ _KEYS = {
 _WRITABLE = ("rw", "rwr", "rww")
 
 
-def node_of_profile(profile: DeviceProfile, title: str) -> tuple[NodeDescription, list[Loss]]:
+OFFSET, VALUE_NAMES = "its offset", "the names of its values"
+
+
+def node_of_profile(
+    profile: DeviceProfile, title: str, has: Collection[str] = ()
+) -> tuple[NodeDescription, list[Loss]]:
     """Return the description and what it does not have of the profile. `title` names the format, for messages.
+
+    `has` are properties of a tag that this format has, but others do not: `OFFSET` and `VALUE_NAMES`.
 
     Raises `UsageError` if the profile is not of a CANopen device, `FileInvalid` if its EDS cannot be read.
     """
     require_protocol(profile, "canopen", title)
+    node, repairs = read_profile_eds(profile)
+    losses = [Loss("the EDS", f"repaired: {repair}", "the result has the repaired value") for repair in repairs]
+    losses += losses_of_keys(profile, _KEYS)
+    by_object = {tag.object: tag for tag in profile.tags.values() if tag.object is not None}
+    known = {(v.index, v.subindex) for v in node.values()}
+    losses += _names_lost(profile, node)
+    objects = [
+        replace(
+            each, values=tuple(_with_tag(v, by_object.get((v.index, v.subindex)), has, losses) for v in each.values)
+        )
+        for each in node.objects
+    ]
+    objects += _new_objects([tag for key, tag in by_object.items() if key not in known], objects, has, losses)
+    return replace(node, objects=tuple(sorted(objects, key=lambda each: each.index))), losses
+
+
+def read_profile_eds(profile: DeviceProfile) -> tuple[NodeDescription, tuple[str, ...]]:
+    """Return the object dictionary of a CANopen profile, and the repairs that its file needed. Raises `FileInvalid`."""
     path = profile.eds_path
     if path is None:
         raise FileInvalid("a CANopen profile needs an EDS", path=profile.path, expected="`eds: FILE.eds`")
@@ -41,25 +66,14 @@ def node_of_profile(profile: DeviceProfile, title: str) -> tuple[NodeDescription
         data = read_input(path, MAX_EDS_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    node, repairs = read_eds(data, path)
-    losses = [Loss(path.name, f"repaired: {repair}", "the result has the repaired value") for repair in repairs]
-    losses += losses_of_keys(profile, _KEYS)
-    by_object = {tag.object: tag for tag in profile.tags.values() if tag.object is not None}
-    known = {(v.index, v.subindex) for v in node.values()}
-    losses += _names_lost(profile, node)
-    objects = [
-        replace(each, values=tuple(_with_tag(v, by_object.get((v.index, v.subindex)), losses) for v in each.values))
-        for each in node.objects
-    ]
-    objects += _new_objects([tag for key, tag in by_object.items() if key not in known], objects, losses)
-    return replace(node, objects=tuple(sorted(objects, key=lambda each: each.index))), losses
+    return read_eds(data, path)
 
 
-def _with_tag(value: NodeValue, tag: Tag | None, losses: list[Loss]) -> NodeValue:
+def _with_tag(value: NodeValue, tag: Tag | None, has: Collection[str], losses: list[Loss]) -> NodeValue:
     """Return the value with the properties of its tag that the format has; note those that it does not have."""
     if tag is None:
         return value
-    losses += _tag_losses(tag)
+    losses += (loss for loss in _tag_losses(tag) if loss.what not in has)
     kind = TAG_TYPES.get(value.type_code)  # type: ignore[call-overload]
     if kind != tag.type:
         losses.append(Loss(f"tag {tag.name}", f"its type {tag.type}", f"the EDS says {type_name(value.type_code)}"))
@@ -68,13 +82,16 @@ def _with_tag(value: NodeValue, tag: Tag | None, losses: list[Loss]) -> NodeValu
         losses.append(Loss(f"tag {tag.name}", f"its access {tag.access}", f"the EDS says {value.access}"))
     low, high = _limits(tag, losses) if tag.range is not None and kind == tag.type else (value.low, value.high)
     factor = f"{tag.scale!r}" if tag.scale != 1.0 else value.factor
-    return replace(value, low=low, high=high, unit=tag.unit or value.unit, factor=factor)
+    offset = f"{tag.offset!r}" if tag.offset and OFFSET in has else value.offset
+    names = tag.values if VALUE_NAMES in has and tag.values else value.names
+    unit = tag.unit or value.unit
+    return replace(value, low=low, high=high, unit=unit, factor=factor, offset=offset, names=names)
 
 
 def _tag_losses(tag: Tag) -> Iterator[Loss]:
     stated = {
-        "its offset": tag.offset != 0.0,
-        "the names of its values": bool(tag.values),
+        OFFSET: tag.offset != 0.0,
+        VALUE_NAMES: bool(tag.values),
         "`scale_by`": tag.scale_by is not None,
         "`sentinels`": bool(tag.sentinels),
         "`bits`": tag.bits is not None,
@@ -114,7 +131,9 @@ def _limits(tag: Tag, losses: list[Loss]) -> tuple[str, str]:
     return str(max(low, whole[0])), str(min(high, whole[1]))
 
 
-def _new_objects(tags: Iterable[Tag], known: Iterable[NodeObject], losses: list[Loss]) -> Iterator[NodeObject]:
+def _new_objects(
+    tags: Iterable[Tag], known: Iterable[NodeObject], has: Collection[str], losses: list[Loss]
+) -> Iterator[NodeObject]:
     """Yield objects for tags that are not in the EDS. A missing sub-object of an object that the EDS has is lost."""
     indexes = {each.index for each in known}
     for tag in tags:
@@ -124,4 +143,4 @@ def _new_objects(tags: Iterable[Tag], known: Iterable[NodeObject], losses: list[
             losses.append(Loss(f"tag {tag.name}", "the tag", f"the EDS has no object {index:04X}h:{subindex:02X}"))
             continue
         value = NodeValue(index, 0, tag.name, TYPE_CODES[tag.type], tag.access)
-        yield NodeObject(index, tag.name, VAR, (_with_tag(value, tag, losses),))
+        yield NodeObject(index, tag.name, VAR, (_with_tag(value, tag, has, losses),))

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from math import isfinite
 from typing import Any
 
 from fieldtwin.descriptions.canopen.node import NodeDescription, NodeValue, number_of
-from fieldtwin.descriptions.canopen.tag_names import TAG_TYPES, tag_names, type_name
+from fieldtwin.descriptions.canopen.tag_names import TAG_TYPES, TYPE_CODES, tag_names, type_name
 from fieldtwin.descriptions.conversion import Loss, Settings, Source, whole_setting
 from fieldtwin.descriptions.profile_text import printable
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES
 from fieldtwin.gateway.core.files.profile_schema import ProfileForm
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.eds.values import read_limit
 from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry
 
 IDENTITY = 0x1018
@@ -130,7 +132,14 @@ def _tag(value: NodeValue, mapped: frozenset[tuple[int, int]], losses: list[Loss
     scale = _factor(value, losses)
     if scale != 1.0:
         tag["scale"] = scale
-    limits = _range(value, kind, scale, losses)
+    offset = _finite(value.offset, 0.0)
+    if offset is None:
+        losses.append(Loss(f"object {value.place}", f"the offset {printable(value.offset)[:40]}", "it is not a number"))
+    if offset:
+        tag["offset"] = offset
+    if value.names:
+        tag["values"] = {number: printable(name) for number, name in value.names}
+    limits = _range(value, kind, scale, offset or 0.0, losses)
     if limits is not None:
         tag["range"] = limits
     if value.remark:
@@ -140,17 +149,23 @@ def _tag(value: NodeValue, mapped: frozenset[tuple[int, int]], losses: list[Loss
 
 def _factor(value: NodeValue, losses: list[Loss]) -> float:
     """Return the scale of a value. A factor that is not a positive or negative number is lost."""
-    try:
-        factor = float(value.factor or 1.0)
-    except ValueError:
-        factor = 0.0
-    if factor == 0.0 or not abs(factor) < float("inf"):
+    factor = _finite(value.factor, 1.0)
+    if not factor:
         losses.append(Loss(f"object {value.place}", f"the factor {printable(value.factor)[:40]}", "it is not a number"))
         return 1.0
     return factor
 
 
-def _range(value: NodeValue, kind: str, scale: float, losses: list[Loss]) -> tuple[float, float] | None:
+def _finite(text: str, otherwise: float) -> float | None:
+    """Return the number in `text`, `otherwise` if it is empty, None if it is not a finite number."""
+    try:
+        number = float(text or otherwise)
+    except ValueError:
+        return None
+    return number if isfinite(number) else None
+
+
+def _range(value: NodeValue, kind: str, scale: float, offset: float, losses: list[Loss]) -> tuple[float, float] | None:
     """Return the limits in engineering units; None if the description has no limits, or only those of the type.
 
     An integer with one limit gets the limit of its type for the other. A float with one limit loses it.
@@ -161,11 +176,15 @@ def _range(value: NodeValue, kind: str, scale: float, losses: list[Loss]) -> tup
     if ends is None and not (value.low and value.high):
         losses.append(Loss(f"object {value.place}", "its limit", "a profile states both limits or none"))
         return None
-    low = float(value.low) if value.low else ends[0] if ends else 0.0
-    high = float(value.high) if value.high else ends[1] if ends else 0.0
-    if (low, high) == ends:
+    code = TYPE_CODES[kind]
+    stated = read_limit(code, value.low), read_limit(code, value.high)
+    if None in stated and ends is None:
         return None
-    first, last = sorted((_short(low * scale), _short(high * scale)))
+    low = stated[0] if stated[0] is not None or ends is None else ends[0]
+    high = stated[1] if stated[1] is not None or ends is None else ends[1]
+    if (low, high) == ends or low is None or high is None:
+        return None
+    first, last = sorted((_short(low * scale + offset), _short(high * scale + offset)))
     return first, last
 
 

@@ -57,7 +57,7 @@ def _check_source(file: YamlFile, simulation: SimulationForm, name: str) -> None
     loc = ("simulations", name)
     if [bool(simulation.formulas), simulation.python is not None, simulation.fmu is not None].count(True) != 1:
         expected = "one of `formulas:`, `python: FILE.py:CLASS` and `fmu: FILE.fmu`"
-        raise file.error(loc, f"the source of the simulation {name!r}", expected=expected)
+        raise file.error(loc, f"the simulation of {name!r}", expected=expected)
     if simulation.fmu is None and simulation.variables:
         raise file.error((*loc, "variables"), "`variables` belongs to an FMU", expected="`fmu: FILE.fmu` beside it")
     if simulation.fmu is not None:

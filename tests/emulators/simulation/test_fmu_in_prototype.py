@@ -26,7 +26,7 @@ pytestmark = needs_gcc
     [
         ("fmu: tank.fmu", "fmu: none.fmu", r":8:\d+: no such file; expected FILE\.fmu; got none\.fmu"),
         ("fmu: tank.fmu", "fmu: fill.st", r":8:\d+: not an FMU; expected FILE\.fmu; got fill\.st"),
-        ("fmu: tank.fmu", "fmu: tank.fmu\n    python: a.py:B", r":7:\d+: the source of the simulation 'water'; expected one"),
+        ("fmu: tank.fmu", "fmu: tank.fmu\n    python: a.py:B", r":7:\d+: the simulation of 'water'; expected one"),
         ("pump: pump.run", "pumpe: pump.run", r":12:\d+: the FMU has no variable 'pumpe'; .*did you mean 'pump'"),
         ("pump: pump.run", "area2: pump.run", r":12:\d+: the FMU has no variable 'area2'"),
         ("pump: pump.run", "full: pump.run", r":12:\d+: 'full' is not an input of the FMU; expected pump, inflow; got caus"),

@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.new_site.devices import TEMPLATES, SiteBus, SiteDevice
 from fieldtwin.new_site.limits import Limits, Output
+from fieldtwin.new_site.served import ServedValue, served_values
 from fieldtwin.new_site.wishes import Ci, Control, Wishes
 from fieldtwin.site.schemas import SCHEMAS, shipped
 
@@ -62,6 +63,12 @@ class DeviceView:
     @property
     def output(self) -> Output | None:
         return self._device.output if self._controlled else None
+
+    def served(self, place: int) -> list[ServedValue]:
+        """Return what an HMI reads of the device number `place`: beside a program its supervised value, else all polled ones."""
+        if self._controlled:
+            return served_values([self._number], place)
+        return served_values((t for t in self._device.profile.tags.values() if t.poll in self.polled), place)
 
     @property
     def sampling(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -107,8 +108,18 @@ def _modbus(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | N
         click.echo(json.dumps(modbus_json(result)))
     else:
         show_modbus(result)
+        if result.units and is_pseudo_terminal(Endpoint.parse(endpoint)):
+            stderr.print(
+                "this port is a pseudo-terminal, which passes bytes at every baud rate: the settings above are not confirmed",
+                soft_wrap=True,
+            )
     found = bool(result.units or (result.heard is not None and result.heard.live))
     return _end(found, result.stopped, result.took_s)
+
+
+def is_pseudo_terminal(endpoint: Endpoint) -> bool:
+    """Return whether the port is a pseudo-terminal, also through a symbolic link, as `socat` and `fieldtwin emulate` make one."""
+    return endpoint.is_serial and os.path.realpath(endpoint.path).startswith("/dev/pts/")
 
 
 def _can(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None, as_json: bool) -> int:

@@ -19,7 +19,7 @@ from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logge
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.recordings.compare_options import LiveOptions, RuleOptions
-from fieldtwin.cli.recordings.compare_view import SHOWN, print_comparison
+from fieldtwin.cli.recordings.compare_view import SHOWN, advise_profile, print_comparison
 from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
 from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
 from fieldtwin.console import stderr
@@ -101,6 +101,8 @@ def command(
         sys.stdout.write("\n")
     else:
         print_comparison(result, recording, other, everything)
+        if recording.suffix != ".log" and not device.profile_name:
+            advise_profile(result, header_of(recording).device)
     return 0 if result.met else INCONCLUSIVE if result.inconclusive else 1
 
 

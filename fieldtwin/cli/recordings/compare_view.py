@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.table import Table
 
-from fieldtwin.capture.recordings.comparing import Comparison
+from fieldtwin.capture.recordings.comparing import Comparison, LatencyRow
 from fieldtwin.capture.recordings.rotating_file import parts_of
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.files.recording import shown
@@ -34,6 +35,7 @@ def print_comparison(result: Comparison, recording: Path, other: str, everything
             times = [f"{1000 * t:.1f}" for t in (*row.recorded_s, *row.other_s)]
             table.add_row(row.service, str(row.count), *times, "" if row.alike else "beyond tolerance")
         stdout.print(table)
+        _advise_latency(result.latency)
     kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(result.by_kind.items()))
     stdout.print(
         f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
@@ -52,6 +54,26 @@ def print_comparison(result: Comparison, recording: Path, other: str, everything
     verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
     alike = f"{100 * result.values:.1f} %" if result.compared else "not known"
     stdout.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
+
+
+def advise_profile(result: Comparison, device: str) -> None:
+    """Name --profile if registers differ that were compared one by one, although the recording names its device."""
+    if device and result.by_kind.get("value"):
+        stderr.print(
+            f"registers were compared one by one, so that a tolerance has no meaning for halves of longer numbers; "
+            f"--profile with the profile of {device} compares its values",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+
+
+def _advise_latency(rows: Sequence[LatencyRow]) -> None:
+    """Explain latencies of zero, which no device on a serial line has."""
+    if any(not row.alike for row in rows) and not any(max(row.recorded_s) for row in rows):
+        stderr.print(
+            "the recorded replies came sooner than the baud rate permits, as on a pseudo-terminal: such latencies cannot be "
+            "compared with those of a line (--latency any)",
+            soft_wrap=True,
+        )
 
 
 def _show_shifts(result: Comparison) -> None:

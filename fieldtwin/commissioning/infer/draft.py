@@ -24,6 +24,7 @@ from fieldtwin.gateway.core.files.profile_file import resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 MOST_BITS = 4000
+_WRITABLE = "# to write: add `access: rw` to the tag, and 5, 6 or 16 to the functions"
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
 
@@ -184,7 +185,8 @@ def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
         keys.append(f"read_registers: {max(2, min(125, *proved, 125))}")
     if any(m.get("pairs") for m in words):
         keys.append("even_only: true")
-    lines = [f"limits: {{{', '.join(keys)}}}"] if keys else []
+    hint = f"  {_WRITABLE}" if series.cells.keys() & {"holding", "coil"} else ""
+    lines = [f"limits: {{{', '.join(keys)}}}{hint}"] if keys else []
     gaps = _gaps(series)
     if gaps:
         lines.append("gaps: [" + ", ".join(f'"{g}"' for g in gaps) + "]")

@@ -160,3 +160,19 @@ def test_invalid_tolerances_and_missing_files(tmp_path: Path) -> None:
         called(export, path, tmp_path / "x.xls")
     code, said = called(compare, path, path)
     assert (code, said["compared"], said["values"], said["timing"], said["differences"]) == (0, 1, 1.0, 1.0, [])
+
+
+def test_compare_names_the_missing_profile_and_latencies_that_no_line_has(tmp_path: Path) -> None:
+    """Two halves of a float were compared as registers, and a recording from a pseudo-terminal has latencies of 0."""
+    for name, reply, latency_s in (("a", b"\x04\x04\x41\x20\0\0", 0.0), ("b", b"\x04\x04\x41\x21\0\0", 0.2)):
+        header = RecordingHeader(version=1, device="acme/meter", kind="exchanges", source="measured")
+        exchanges = [RecordedExchange(float(i), 1, b"\x04\0\0\0\x02", reply, latency_s) for i in range(3)]
+        lines = [encode_header(header), *map(encode_exchange, exchanges)]
+        (tmp_path / f"{name}.jsonl").write_bytes(b"".join(lines))
+    words = [str(tmp_path / "a.jsonl"), str(tmp_path / "b.jsonl")]
+    said = CliRunner().invoke(compare, words, standalone_mode=False).output
+    assert "--profile with the profile of acme/meter compares its values" in said
+    assert "(--latency any)" in said
+    swapped = CliRunner().invoke(compare, [*reversed(words), "--tolerance", "1"], standalone_mode=False).output
+    assert "--profile with" not in swapped
+    assert "--latency any" not in swapped

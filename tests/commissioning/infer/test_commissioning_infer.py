@@ -279,6 +279,7 @@ def test_from_a_hidden_map_over_the_wire_to_a_profile_that_reads_it(tmp_path: Pa
         dumps = [load_dump(tmp_path / "d.jsonl")]
         inference = infer(series_of(dumps))
         text = draft_profile(inference, dumps, "hidden")
+        assert "limits: {functions: [3], read_registers: 20}  # to write: add" in text
         checked(text, tmp_path / "p.yaml")
         (tmp_path / "p.yaml").write_text(text)
         profile = load_profile(tmp_path / "p.yaml")

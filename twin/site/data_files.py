@@ -15,6 +15,8 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
+MOST_LISTED = 8
+"""The most files of a folder that a message lists."""
 # the path is not resolved yet, because in a checkout fieldtwin/twin is a link
 _HERE = Path(__file__).absolute().parents[3].resolve()
 """The folder site-packages if a wheel is installed, otherwise the checkout."""
@@ -62,6 +64,8 @@ def _with_key(folder: Path, key: str) -> list[Path]:
     """Return the YAML files of a folder with this key at the top level, and without that of a scenario."""
     found = []
     for path in sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")]):
+        if not path.is_file():
+            continue
         try:
             with path.open("rb") as file:
                 keys = {line.partition(b":")[0] for line in file.read(MAX_BYTES).splitlines() if line[:1].isalpha()}
@@ -99,7 +103,11 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
     if direct.exists() and not direct.is_dir():
         raise UsageError(f"{name!r} is not a regular file", expected=f"a {kind[:-1]}'s file")
     if direct.name != name or direct.suffix in (".yaml", ".yml"):
-        raise UsageError(f"there is no file {name!r}", expected=f"a {kind[:-1]}'s file, or one of " + ", ".join(known))
+        key = "system" if kind == "systems" else "device"
+        folder = (beside.parent / direct if beside else direct).parent
+        there = [str(direct.parent / path.name) for path in _with_key(folder, key)]
+        expected = f"a {kind[:-1]}'s file, or one of " + ", ".join(there[:MOST_LISTED] or known)
+        raise UsageError(f"there is no file {name!r}", expected=expected, hint=did_you_mean(name, there))
     files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]
     raise UsageError(
         f"no {kind[:-1]} {name!r}",

@@ -109,7 +109,7 @@ def _logic(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
         return x.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
     kind = ty.common(left.type, right.type)
     if kind is None or not ty.is_kind(kind, "bool", "bits"):
-        _mismatch(x, expr, left, right, "BOOL, or bit strings of compatible types")
+        _mismatch(x, expr, left, right, "BOOL, or bit strings (BYTE, WORD, DWORD, LWORD) of compatible types")
     a_code, b_code = x.coerced(left, kind, expr.pos), x.coerced(right, kind, expr.pos)
     if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
         _mismatch(x, expr, left, right, "BOOL")

@@ -34,6 +34,16 @@ def test_a_missing_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name:
         find("systems", name)
 
 
+def test_missing_profile_of_a_site_lists_the_profiles_in_its_folder(tmp_path: Path) -> None:
+    """Defect: the message listed all shipped profiles, and none of the site."""
+    (tmp_path / "profiles").mkdir()
+    for name in ("analyser", "pump"):
+        (tmp_path / "profiles" / f"{name}.yaml").write_text(f"device: test/{name}\n")
+    told = r"there is no file 'profiles/pumpe.yaml'; expected .*, or one of profiles/analyser.yaml, profiles/pump.yaml \(did you"
+    with pytest.raises(UsageError, match=told):
+        find("devices", "profiles/pumpe.yaml", beside=tmp_path / "site.yaml")
+
+
 def test_a_site_without_a_prototype_reports_the_remedy(tmp_path: Path) -> None:
     shutil.copy(data_root() / "profiles" / "systems" / "observatory.yaml", tmp_path / "mysite.yaml")
     with pytest.raises(

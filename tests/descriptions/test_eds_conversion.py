@@ -204,6 +204,15 @@ def test_one_limit_of_an_integer_is_completed_by_that_of_its_type() -> None:
     assert tag.range == (0, 100)
 
 
+def test_an_array_without_sub_objects_is_listed_as_left_out() -> None:
+    text = (
+        ONE_OBJECT.format("2000") + "DataType=6\n[2001]\nParameterName=Valve\nObjectType=8\nDataType=8\nAccessType=rw\n"
+    )
+    result = eds.import_description(Source(Path("t.eds"), text.encode()), {})
+    assert result.repairs == ("[2001]: left out, 'Valve' has no sub-objects (line 9)",)
+    assert list(result.profile.tags) == ["speed"]
+
+
 def test_a_file_without_objects_for_tags_is_refused() -> None:
     text = ONE_OBJECT.format("1017") + "DataType=6\n"
     with pytest.raises(FileInvalid, match="no object becomes a tag"):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 
 from fieldtwin.descriptions.canopen.node import NodeDescription, NodeObject, NodeValue
-from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, parse_dictionary
+from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary, parse_dictionary
 from fieldtwin.gateway.protocols.canopen.eds.text import EdsText, Section, decode_eds, read_eds_text
 from fieldtwin.gateway.protocols.canopen.eds.values import read_value
 
+_OBJECT = re.compile(r"[0-9A-F]{4}")
+_FIRST_OBJECT = 0x1000
+"""Lower indexes define data types (CiA 301, 7.4.1)."""
 _ANY_NODE = 1
 """A node ID to check a value that depends on the node ID; the description keeps its text."""
 
@@ -31,7 +36,15 @@ def read_eds(data: bytes, path: Path) -> tuple[NodeDescription, tuple[str, ...]]
         int(commissioning.get("Baudrate", "0")) or None,
         commissioning.get("NodeName", ""),
     )
-    return described, dictionary.mended
+    return described, (*dictionary.mended, *_without_values(eds, dictionary))
+
+
+def _without_values(eds: EdsText, dictionary: ObjectDictionary) -> Iterator[str]:
+    """Yield a message for each object that has no value, such as an array without sub-objects."""
+    indexes = {index for index, _ in dictionary.entries}
+    for name, section in eds.sections.items():
+        if _OBJECT.fullmatch(name) and int(name, 16) >= _FIRST_OBJECT and int(name, 16) not in indexes:
+            yield f"[{name}]: left out, {section.values['ParameterName']!r} has no sub-objects (line {section.line})"
 
 
 def _object(section: Section, entries: tuple[DictionaryEntry, ...], eds: EdsText) -> NodeObject:

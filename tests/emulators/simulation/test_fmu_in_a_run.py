@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from fmu_rig import build_fmu, in_prototype, needs_gcc, tank_site
+from template_rig import own_system
 
 from fieldtwin.cli.main import cli
 from fieldtwin.results.model import ScenarioResult, Verdict
@@ -67,6 +68,24 @@ def test_two_fmus_are_coupled_through_devices(tmp_path: Path) -> None:
     result = scenario(
         system, "virtual", 'wait: {until: "lower.level > 0.5", within: 15s}',
         'expect: {that: "sensor.level + lower.level > 1.66 and sensor.level + lower.level < 1.74", during: 1s}',
+    )  # fmt: skip
+    assert result.verdict is Verdict.PASSED, result
+
+
+def test_an_object_of_a_canopen_node_has_the_value_of_an_fmu(tmp_path: Path) -> None:
+    system = own_system(tmp_path / "site")
+    system.write_text(
+        system.read_text().replace("node: 5,", "node: 5, tpdo1: {map: [slope_long, slope_lateral], event_ms: 100},")
+    )
+    build_fmu(system.with_name("tank.fmu"))
+    prototype = system.with_name("dam.prototype.yaml")
+    text = prototype.read_text().replace(
+        "{recording: tilt.jsonl, at_end: loop}", "{simulation: water, plays: {slope_long: level}}"
+    )
+    prototype.write_text(text + "simulations: {water: {fmu: tank.fmu, start: {level: 1.5, pump: 1}}}\n")
+    result = scenario(
+        system, "virtual", 'wait: {until: "tilt.slope_long > 1.5", within: 5s}',
+        'wait: {until: "tilt.slope_long > 2.2", within: 30s}',
     )  # fmt: skip
     assert result.verdict is Verdict.PASSED, result
 

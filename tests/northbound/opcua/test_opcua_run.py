@@ -64,6 +64,19 @@ def test_values_have_the_types_units_and_names_of_the_profile(hall: tuple[Fieldt
     asyncio.run(look(hall[1]))
 
 
+def test_a_poll_with_an_equal_value_brings_a_new_time(hall: tuple[Fieldtwin, str]) -> None:
+    async def look(url: str) -> None:
+        async with client(url) as connected:
+            before = await value_of(connected, "sensor.flow")
+            async with asyncio.timeout(20):
+                while (after := await value_of(connected, "sensor.flow")).SourceTimestamp == before.SourceTimestamp:
+                    await asyncio.sleep(0.05)
+            assert after.SourceTimestamp > before.SourceTimestamp
+            assert (after.Value, after.StatusCode) == (before.Value, before.StatusCode)
+
+    asyncio.run(look(hall[1]))
+
+
 def test_a_secret_tag_has_no_variable(hall: tuple[Fieldtwin, str]) -> None:
     async def look(url: str) -> None:
         async with client(url) as connected:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from json.decoder import scanstring  # type: ignore[attr-defined]  # not in the type stubs
 from typing import Any
@@ -54,6 +54,13 @@ class Document:
         if not isinstance(value, list):
             raise self.error(loc, name, expected="a list", got=_kind(value))
         return [((*loc, i), self.mapping(each, (*loc, i), f"entry {i + 1} of {name}")) for i, each in enumerate(value)]
+
+    def choice(self, value: object, loc: Loc, name: str, options: Iterable[str]) -> str:
+        """Return `value` if it is one of the texts `options`. Raises `FileInvalid` otherwise."""
+        known = list(options)
+        if not isinstance(value, str) or value not in known:
+            raise self.error(loc, name, expected=", ".join(each for each in known if each), got=_shown(value))
+        return value
 
     def integer(self, value: object, loc: Loc, name: str, low: int, high: int) -> int:
         """Return a whole number, which may be written as text such as "3" or "0x10". Raises `FileInvalid` for other values."""

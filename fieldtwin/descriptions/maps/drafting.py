@@ -6,7 +6,7 @@ Addresses are those that are sent, from 0. Names become names of tags; the origi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fieldtwin.descriptions.conversion import Imported, Loss, Settings
@@ -48,6 +48,22 @@ class Draft:
     def factory(self, **settings: int | str) -> None:
         """Set the unit ID, and the baud rate and frame of a serial line."""
         self._factory.update(settings)
+
+    def serial(
+        self,
+        loc: Loc,
+        stated: Mapping[str, Any],
+        keys: Sequence[str] = ("baudrate", "bytesize", "parity", "stopbits"),
+        usual_rate: int = 9600,
+    ) -> None:
+        """Set baud rate and frame of a serial line, which `stated` has under these `keys`. The usual frame is 8N1."""
+        document = self._document
+        baudrate, data, parity, stop = keys
+        rate = document.integer(stated.get(baudrate, usual_rate), (*loc, baudrate), f"`{baudrate}`", 1, 10_000_000)
+        bits = document.integer(stated.get(data, 8), (*loc, data), f"`{data}`", 7, 8)
+        stops = document.integer(stated.get(stop, 1), (*loc, stop), f"`{stop}`", 1, 2)
+        letter = document.choice(str(stated.get(parity) or "N")[:1].upper(), (*loc, parity), f"`{parity}`", "NEO")
+        self.factory(baudrate=rate, frame=f"{bits}{letter}{stops}")
 
     def lose(self, place: str, what: str, why: str) -> None:
         """Add a loss, unless the same loss of the same place is listed already."""
@@ -143,8 +159,3 @@ def choose(found: Sequence[tuple[str, int]], wanted: str, path: str) -> int:
         expected="one of " + ", ".join(labels[:40]) + (" and more" if len(labels) > 40 else ""),
         hint=did_you_mean(wanted, labels) or "select it with --set select=NAME, UNIT or NAME/UNIT",
     )
-
-
-def unknown_keys(value: Iterable[str], known: Iterable[str]) -> list[str]:
-    """Return the keys that are not `known`, in the order of the file."""
-    return [key for key in value if key not in set(known)]

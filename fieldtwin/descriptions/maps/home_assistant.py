@@ -120,15 +120,8 @@ def _unit(document: Document, loc: Loc, entity: Mapping[str, Any]) -> int:
 def _import_hub(document: Document, loc: Loc, hub: Mapping[str, Any], draft: Draft) -> None:
     kind = hub.get("type", "tcp")
     if kind == "serial":
-        rate = document.integer(hub.get("baudrate", 9600), (*loc, "baudrate"), "`baudrate`", 1, 10_000_000)
-        bits = document.integer(hub.get("bytesize", 8), (*loc, "bytesize"), "`bytesize`", 7, 8)
-        stop = document.integer(hub.get("stopbits", 1), (*loc, "stopbits"), "`stopbits`", 1, 2)
-        parity = str(hub.get("parity", "N")).upper()
-        if parity not in ("N", "E", "O"):
-            raise document.error((*loc, "parity"), "`parity`", expected="N, E or O", got=repr(hub.get("parity")))
-        draft.factory(baudrate=rate, frame=f"{bits}{parity}{stop}")
-    elif kind not in _HUB_TYPES:
-        raise document.error((*loc, "type"), "`type`", expected=", ".join(_HUB_TYPES), got=repr(kind))
+        draft.serial(loc, hub)
+    document.choice(kind, (*loc, "type"), "`type`", _HUB_TYPES)
     draft.lose("key host", "address of the hub", "an endpoint belongs in the system file")
     for key in ("timeout", "delay", "message_wait_milliseconds", "retries"):
         if key in hub:
@@ -175,21 +168,18 @@ def _table(document: Document, loc: Loc, platform: str, entity: Mapping[str, Any
     key = "write_type" if platform == "switches" else "input_type"
     kind = entity.get(key, "coil" if platform == "binary_sensors" else "holding")
     kind = {"coils": "coil", "holdings": "holding"}.get(str(kind), str(kind))
-    if kind not in _INPUTS:
-        raise document.error((*loc, key), f"`{key}`", expected=", ".join(_INPUTS), got=repr(kind))
-    return _INPUTS[kind]
+    return _INPUTS[document.choice(kind, (*loc, key), f"`{key}`", _INPUTS)]
 
 
 def _sensor_fields(
     document: Document, loc: Loc, entity: Mapping[str, Any], place: str, draft: Draft
 ) -> dict[str, Any] | None:
     """Return the fields of a tag, or None if a profile cannot hold the value."""
-    kind = str(entity.get("data_type", "int16"))
+    stated = kind = str(entity.get("data_type", "int16"))
     count = document.integer(entity.get("count") or 1, (*loc, "count"), "`count`", 1, 125)
     swap = entity.get("swap", "none")
-    order = _SWAPS.get({False: "none", None: "none"}.get(swap, str(swap)))
-    if order is None:
-        raise document.error((*loc, "swap"), "`swap`", expected=", ".join(_SWAPS), got=repr(swap))
+    swap = "none" if swap in (False, None) else swap  # an older file may have `swap: false`
+    order = _SWAPS[document.choice(swap, (*loc, "swap"), "`swap`", _SWAPS)]
     if kind in _OLD_TYPES:
         kind = _OLD_TYPES[kind][count - 1] if count <= 4 else ""
     if kind == "custom":
@@ -199,8 +189,8 @@ def _sensor_fields(
             draft.lose(place, "the tag", f"its structure {structure!r} is not a single value of a profile's type")
             return None
     if kind not in _TYPES:
-        if kind == "float16" or entity.get("data_type") in _OLD_TYPES:
-            draft.lose(place, "the tag", f"a profile has no type {entity.get('data_type')} of {count} registers")
+        if kind == "float16" or stated in _OLD_TYPES:
+            draft.lose(place, "the tag", f"a profile has no type {stated} of {count} registers")
             return None
         raise document.error((*loc, "data_type"), "`data_type`", expected=", ".join(sorted(_TYPES)), got=repr(kind))
     fields: dict[str, Any] = {"type": kind, "order": None if order == "ABCD" else order}

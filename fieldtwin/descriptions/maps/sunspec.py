@@ -136,11 +136,7 @@ def _repetitions(reader: _Reader, loc: Loc, group: Mapping[str, Any], name: str)
 def _read_point(reader: _Reader, loc: Loc, point: Mapping[str, Any], prefix: str) -> None:
     document, draft = reader.document, reader.draft
     name = document.text(point.get("name"), (*loc, "name"), "`name`")
-    kind = point.get("type")
-    if kind not in _TYPES:
-        raise document.error(
-            (*loc, "type"), f"the type of the point {name!r}", expected=", ".join(_TYPES), got=repr(kind)
-        )
+    kind = document.choice(point.get("type"), (*loc, "type"), f"the type of the point {name!r}", _TYPES)
     tag_type, registers, missing = _TYPES[kind]
     size = document.integer(point.get("size", registers), (*loc, "size"), "`size`", 1, 1000)
     if registers and size != registers:

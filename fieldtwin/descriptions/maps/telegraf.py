@@ -70,9 +70,7 @@ def import_description(source: Source, settings: Settings) -> Imported:
 
 def _style(document: Document, loc: Loc, plugin: Mapping[str, Any]) -> str:
     style = plugin.get("configuration_type", "register")
-    if style not in _STYLES:
-        raise document.error((*loc, "configuration_type"), "the style", expected=", ".join(_STYLES), got=repr(style))
-    return str(style)
+    return document.choice(style, (*loc, "configuration_type"), "`configuration_type`", _STYLES)
 
 
 def _units(document: Document, loc: Loc, plugin: Mapping[str, Any]) -> list[int]:
@@ -90,13 +88,7 @@ def _units(document: Document, loc: Loc, plugin: Mapping[str, Any]) -> list[int]
 def _import_connection(document: Document, loc: Loc, plugin: Mapping[str, Any], draft: Draft) -> None:
     controller = str(plugin.get("controller", ""))
     if controller.startswith("file:") or "baud_rate" in plugin:
-        rate = document.integer(plugin.get("baud_rate", 9600), (*loc, "baud_rate"), "`baud_rate`", 1, 10_000_000)
-        bits = document.integer(plugin.get("data_bits", 8), (*loc, "data_bits"), "`data_bits`", 7, 8)
-        stop = document.integer(plugin.get("stop_bits", 1), (*loc, "stop_bits"), "`stop_bits`", 1, 2)
-        parity = str(plugin.get("parity", "N"))[:1].upper()
-        if parity not in ("N", "E", "O"):
-            raise document.error((*loc, "parity"), "`parity`", expected="N, E or O", got=repr(plugin.get("parity")))
-        draft.factory(baudrate=rate, frame=f"{bits}{parity}{stop}")
+        draft.serial(loc, plugin, ("baud_rate", "data_bits", "parity", "stop_bits"))
     if controller:
         draft.lose("key controller", f"address {controller}", "an endpoint belongs in the system file")
     for key in ("timeout", "busy_retries", "workarounds", "optimization", "tags"):
@@ -119,10 +111,9 @@ def _fields(
             continue
         for at, field in document.entries(block.get("fields"), (*place, "fields"), "`fields`"):
             name = (block if style == "request" else field).get("register", "holding")
-            if name not in _REGISTERS:
-                raise document.error(at, "`register`", expected=", ".join(_REGISTERS), got=repr(name))
+            table = _REGISTERS[document.choice(name, (*at, "register"), "`register`", _REGISTERS)]
             measurement = field.get("measurement") or block.get("measurement")
-            yield at, field | {"measurement": measurement}, _REGISTERS[name], block.get("byte_order", ""), style
+            yield at, field | {"measurement": measurement}, table, block.get("byte_order", ""), style
 
 
 def _import_field(
@@ -141,11 +132,8 @@ def _import_field(
                 draft.lose(f"field {name}", "the tag", f"a profile has no type {kind}")
                 return
             raise document.error(loc, f"the type of {name!r}", expected=", ".join(_TYPES), got=kind or "nothing")
-        if order not in _ORDERS:
-            raise document.error(
-                loc, f"the byte order of {name!r}", expected="ABCD, CDAB, BADC or DCBA", got=repr(order)
-            )
-        fields |= {"type": _TYPES[kind], "order": None if _ORDERS[str(order)] == "ABCD" else _ORDERS[str(order)]}
+        found = _ORDERS[document.choice(order, loc, f"the byte order of {name!r}", _ORDERS)]
+        fields |= {"type": _TYPES[kind], "order": None if found == "ABCD" else found}
         if kind == "STRING":
             fields["registers"] = length or document.integer(field.get("length"), (*loc, "length"), "`length`", 1, 125)
         elif length not in (0, REGISTERS_OF[_TYPES[kind]]):

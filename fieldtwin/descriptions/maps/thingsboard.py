@@ -89,13 +89,7 @@ def _devices(document: Document) -> Iterator[tuple[Loc, dict[str, Any]]]:
 def _import_device(document: Document, loc: Loc, device: Mapping[str, Any], unit: int, draft: Draft) -> None:
     draft.factory(unit=unit)
     if device.get("type") == "serial" or "baudrate" in device:
-        rate = document.integer(device.get("baudrate", 19200), (*loc, "baudrate"), "`baudrate`", 1, 10_000_000)
-        bits = document.integer(device.get("bytesize", 8), (*loc, "bytesize"), "`bytesize`", 7, 8)
-        stop = document.integer(device.get("stopbits", 1), (*loc, "stopbits"), "`stopbits`", 1, 2)
-        parity = str(device.get("parity") or "N")[:1].upper()
-        if parity not in ("N", "E", "O"):
-            raise document.error((*loc, "parity"), "`parity`", expected="N, E or O", got=repr(device["parity"]))
-        draft.factory(baudrate=rate, frame=f"{bits}{parity}{stop}")
+        draft.serial(loc, device, usual_rate=19200)
     draft.lose("key host", "address of the device", "an endpoint belongs in the system file")
     kept = {"unitId", "deviceName", "byteOrder", "wordOrder", "host", "port", "type", *_SECTIONS}
     kept |= {"baudrate", "bytesize", "stopbits", "parity", "method"}
@@ -212,9 +206,7 @@ def _order(document: Document, loc: Loc, entry: Mapping[str, Any], device: Mappi
     found = []
     for key in ("byteOrder", "wordOrder"):
         value = str(entry.get(key) or device.get(key) or "LITTLE").upper()
-        if value not in ("BIG", "LITTLE"):
-            raise document.error((*loc, key), f"`{key}`", expected="BIG or LITTLE", got=repr(value))
-        found.append(value)
+        found.append(document.choice(value, (*loc, key), f"`{key}`", ("BIG", "LITTLE")))
     return _ORDERS[found[0], found[1]]
 
 

@@ -41,18 +41,18 @@ def test_every_model_that_pysunspec2_ships_is_imported() -> None:
         found = import_description(Source(path, path.read_bytes()), {"base": "100"})
         profile = resolve(YamlFile(path.name, found.profile.model_dump(exclude_defaults=True), {}))
         assert profile.tags["id"].registers.address == 100
-        lost = sum(loss.what == "the tag" for loss in found.losses)  # texts that no single request can read
+        lost = sum(loss.what == "the tag" for loss in found.losses)  # points that no single request can read
         assert len(profile.tags) + lost >= len(definition["group"]["points"]), path.name
 
 
 def test_points_have_the_addresses_that_pysunspec2_computes() -> None:
-    for number in (1, 103, 160, 705):
+    for number in (1, 103, 160, 705, 64411):  # 64411 has points that no single request can read
         path = model_path(number)
         profile = imported(path, base="40002", repeat="0")
         offset = 40002
         for point in json.loads(path.read_text(encoding="utf-8"))["group"]["points"]:
-            tag = next(t for n, t in profile.tags.items() if t.registers.address == offset)
-            assert tag.registers.count == point["size"], point["name"]
+            found = [tag.registers.count for tag in profile.tags.values() if tag.registers.address == offset]
+            assert found == ([point["size"]] if point["size"] <= 125 else []), point["name"]
             offset += point["size"]
 
 

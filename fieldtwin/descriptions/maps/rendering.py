@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from fieldtwin.descriptions.conversion import Loss, require_protocol
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile import BIT_TABLES, DeviceProfile, Tag
 from fieldtwin.gateway.core.files.profile_schema import ProfileForm
 
 PLACEHOLDER = "tcp://192.0.2.1:502"
@@ -75,12 +75,16 @@ def exported(profile: DeviceProfile, abilities: Abilities, losses: list[Loss]) -
     require_protocol(profile, "modbus", abilities.name)
     losses += device_losses(profile.form, abilities)
     described = descriptions(profile)
-    for tag in profile.tags.values():
-        place = f"tag {tag.name}"
+    for stated in profile.tags.values():
+        tag, place = stated, f"tag {stated.name}"
+        if tag.type == "bool" and tag.registers.table not in BIT_TABLES:
+            tag = replace(tag, type="uint16", scale=1.0, offset=0.0)  # a bool has no scale
         why = _reason_to_omit(tag, abilities)
         if why:
             losses.append(Loss(place, "the tag", why))
             continue
+        if tag.type != stated.type:
+            losses.append(Loss(place, "type bool", "it is in a register, and is exported as a number"))
         losses += [
             Loss(place, what, f"{abilities.name} has no place for it")
             for key, what in _OPTIONAL.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,7 @@ def _table(readings: list[Interpretation]) -> Table:
         kind += " swapped" if r.registers == 1 and r.order == "BADC" else ""
         kind += f" x {r.scale:g}" if r.scale != 1.0 else ""
         value = r.values[-1]
-        last = repr(value) if isinstance(value, str) else f"{value * r.scale:.7g}"
+        last = repr(value) if isinstance(value, str) else "NaN" if math.isnan(value) else f"{value * r.scale:.7g}"
         table.add_row(f"{r.table}:{r.address}", kind, Text(last), Text(doubts(r), COLOUR[r.level]))
     return table
 
@@ -125,8 +126,15 @@ def _described(inference: Inference, out: Path | None) -> dict[str, Any]:
             "rivals": [
                 dict(zip(("type", "address", "order", "probability"), rival, strict=True)) for rival in r.rivals
             ],
-            "last": r.values[-1],
+            "sentinels": list(r.sentinels),
+            "last": _last(r),
         }
         for r in inference.readings
     ]
     return {"passes": inference.series.passes, "readings": rows, "draft": str(out) if out is not None else None}
+
+
+def _last(reading: Interpretation) -> float | str | None:
+    """Return the last value; None for NaN, which JSON does not have."""
+    value = reading.values[-1]
+    return value if isinstance(value, str) or not math.isnan(value) else None

@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.files.profile import REGISTERS_OF
 from fieldtwin.gateway.devices.codec import reorder
 
 IMPOSSIBLE = math.inf
-"""The cost of a reading that no device can have, such as NaN or a float of an implausible magnitude."""
+"""The cost of a reading that no device can have, such as infinity or a float of an implausible magnitude."""
 MOST_TEXT_REGISTERS = 24
 
 TYPE_COST = {
@@ -40,6 +40,15 @@ _FORMATS = {
     "float64": ">d",
 }  # fmt: skip
 _MANTISSA_BITS = {"float32": 23, "float64": 52}
+NANS = {
+    "float32": frozenset({0x7FC0_0000, 0xFFC0_0000}),
+    "float64": frozenset({0x7FF8_0000_0000_0000, 0xFFF8_0000_0000_0000}),
+}
+"""The bit patterns of NaN that devices send for a value that is not available: quiet, without a payload (IEEE 754-2019, 6.2.1).
+SunSpec has the positive ones.
+"""
+_NAN_COST, _NAN_CHANGE_COST = 3.0, 1.5
+"""The cost of a float that is sometimes not available, and of each change between available and not available."""
 _LN2 = math.log(2)
 WILD_COST = 9.0
 """The cost of a number that jumps over its whole range, as the lower half of a longer number does."""
@@ -108,10 +117,16 @@ def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
     """Return the same cost as `cost`, for words that are already combined to unsigned numbers."""
     if not any(wholes):
         return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind]
+    rarity = TYPE_COST[kind]
+    if kind in NANS and not NANS[kind].isdisjoint(wholes):
+        absent = [w in NANS[kind] for w in wholes]
+        if all(absent):
+            return IMPOSSIBLE
+        wholes = [w for w in wholes if w not in NANS[kind]]
+        rarity += _NAN_COST + _NAN_CHANGE_COST * sum(a != b for a, b in pairwise(absent))
     numbers = decode_numbers(wholes, kind)
     if numbers is None:
         return IMPOSSIBLE
-    rarity = TYPE_COST[kind]
     carried = 0.0
     if REGISTERS_OF[kind] == 2:
         carried = carry_evidence([w >> 16 for w in wholes], [w & 0xFFFF for w in wholes])

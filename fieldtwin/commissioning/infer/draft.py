@@ -100,7 +100,7 @@ def _percent(reading: Interpretation) -> str:
 def _seen(reading: Interpretation) -> str:
     if reading.type == "string":
         return f"{reading.values[0]!r}".replace("#", "")
-    numbers = [float(v) for v in reading.values]
+    numbers = [float(v) for v in reading.available]
     low, high = min(numbers), max(numbers)
     return f"always {low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 
@@ -119,6 +119,8 @@ def _tag(reading: Interpretation) -> list[str]:
         keys += [f"registers: {reading.registers}", "poll: identity"]
     if reading.scale != 1.0:
         keys.append(f"scale: {reading.scale:g}")
+    if reading.sentinels:
+        keys.append(f"sentinels: [{', '.join(f'0x{s:0{4 * reading.registers}X}' for s in reading.sentinels)}]")
     if {"counter", "seconds"} & set(reading.marks):
         keys.append("counter: true")
     if "enumeration" in reading.marks:

@@ -18,6 +18,7 @@ from statistics import median
 from fieldtwin.commissioning.infer.costs import (
     IMPOSSIBLE,
     MOST_TEXT_REGISTERS,
+    NANS,
     NUMBERS,
     ORDER_COST,
     cost,
@@ -57,7 +58,8 @@ class Interpretation:
 
     `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value was seen that
     distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is the reason why the
-    reading is not certain, however probable it is.
+    reading is not certain, however probable it is. `values` has NaN for each pass in which a float was not available, and
+    `sentinels` holds the bit patterns of these NaNs.
     """
 
     table: str
@@ -74,10 +76,16 @@ class Interpretation:
     scale: float = 1.0
     notes: tuple[str, ...] = field(default=())
     model: float | None = None
+    sentinels: tuple[int, ...] = ()
+
+    @property
+    def available(self) -> list[float | str]:
+        """Return the values without those that are NaN."""
+        return [v for v in self.values if isinstance(v, str) or not math.isnan(v)]
 
     @property
     def distinct(self) -> int:
-        return len(set(self.values))
+        return len(set(self.available))
 
     @property
     def moves(self) -> bool:
@@ -93,7 +101,7 @@ class Interpretation:
             return Level.UNKNOWN
         if self.probability < LIKELY:
             return Level.GUESS
-        enough = len(self.values) >= FEWEST_PASSES and self.distinct >= FEWEST_VALUES
+        enough = len(self.available) >= FEWEST_PASSES and self.distinct >= FEWEST_VALUES
         trusted = self.probability if self.model is None else self.model
         if trusted < CERTAIN or not enough or self.capped:
             return Level.LIKELY
@@ -253,6 +261,7 @@ def _reading(
         equal = [
             t for _, t in covering if (t.start, t.size, t.type, t.order) == (tile.start, tile.size, twin, tile.order)
         ]
+    nans = NANS[tile.type].intersection(whole_numbers(rows, tile.order)) if tile.type in NANS else ()
     share = min(1.0, share + sum(math.exp(w) for w, t in covering if t in equal))
     others = sorted(((w, t) for w, t in covering if t is not tile and t not in equal), key=lambda x: -x[0])[:3]
     rivals = tuple((t.type, address + t.start, t.order, min(1.0, math.exp(w))) for w, t in others)
@@ -269,6 +278,7 @@ def _reading(
         rivals,
         _cap(tile, words, values),
         sign_open,
+        sentinels=tuple(sorted(nans)),
     )
 
 
@@ -296,14 +306,15 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
     """Return why a reading is not certain whatever its probability: another reading would have shown the same values."""
     if tile.type == "string":
         return ""
-    numbers = [float(v) for v in values]
+    absent = {i for i, v in enumerate(values) if math.isnan(float(v))}
+    numbers = [float(v) for i, v in enumerate(values) if i not in absent]
     steps = [b - a for a, b in pairwise(numbers)]
     monotone = all(s >= 0 for s in steps) or all(s <= 0 for s in steps)
     if tile.type.startswith("int") and monotone and min(numbers) < 0 <= max(numbers):
         return "a counter that overflowed looks the same"
     if tile.type.startswith("float") and monotone:
         return "it changed in only one direction"
-    still = [len(set(w)) == 1 for w in words[tile.start : tile.end]]
+    still = [len({w for i, w in enumerate(row) if i not in absent}) == 1 for row in words[tile.start : tile.end]]
     if tile.order in ("CDAB", "DCBA"):
         still.reverse()
     half = tile.size // 2

@@ -5,6 +5,7 @@ The module does no I/O. A mark needs enough observations; a mere resemblance bec
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -29,9 +30,15 @@ _MAINS = (
 
 def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
     """Return `reading` with its marks and notes. `times_s`: the time of each pass, in seconds since 1970 UTC."""
-    if reading.type == "string" or not reading.moves:
+    if reading.type == "string":
         return reading
-    numbers = [float(v) for v in reading.values]
+    known = [(float(v), t) for v, t in zip(reading.values, times_s, strict=True) if not math.isnan(float(v))]
+    if len(known) < len(times_s):
+        note = f"NaN in {len(times_s) - len(known)} of {len(times_s)} passes: perhaps not available"
+        reading = replace(reading, notes=(*reading.notes, note))
+    if not reading.moves:
+        return reading
+    numbers, times_s = [n for n, _ in known], [t for _, t in known]
     whole = "int" in reading.type or reading.type.startswith("bcd")
     marks, notes = list(reading.marks), list(reading.notes)
     steps = [b - a for a, b in pairwise(numbers)]

@@ -94,7 +94,6 @@ def _tag_losses(tag: Tag) -> Iterator[Loss]:
         VALUE_NAMES: bool(tag.values),
         "`scale_by`": tag.scale_by is not None,
         "`sentinels`": bool(tag.sentinels),
-        "`bits`": tag.bits is not None,
         "`counter`": tag.counter,
         "`nonvolatile`": tag.nonvolatile,
         "`secret`": tag.secret,

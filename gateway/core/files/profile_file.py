@@ -25,6 +25,12 @@ from fieldtwin.gateway.core.files.profile import (
 from fieldtwin.gateway.core.files.profile_schema import BoxForm, MessageForm, ProfileForm, TagForm
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 
+_WHOLE_OBJECT = (
+    "name the values of the whole object with `values`; a program takes its bits: declare a BYTE, WORD or DWORD, and use "
+    "`outputs AND 1`"
+)
+"""The alternative to several tags of one CANopen object, which is one value in a PDO and in an SDO (CiA 301, 7.2.2 and 7.2.4)."""
+
 
 def load_profile(path: Path) -> DeviceProfile:
     """Read a profile. Raises `FileInvalid` with line and column for every error."""
@@ -35,11 +41,20 @@ def resolve(file: YamlFile) -> DeviceProfile:
     """Return a parsed profile file as a `DeviceProfile`."""
     form = validate(file, ProfileForm)
     tags: dict[str, Tag] = {}
+    by_object: dict[tuple[int, int], Tag] = {}
     for name, tag_form in form.tags.items():
         for tag in _tags_of(file, form, name, tag_form):
             if tag.name in tags:
                 raise file.error(("tags", name), f"the tag {tag.name!r} is defined twice")
             tags[tag.name] = tag
+            if tag.object is not None and (first := by_object.setdefault(tag.object, tag)) is not tag:
+                index, subindex = tag.object
+                raise file.error(
+                    ("tags", name, "object"),
+                    f"the object {index:04X}h:{subindex:02X} already has the tag {first.name!r}",
+                    expected="one tag for each object",
+                    hint=_WHOLE_OBJECT,
+                )
     profile = DeviceProfile(
         path=file.path,
         hash=hashlib.sha256(form.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:16],
@@ -114,12 +129,12 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
 
 def _check_bits(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, kind: str, bits: tuple[int, int]) -> None:
     name, (low, high) = str(loc[-1]), bits
-    if form.protocol == "canopen" and kind != "uint16":
+    if form.protocol == "canopen":
         raise file.error(
             (*loc, "bits"),
             f"{name!r} is a part of a CANopen object",
             expected="a tag of the whole object",
-            hint="a program takes its bits: declare a BYTE or WORD, and use `outputs AND 1`",
+            hint=_WHOLE_OBJECT,
         )
     if kind not in ("uint16", "bool") or not 0 <= low <= high <= 15:
         raise file.error(

@@ -92,7 +92,7 @@ class TagForm(Strict):
     offset: float = 0.0
     scale_by: str | None = Field(default=None, description="tag that holds the power of ten to multiply by (SunSpec)")
     bits: tuple[int, int] | None = Field(
-        default=None, description="lowest and highest bit of one register, 0 to 15; one bit with type bool"
+        default=None, description="Modbus: lowest and highest bit of one register, 0 to 15; one bit with type bool"
     )
     sentinels: list[int] = Field(
         default=[], description="raw values that mean that the value is not implemented (SunSpec 0x8000, 0xFFFF)"

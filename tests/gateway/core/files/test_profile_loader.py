@@ -134,6 +134,35 @@ def test_contradictions_are_found_when_the_file_is_read(text: str, line: int, to
     assert error.value.path == "p.yaml"
 
 
+CANOPEN = "protocol: canopen\neds: x.eds\ntags:\n"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "place", "told"),
+    [
+        ('whole: {object: "6200:01", type: int8}', 'again: {object: "6200:01", type: int8}', "7:11",
+         "6200h:01 already has the tag 'whole'"),
+        ('word: {object: "60FD:00", type: uint32}', 'rest: {object: "60fd:00", type: bool}', "7:10",
+         "60FDh:00 already has the tag 'word'"),
+        ('out1..2: {object: "6200:01"}', 'last: {object: "6200:02", access: wo}', "7:10", "6200h:02 already has the tag 'out2'"),
+        ('last: {object: "6200:02"}', 'out1..2: {object: "6200:01"}', "7:13", "6200h:02 already has the tag 'last'"),
+    ],
+)  # fmt: skip
+def test_second_tag_of_a_canopen_object_is_an_error_because_a_pdo_would_set_only_one(
+    first: str, second: str, place: str, told: str
+) -> None:
+    with pytest.raises(FileInvalid, match=r"expected one tag for each object .*`values`.*`outputs AND 1`") as error:
+        read(f"{CANOPEN}  {first}\n  {second}\n")
+    assert f"p.yaml:{place}: the object {told}" in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "uint32", "bool"])
+def test_bits_of_a_canopen_object_are_an_error_for_every_type(kind: str) -> None:
+    with pytest.raises(FileInvalid, match=r"expected a tag of the whole object .*`values`.*`outputs AND 1`") as error:
+        read(CANOPEN + f'  acid: {{object: "6200:01", type: {kind}, bits: [0, 0]}}\n')
+    assert (error.value.line, error.value.message) == (6, "'acid' is a part of a CANopen object")
+
+
 def test_the_hash_depends_on_the_content_and_not_on_the_notation() -> None:
     plain = read("protocol: modbus\ntags:\n  a: {at: 40001}\n")
     styled = read("# a comment\nprotocol: modbus\ntags:\n  a:\n    at: 40001\n")

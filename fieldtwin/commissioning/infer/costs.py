@@ -40,15 +40,21 @@ _FORMATS = {
     "float64": ">d",
 }  # fmt: skip
 _MANTISSA_BITS = {"float32": 23, "float64": 52}
+SUNSPEC_NAN = 0x7FC0_0000
+"""The bits of a float32 that a SunSpec device has not implemented."""
 NANS = {
-    "float32": frozenset({0x7FC0_0000, 0xFFC0_0000}),
+    "float32": frozenset({SUNSPEC_NAN, 0xFFC0_0000}),
     "float64": frozenset({0x7FF8_0000_0000_0000, 0xFFF8_0000_0000_0000}),
 }
-"""The bit patterns of NaN that devices send for a value that is not available: quiet, without a payload (IEEE 754-2019, 6.2.1).
-SunSpec has the positive ones.
+"""The bit patterns of NaN that devices send for a value that is not available: quiet and without a payload (IEEE 754-2019,
+6.2.1).
 """
 _NAN_COST, _NAN_CHANGE_COST = 3.0, 1.5
 """The cost of a float that is sometimes not available, and of each change between available and not available."""
+ABSENT_COST = 9.5
+"""The cost of a float32 that was never available, on a device with other floats. It is higher than that of other constants,
+because two integers with these values are possible.
+"""
 _LN2 = math.log(2)
 WILD_COST = 9.0
 """The cost of a number that jumps over its whole range, as the lower half of a longer number does."""

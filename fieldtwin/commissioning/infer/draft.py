@@ -101,6 +101,8 @@ def _seen(reading: Interpretation) -> str:
     if reading.type == "string":
         return f"{reading.values[0]!r}".replace("#", "")
     numbers = [float(v) for v in reading.available]
+    if not numbers:
+        return "always NaN"
     low, high = min(numbers), max(numbers)
     return f"always {low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 

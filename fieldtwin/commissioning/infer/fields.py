@@ -16,11 +16,13 @@ from itertools import pairwise
 from statistics import median
 
 from fieldtwin.commissioning.infer.costs import (
+    ABSENT_COST,
     IMPOSSIBLE,
     MOST_TEXT_REGISTERS,
     NANS,
     NUMBERS,
     ORDER_COST,
+    SUNSPEC_NAN,
     cost,
     cost_of,
     decode_series,
@@ -137,6 +139,19 @@ class Run:
 def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
     """Return a run with all readings and their costs. This takes most of the time: a few milliseconds per register."""
     return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
+
+
+def with_absent_floats(run: Run, orders: Sequence[str]) -> Run:
+    """Return the run with one more reading for each pair of registers that was always 7FC0 0000 in one of these byte orders:
+    a float32 that was never available. The other NaN, FFC0 0000, is not used, because -64 and 0 are plausible settings.
+    """
+    tiles = []
+    for start, pair in enumerate(pairwise(run.words)):
+        rows = set(zip(*pair, strict=True))
+        for order in orders if len(rows) == 1 else ():
+            if whole_numbers(list(rows), order)[0] == SUNSPEC_NAN:
+                tiles.append(_Tile(start, 2, "float32", order, ABSENT_COST))
+    return replace(run, tiles=[*run.tiles, *tiles])
 
 
 def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Interpretation]:

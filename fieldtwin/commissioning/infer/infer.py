@@ -15,7 +15,15 @@ from dataclasses import dataclass, replace
 from fieldtwin.commissioning.dump.file import Dump
 from fieldtwin.commissioning.infer.calibration import calibrated, kind_of
 from fieldtwin.commissioning.infer.costs import ORDER_COST, decode_series
-from fieldtwin.commissioning.infer.fields import LIKELY, Interpretation, Run, infer_run, run_of, runs_of
+from fieldtwin.commissioning.infer.fields import (
+    LIKELY,
+    Interpretation,
+    Run,
+    infer_run,
+    run_of,
+    runs_of,
+    with_absent_floats,
+)
 from fieldtwin.commissioning.infer.marks import clock_fields, marked, with_scales
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -115,7 +123,10 @@ def infer(series: Series) -> Inference:
             found = clock_fields(table, address, words, seen.times_s)
             clocks += found
             runs += [run_of(table, *part) for part in _between(address, words, found)]
-    orders = _orders_kept(_look(runs, ORDER_COST, seen.pairs))
+    first = _look(runs, ORDER_COST, seen.pairs)
+    orders = _orders_kept(first)
+    usual = [order for order, count in _floats(first).items() if count >= FLOCK]
+    runs = [with_absent_floats(run, usual) for run in runs]
     readings = with_scales([_marked(r, series) for r in _look(runs, orders, seen.pairs)])
     readings = [_as_observed(r) for r in _supported(readings)]
     readings = sorted([*readings, *clocks], key=lambda r: (r.table, r.address))
@@ -173,13 +184,18 @@ def _orders_kept(readings: Sequence[Interpretation]) -> dict[str, float]:
     return {order: -math.log(seen[order] / total) for order in ORDER_COST}
 
 
+def _floats(readings: Sequence[Interpretation]) -> Counter[str]:
+    """Return the number of probable floats with changing values, for each byte order."""
+    return Counter(r.order for r in readings if r.type.startswith("float") and r.moves and r.probability >= LIKELY)
+
+
 def _supported(readings: Sequence[Interpretation]) -> list[Interpretation]:
     """Return the readings. A reading is limited (`capped`) if few values of the device have its order, or if it is a single
     float.
     """
     moving = [r for r in readings if r.moves and r.probability >= LIKELY and r.type != "string"]
     orders = Counter(r.order for r in moving if r.registers > 1)
-    floats = Counter(r.order for r in moving if r.type.startswith("float"))
+    floats = _floats(readings)
     swapped = orders["BADC"] + orders["DCBA"]
 
     def doubt(r: Interpretation) -> str:

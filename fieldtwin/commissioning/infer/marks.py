@@ -34,7 +34,8 @@ def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
         return reading
     known = [(float(v), t) for v, t in zip(reading.values, times_s, strict=True) if not math.isnan(float(v))]
     if len(known) < len(times_s):
-        note = f"NaN in {len(times_s) - len(known)} of {len(times_s)} passes: perhaps not available"
+        passes = f"NaN in {len(times_s) - len(known)} of {len(times_s)} passes: " if known else ""
+        note = f"{passes}perhaps not available"
         reading = replace(reading, notes=(*reading.notes, note))
     if not reading.moves:
         return reading

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from infer_corpus import START_S, packed
 
 from fieldtwin.commissioning.dump.file import load_dump
-from fieldtwin.commissioning.infer.draft import checked, draft_profile
+from fieldtwin.commissioning.infer.draft import checked, doubts, draft_profile
 from fieldtwin.commissioning.infer.fields import Interpretation, Level
 from fieldtwin.commissioning.infer.infer import Inference, Series, infer, series_of
 from fieldtwin.gateway.core.values import Quality, Reason
@@ -82,6 +82,29 @@ def test_a_nan_is_not_a_changed_value() -> None:
 def test_too_few_available_values_are_not_certain() -> None:
     reading = at(inferred(meter("ABCD", dict.fromkeys(range(5, PASSES), NAN))), 2)
     assert reading.level is not Level.CERTAIN
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB", "BADC", "DCBA"])
+def test_a_pair_that_was_always_nan_is_a_float_where_the_device_has_floats(order: str) -> None:
+    found = inferred(meter(order, dict.fromkeys(range(PASSES), NAN)))
+    reading = at(found, 2)
+    assert (reading.address, reading.type, reading.order, reading.sentinels) == (2, "float32", order, (NAN,))
+    assert reading.level is Level.LIKELY
+    assert "always NaN; perhaps not available" in doubts(reading)
+    assert [r.type for r in found.readings] == ["float32"] * 4
+
+
+@pytest.mark.parametrize("others", [0, 1, 2])
+def test_a_pair_that_was_always_nan_stays_two_integers_where_floats_are_few(others: int) -> None:
+    columns = meter("ABCD", {})
+    kept = {a: columns[a] for a in range(8) if a < 2 * others}
+    absent = {2 * others: [0x7FC0] * PASSES, 2 * others + 1: [0] * PASSES}
+    assert [at(inferred(kept | absent), a).type for a in absent] == ["uint16", "uint16"]
+
+
+def test_minus_64_and_0_stay_two_integers() -> None:
+    found = inferred(meter("ABCD", dict.fromkeys(range(PASSES), NEGATIVE_NAN)))
+    assert [(at(found, a).type, at(found, a).registers) for a in (2, 3)] == [("int16", 1), ("uint16", 1)]
 
 
 @pytest.mark.parametrize("bits", [0x7F80_0000, 0x7FC0_0001, 0x7F80_0001])

@@ -119,7 +119,10 @@ def boots_after(data: str) -> Callable[[Bus], str]:
 
 def reset_amid(bus: Bus) -> str:
     bus.ask("4004200000000000")
-    return boots_after("8205")(bus)
+    if missing := boots_after("8205")(bus):
+        return missing
+    reply = bus.ask("6000000000000000")
+    return f"continues the earlier transfer: {reply}" if reply and not abort(reply) else ""
 
 
 def stopped(bus: Bus) -> str:

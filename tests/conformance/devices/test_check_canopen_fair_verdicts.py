@@ -92,10 +92,10 @@ def aborting(*, hangs: bool) -> Callable[[CanConnection, VirtualClock], object]:
 
 
 def verdicts(
-    serve: Serve, tmp_path: Path, *only: str, may_write: tuple[tuple[int, int], ...]
+    serve: Serve, tmp_path: Path, *only: str, may_write: tuple[tuple[int, int], ...], sheet: str = LONG
 ) -> dict[str, tuple[Verdict, str]]:
     eds = tmp_path / "rig.eds"
-    eds.write_text(LONG)
+    eds.write_text(sheet)
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, tuple[Verdict, str]]:
         plan = CasePlan(frozenset(only), Impact.WRITE, frozenset({"object", "eds"}))
@@ -133,6 +133,17 @@ def test_the_heartbeat_time_alone_serves_the_cases_that_need_a_number(tmp_path: 
     # They were skipped: "none of the objects given by --write is a number of 1, 2 or 4 bytes". 1017h is one of 2 bytes.
     found = verdicts(ours, tmp_path, *NEEDS_A_NUMBER, may_write=((0x1017, 0),))
     assert {id: verdict for id, (verdict, _) in found.items()} == dict.fromkeys(NEEDS_A_NUMBER, Verdict.PASSED), found
+
+
+def test_blocks_are_checked_with_an_object_of_moderate_length(tmp_path: Path) -> None:
+    # durand holds its EDS of two megabytes in 1021h. The check chose it, stopped after 200 blocks, and failed the node: "no end".
+    sheet = LONG.replace("DefaultValue=a node for tests", f"DefaultValue={12_000 * 'n'}")
+
+    async def serve(connection: CanConnection, clock: VirtualClock) -> None:
+        await serve_node(connection, CanopenNode(parse_eds(sheet), NODE), clock)
+
+    found = verdicts(serve, tmp_path, "CO-016", "CO-019", may_write=(), sheet=sheet)
+    assert {verdict for verdict, _ in found.values()} == {Verdict.PASSED}, found
 
 
 def test_a_skipped_case_describes_each_given_object(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ async def must_abort(wire: NodeConnection, request: bytes, *codes: int) -> Findi
 async def long_object(wire: NodeConnection) -> Key:
     """Return an object whose upload needs at least two segments. Raises `NotHere` if the check has found none."""
     if wire.long is None:
-        raise NotHere("no object of more than 7 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
+        raise NotHere("no object of 8 to 5,000 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
     return wire.long
 
 

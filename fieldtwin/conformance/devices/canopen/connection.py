@@ -184,7 +184,10 @@ class NodeConnection:
         await self.send_sdo(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
     async def upload(self, key: Key) -> bytes | SdoReply:
-        """Upload an object expedited or in segments; return its value, or the reply with which the upload failed."""
+        """Upload an object expedited or in segments; return its value, or the reply with which the upload failed.
+
+        The upload is aborted after `MOST_SEGMENTS` segments; the value is then the part that has arrived, about 7,000 bytes.
+        """
         reply = await self.ask(b"\x40" + mux(*key))
         if reply.specifier != 2 or reply.data[1:4] != mux(*key):
             return reply

@@ -27,6 +27,8 @@ LISTEN_S = 0.5
 """Time in seconds for which the check listens before it sends anything: a heartbeat in this time reports the node's NMT state."""
 MOST_LONG = 20
 """Largest number of objects of the EDS that are read to find one with more than one segment."""
+MOST_BYTES = 5_000
+"""Largest size in bytes of the object with which transfers are checked. CO-016 uploads it in at most 200 blocks of 28 bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +126,7 @@ async def learn(wire: NodeConnection) -> dict[str, str]:
         if isinstance(value, bytes):
             if text := shown(value):
                 identity[name] = text
-            if len(value) > longest:
+            if longest < len(value) <= MOST_BYTES:
                 wire.long, longest = key, len(value)
     if wire.long is None:
         wire.long = await _long_by_eds(wire)
@@ -132,11 +134,11 @@ async def learn(wire: NodeConnection) -> dict[str, str]:
 
 
 async def _long_by_eds(wire: NodeConnection) -> Key | None:
-    """Return an object of the EDS that holds more than 7 bytes, None if none was found."""
+    """Return an object of the EDS that holds more than 7 bytes and at most `MOST_BYTES`, None if none was found."""
     texts = [e for e in wire.dictionary or () if e.readable and e.type_code in (0x09, 0x0A, 0x0B, 0x0F)]
     for entry in texts[:MOST_LONG]:
         key = (entry.index, entry.subindex)
         value = await wire.upload(key)
-        if isinstance(value, bytes) and len(value) > 7:
+        if isinstance(value, bytes) and 7 < len(value) <= MOST_BYTES:
             return key
     return None

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.connection import PROTOCOL, CanConnection
 from fieldtwin.gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
-from fieldtwin.gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, tags_in, usable
+from fieldtwin.gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, mapped_tag, tags_in, usable
 from fieldtwin.gateway.devices.codec import decode_little, encode, reorder
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.driver import DeviceDriver, TagSink
@@ -116,8 +116,7 @@ class CanopenDriver(DeviceDriver):
     def pdo_tags(self) -> list[str]:
         """Return the full names of the tags that TPDOs carry."""
         names = [n for n in self.config.tpdo1.tags if n not in self.unmapped] if self.config.tpdo1 else []
-        mapped = [(e.index, e.subindex) for seen in self.tpdos for e in seen.mapping.entries]
-        names += [self._by_object[o].name for o in mapped if o in self._by_object]
+        names += [name for seen in self.tpdos for name in seen.tags]
         return [f"{self.config.name}.{name}" for name in dict.fromkeys(names)]
 
     @property
@@ -380,10 +379,8 @@ class CanopenDriver(DeviceDriver):
 
     def _put_of(self, entry: PdoEntry) -> tuple[str, Tag] | None:
         """Return the full name and the tag of a mapped entry; None if there is no such tag, or if its size differs."""
-        tag = self._by_object.get((entry.index, entry.subindex))
-        if tag is None or BITS.get(tag.type) != entry.bits:
-            return None
-        return f"{self.config.name}.{tag.name}", tag
+        tag = mapped_tag(entry, self._by_object)
+        return None if tag is None else (f"{self.config.name}.{tag.name}", tag)
 
     def on_event(self, event: NodeEvent) -> None:
         """Adapt the quality of the node's values to a change of its state or the loss of its heartbeat.

@@ -59,14 +59,16 @@ def is_gap(entry: PdoEntry) -> bool:
 
 def tags_in(mapping: PdoMapping, by_object: ObjectTags) -> tuple[str, ...]:
     """Return the tag of each mapped object, or "" for a gap and for an object that has no tag of this size."""
-    return tuple(_tag_of(entry, by_object) for entry in mapping.entries)
+    found = (mapped_tag(entry, by_object) for entry in mapping.entries)
+    return tuple("" if tag is None else tag.name for tag in found)
 
 
-def _tag_of(entry: PdoEntry, by_object: ObjectTags) -> str:
+def mapped_tag(entry: PdoEntry, by_object: ObjectTags) -> Tag | None:
+    """Return the tag of a mapped object; None for a gap and for an object that has no tag of this size."""
     tag = by_object.get((entry.index, entry.subindex))
     if tag is None or (entry.bits != BITS.get(tag.type) and (tag.type, entry.bits) != ("bool", 1)):
-        return ""
-    return tag.name
+        return None
+    return tag
 
 
 def usable(

@@ -15,6 +15,7 @@ from typing import Any
 
 from canopen_master_bus import MemoryEnd
 from canopen_peer_node import PeerBus, PeerNode, closing
+from canopen_slave_rig import BOOL, RICH, U16, var
 from lss_slave import Slave
 from modbus_virtual import VirtualLoop, run_virtually
 
@@ -22,6 +23,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
@@ -108,14 +110,15 @@ async def rig(
     allow_writes: bool = True,
     bus: CanopenBusConfig | None = None,
     today_ns: int = 1_700_000_000_000_000_000,
+    profile: DeviceProfile = PROFILE,
 ) -> AsyncIterator[Rig]:
     clock = Dated(today_ns)
     config = DeviceConfig(
-        "incl", PROFILE, "can0", NODE, heartbeat=Heartbeat(100, 350) if allow_writes else None, start=True,
-        canopen=boot or CanopenNodeConfig(),
+        "incl", profile, "can0", NODE, heartbeat=Heartbeat(100, 350) if allow_writes else None, start=True,
+        canopen=boot or CanopenNodeConfig(), poll={"values": 100},
     )  # fmt: skip
     tags = TagTable(clock)
-    tags.declare(["incl.slope_long", "incl.slope_lateral", "incl.serial"], None)
+    tags.declare([f"incl.{tag}" for tag in profile.tags], None)
     audit = AuditLog(tmp_path / "audit", clock)
     driver = CanopenDriver(config, tags, clock)
     wire = BusConfig("can0", Endpoint.parse("can:fieldtwin/h:1"), 0.05, 1, canopen=bus or CanopenBusConfig())
@@ -277,6 +280,33 @@ def test_tpdos_come_from_the_node_or_from_its_dcf(tmp_path: Path) -> None:
     from_dcf = (PdoConfig(1, 0x185, True, 254, 100, PdoMapping.of(SLOPES)),)
     run_virtually(main(CanopenNodeConfig(adopt_tpdos=True), True))
     run_virtually(main(CanopenNodeConfig(tpdos=from_dcf), False))
+
+
+def test_a_tag_that_a_tpdo_maps_with_another_size_is_polled(tmp_path: Path) -> None:
+    # A BOOLEAN may be mapped with 1 bit (7.4.8). It never got a value, and neither did a tag whose mapped size was wrong.
+    (tmp_path / "inputs.eds").write_text(RICH + var("2F10", BOOL) + var("2F11", U16))
+    (tmp_path / "inputs.yaml").write_text(
+        "device: test/inputs\nsource: a test\nprotocol: canopen\neds: inputs.eds\ntags:\n"
+        '  closed: {object: "2F10:00", type: bool}\n  level: {object: "2F11:00", type: uint16}\n'
+    )
+    bits = (PdoConfig(1, 0x185, True, 254, 100, PdoMapping.of([(0x2F10, 0, 1), (0x0001, 0, 7), (0x2F11, 0, 8)])),)
+
+    async def main() -> None:
+        inputs = node()
+        inputs.factory |= {(0x2F10, 0): b"\0", (0x2F11, 0): b"\x34\x12"}
+        boot, profile = CanopenNodeConfig(tpdos=bits), load_profile(tmp_path / "inputs.yaml")
+        async with rig(tmp_path, PeerBus([inputs]), boot, allow_writes=False, profile=profile) as r:
+            r.peer.power_on()
+            r.peer.command(1)
+            await asyncio.sleep(0.6)
+            assert r.status.driver.pdo_tags == ["incl.closed"]
+            assert r.tags.current("incl.level", 0).value == 0x1234
+            for sent, value in ((b"\x01\x34", True), (b"\x00\x34", False)):
+                r.peer.say(0x180, sent)
+                await asyncio.sleep(0.001)
+                assert r.tags.current("incl.closed", 0).value is value
+
+    run_virtually(main())
 
 
 def test_sync_and_time_are_produced_if_writing_is_allowed(tmp_path: Path) -> None:

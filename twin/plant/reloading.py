@@ -144,9 +144,8 @@ def _unexplained(old: System, new: System) -> list[ConfigChange]:
             found.append(_change(new.file, ("devices", name), "", "", live=False))
     if new.serving != old.serving or new.plc != old.plc:
         found.append(_change(new.file, ("serve",), "", "", live=False))
-    if (
-        new.exported_tags != old.exported_tags
-    ):  # a tag became secret: the process that serves metrics keeps the old list
+    # A tag that became secret needs a restart: the process that serves metrics keeps the old list.
+    if new.exported_tags != old.exported_tags:
         found.append(_change(new.file, ("metrics",), "", "", live=False))
     return found
 

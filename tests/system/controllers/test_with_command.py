@@ -83,7 +83,9 @@ def test_a_field_that_dies_is_not_a_success(tmp_path: Path) -> None:
     script = "echo up; while [ ! -e gone ]; do sleep 0.05; done"
     with fieldtwin(tmp_path, "with", "--instance", "w", "observatory", "--", "sh", "-c", script) as started:
         wait_for(lambda: "up" in started.out, 20, started.err)
-        os.kill(started.pid_of("w", "field"), signal.SIGKILL)
+        field = started.pid_of("w", "field")
+        os.kill(field, signal.SIGKILL)
+        wait_for(lambda: " Z " in Path(f"/proc/{field}/stat").read_text(), 5, "the field simulator ended")
         (tmp_path / "gone").touch()
         assert started.wait(30) != 0
     assert "field" in started.err

@@ -107,7 +107,7 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
         folder = (beside.parent / direct if beside else direct).parent
         there = [str(direct.parent / path.name) for path in _with_key(folder, key)]
         expected = f"a {kind[:-1]}'s file, or one of " + ", ".join(there[:MOST_LISTED] or known)
-        raise UsageError(f"there is no file {name!r}", expected=expected, hint=did_you_mean(name, there))
+        raise UsageError(f"there is no file {name!r}", expected=expected, hint=did_you_mean(str(name), there))
     files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]
     raise UsageError(
         f"no {kind[:-1]} {name!r}",

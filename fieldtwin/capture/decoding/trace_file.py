@@ -25,12 +25,7 @@ def read_events(path: Path, system: System) -> Iterator[TraceEvent]:
 
     A truncated last line is omitted. Raises `FileInvalid` with the line number for any other invalid line.
     """
-    try:
-        with open_input(path) as file:
-            first = file.read(1)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    if first == b"{":
+    if _is_capture(path):
         refusals: list[dict[str, Any]] = []
         captured = list(read_capture(path, refusals))
         start_ns = captured[0].t_ns if captured else 0
@@ -45,17 +40,21 @@ def start_utc_ns(path: Path) -> int:
 
     A trace of a run in virtual time starts on 1 January 2026, as the clock of that run did. Raises `FileInvalid`.
     """
-    try:
-        with open_input(path) as file:
-            first = file.read(1)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    if first == b"{":
+    if _is_capture(path):
         offset_ns = utc_offset_ns(path)
         begin = next(read_capture(path), None)
         return begin.t_ns + offset_ns if begin is not None and offset_ns else 0
     about = read_about(path)
     return EPOCH_UTC_NS if about is not None and about.target == "virtual" else 0
+
+
+def _is_capture(path: Path) -> bool:
+    """Return whether the file is a capture and not a trace. Raises `FileInvalid` if it cannot be read."""
+    try:
+        with open_input(path) as file:
+            return file.read(1) == b"{"
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
 
 
 def _trace(path: Path) -> Iterator[TraceEvent]:

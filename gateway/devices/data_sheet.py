@@ -12,6 +12,22 @@ from fieldtwin.gateway.devices.canopen_rpdo import BITS
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType, size_of
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary, load_dictionary
 
+TAG_TYPES: dict[int, str] = {
+    DataType.BOOLEAN: "bool",
+    DataType.INTEGER8: "int8",
+    DataType.INTEGER16: "int16",
+    DataType.INTEGER32: "int32",
+    DataType.INTEGER64: "int64",
+    DataType.UNSIGNED8: "uint8",
+    DataType.UNSIGNED16: "uint16",
+    DataType.UNSIGNED32: "uint32",
+    DataType.UNSIGNED64: "uint64",
+    DataType.REAL32: "float32",
+    DataType.REAL64: "float64",
+    DataType.VISIBLE_STRING: "string",
+    DataType.OCTET_STRING: "bytes",
+}
+"""The type of a tag for each data type of CiA 301 that a profile has."""
 _REALS = (DataType.REAL32, DataType.REAL64)
 
 
@@ -68,9 +84,7 @@ def _agrees(tag: Tag, entry: DictionaryEntry | None) -> bool:
 
 def _fitting(entry: DictionaryEntry) -> str:
     """Return the type of a tag for the data type of an object, such as uint16 for UNSIGNED16."""
-    name = DataType(entry.type_code).name
-    kinds = {"BOOLEAN": "bool", "REAL32": "float32", "REAL64": "float64"}
-    kind = kinds.get(name) or name.replace("UNSIGNED", "uint").replace("INTEGER", "int")
+    kind = TAG_TYPES.get(entry.type_code, "")
     return kind if kind in BITS else "no tag of this object, because a profile has no such type"
 
 

@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.files.profile import (
     Tag,
     resolve_address,
 )
+from fieldtwin.gateway.devices.data_sheet import TAG_TYPES
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import DictionaryEntry, ObjectDictionary
 
@@ -32,12 +33,6 @@ TYPES = (*REGISTERS_OF, "int8", "uint8", "string", "bytes")
 _OBJECT = re.compile(r"^(?:0x)?([0-9A-Fa-f]{4})h?(?:[:.]([0-9A-Fa-f]{1,2})h?)?$")
 _REGISTER = re.compile(r"^(?:(?:coil|discrete|input|holding):.*|[0-9]{5,6})$")
 _STORING = {0x1010: "stores parameters", 0x1011: "restores factory values"}
-_OF_TYPE_CODE = {
-    DataType.BOOLEAN: "bool", DataType.INTEGER8: "int8", DataType.INTEGER16: "int16", DataType.INTEGER32: "int32",
-    DataType.INTEGER64: "int64", DataType.UNSIGNED8: "uint8", DataType.UNSIGNED16: "uint16", DataType.UNSIGNED32: "uint32",
-    DataType.UNSIGNED64: "uint64", DataType.REAL32: "float32", DataType.REAL64: "float64",
-    DataType.VISIBLE_STRING: "string",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,9 +183,7 @@ def object_name(index: int, subindex: int) -> str:
 
 def tag_of_entry(entry: DictionaryEntry) -> Tag:
     """Return an entry of an EDS as a tag, with type, access and limits of the file."""
-    kind = _OF_TYPE_CODE.get(
-        DataType(entry.type_code) if entry.type_code in set(DataType) else DataType.DOMAIN, "bytes"
-    )
+    kind = TAG_TYPES.get(entry.type_code, "bytes")
     limits = None
     if kind in INTEGER_RANGES and (entry.low is not None or entry.high is not None):
         low, high = INTEGER_RANGES[kind]

@@ -11,13 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.descriptions.canopen.node import NodeDescription, NodeObject, NodeValue, number_of
-from fieldtwin.descriptions.canopen.node_of_profile import NO_PLACE, read_profile_eds
-from fieldtwin.descriptions.canopen.tag_names import tag_names, type_name
+from fieldtwin.descriptions.canopen.node import NodeDescription, NodeValue, mapped_words, numbers_of
+from fieldtwin.descriptions.canopen.node_of_profile import (
+    object_names,
+    poll_groups_lost,
+    read_profile_eds,
+    tag_losses,
+)
+from fieldtwin.descriptions.canopen.tag_names import type_name
 from fieldtwin.descriptions.conversion import Exported, Loss, Settings, losses_of_keys, require_protocol, whole_setting
 from fieldtwin.descriptions.profile_text import printable
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.protocols.canopen.configure import PDO_INVALID
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType, is_signed, size_of
 from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry, PdoMapping
 from fieldtwin.installation import install_hint
@@ -25,8 +31,8 @@ from fieldtwin.installation import install_hint
 TITLE = "DBC"
 _KINDS = (("TPDO", 0x1800, 0x1A00), ("RPDO", 0x1400, 0x1600))
 _PDOS = 512
-_INVALID, _EXTENDED = 1 << 31, 1 << 29
-"""Bits of a COB-ID: the PDO does not exist, and its CAN-ID has 29 bits (CiA 301, 7.5.2.35)."""
+_EXTENDED = 1 << 29
+"""Bit of a COB-ID: the CAN-ID has 29 bits (CiA 301, 7.5.2.35)."""
 _DUMMIES = range(1, 0x20)
 """Indexes of data types, which a mapping names for bits without a value."""
 _REALS = (DataType.REAL32, DataType.REAL64)
@@ -93,10 +99,9 @@ def pdos_of(node: NodeDescription, node_id: int, losses: list[Loss]) -> Iterator
             record, mapped = objects.get(communication + at), objects.get(mapping + at)
             if record is None or mapped is None:
                 continue
-            words = _numbers(mapped, node_id)
-            listed = [words.get(sub, 0) for sub in range(1, min(words.get(0, 0), 64) + 1)]
-            cob_id, place = _numbers(record, node_id).get(1, _INVALID), f"{kind}{at + 1}"
-            if listed and cob_id & _INVALID:
+            listed, stated = mapped_words(mapped, node_id), numbers_of(record, node_id)
+            cob_id, place = stated.get(1, PDO_INVALID), f"{kind}{at + 1}"
+            if listed and cob_id & PDO_INVALID:
                 losses.append(Loss(place, "the PDO", "its COB-ID says that it does not exist (bit 31)"))
             elif listed:
                 try:
@@ -106,21 +111,14 @@ def pdos_of(node: NodeDescription, node_id: int, losses: list[Loss]) -> Iterator
                     continue
                 extended = bool(cob_id & _EXTENDED)
                 can_id = cob_id & (0x1FFFFFFF if extended else 0x7FF)
-                yield Pdo(kind, at + 1, can_id, extended, _numbers(record, node_id).get(2), found)
-
-
-def _numbers(record: NodeObject, node_id: int) -> dict[int, int]:
-    """Return the numbers of a record by subindex, those that a DCF sets before the defaults."""
-    found = {v.subindex: number_of(v.configured or v.default, node_id) for v in record.values}
-    return {subindex: number for subindex, number in found.items() if number is not None}
+                yield Pdo(kind, at + 1, can_id, extended, stated.get(2), found)
 
 
 def _signal_names(node: NodeDescription, tags: Mapping[tuple[int, int], Tag]) -> dict[tuple[int, int], str]:
     """Return a name for each object: that of its tag, else one made from the name of the object; all names differ."""
-    listed = [(v.index, v.subindex, each.name, v.name) for each in node.objects for v in each.values]
     taken = {tag.name for tag in tags.values()}
     names = {}
-    for (index, subindex, _, _), name in zip(listed, tag_names(listed), strict=True):
+    for (index, subindex), name in object_names(node).items():
         tag = tags.get((index, subindex))
         other = f"{name}_{index:04x}_{subindex:02x}" if name in taken else name
         names[index, subindex] = tag.name if tag is not None else other
@@ -202,19 +200,8 @@ def _tags_lost(profile: DeviceProfile, mapped: set[tuple[int, int]]) -> Iterator
         if tag.object not in mapped:
             yield Loss(f"tag {tag.name}", "the tag", "no PDO carries its object")
             continue
-        stated = {
-            "`scale_by`": tag.scale_by is not None,
-            "`sentinels`": bool(tag.sentinels),
-            "`counter`": tag.counter,
-            "`nonvolatile`": tag.nonvolatile,
-            "`secret`": tag.secret,
-            "`danger`": bool(tag.danger),
-        }
-        for what, present in stated.items():
-            if present:
-                yield Loss(f"tag {tag.name}", what, "a DBC has no place for it")
-    if len(profile.groups) > 1 or profile.groups != ["values"]:
-        yield Loss("all tags", "the poll groups", NO_PLACE)
+        yield from tag_losses(tag, "a DBC has no place for it")
+    yield from poll_groups_lost(profile)
 
 
 def _identifier(text: str) -> str:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from fieldtwin.gateway.protocols.canopen.pdo.mapping import MAX_ENTRIES
+
 VAR, ARRAY, RECORD, DOMAIN = 0x7, 0x8, 0x9, 0x2
 """Object codes (CiA 301, table 42)."""
 LARGEST_KBIT = 1000
@@ -94,3 +96,15 @@ def number_of(text: str, node_id: int) -> int | None:
         except ValueError:
             return None
     return total
+
+
+def numbers_of(record: NodeObject, node_id: int) -> dict[int, int]:
+    """Return the numbers of a record by subindex. The values that a DCF or XDC sets have precedence over the defaults."""
+    found = {v.subindex: number_of(v.configured or v.default, node_id) for v in record.values}
+    return {subindex: number for subindex, number in found.items() if number is not None}
+
+
+def mapped_words(mapping: NodeObject, node_id: int) -> list[int]:
+    """Return the entries of a mapping parameter in order, 0 for one without a number (CiA 301, 7.5.2.36 and 7.5.2.38)."""
+    words = numbers_of(mapping, node_id)
+    return [words.get(sub, 0) for sub in range(1, min(words.get(0, 0), MAX_ENTRIES) + 1)]

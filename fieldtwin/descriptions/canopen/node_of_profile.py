@@ -7,16 +7,18 @@ from dataclasses import replace
 
 from fieldtwin.descriptions.canopen.eds_reader import read_eds
 from fieldtwin.descriptions.canopen.node import VAR, NodeDescription, NodeObject, NodeValue
-from fieldtwin.descriptions.canopen.tag_names import TAG_TYPES, TYPE_CODES, tag_names, type_name
+from fieldtwin.descriptions.canopen.tag_names import TYPE_CODES, tag_names, type_name
 from fieldtwin.descriptions.conversion import Loss, losses_of_keys, require_protocol
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES, DeviceProfile, Tag
+from fieldtwin.gateway.devices.data_sheet import TAG_TYPES
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import MAX_EDS_BYTES
 
 NO_PLACE = "the format describes objects, not what a gateway does with them"
+_NO_PLACE_FOR_IT = "the format has no place for it"
 _KEYS = {
-    "source": "the format has no place for it",
+    "source": _NO_PLACE_FOR_IT,
     "timing": NO_PLACE,
     "identify": NO_PLACE,
     "commands": NO_PLACE,
@@ -26,8 +28,6 @@ _KEYS = {
     "effects": NO_PLACE,
 }
 _WRITABLE = ("rw", "rwr", "rww")
-
-
 OFFSET, VALUE_NAMES = "its offset", "the names of its values"
 
 
@@ -73,8 +73,11 @@ def _with_tag(value: NodeValue, tag: Tag | None, has: Collection[str], losses: l
     """Return the value with the properties of its tag that the format has; note those that it does not have."""
     if tag is None:
         return value
-    losses += (loss for loss in _tag_losses(tag) if loss.what not in has)
-    kind = TAG_TYPES.get(value.type_code)  # type: ignore[call-overload]
+    for what, stated in ((OFFSET, tag.offset != 0.0), (VALUE_NAMES, bool(tag.values))):
+        if stated and what not in has:
+            losses.append(Loss(f"tag {tag.name}", what, _NO_PLACE_FOR_IT))
+    losses += tag_losses(tag, _NO_PLACE_FOR_IT)
+    kind = TAG_TYPES.get(value.type_code)
     if kind != tag.type:
         losses.append(Loss(f"tag {tag.name}", f"its type {tag.type}", f"the EDS says {type_name(value.type_code)}"))
     may = "rw" if value.access in _WRITABLE else "wo" if value.access == "wo" else "ro"
@@ -88,10 +91,9 @@ def _with_tag(value: NodeValue, tag: Tag | None, has: Collection[str], losses: l
     return replace(value, low=low, high=high, unit=unit, factor=factor, offset=offset, names=names)
 
 
-def _tag_losses(tag: Tag) -> Iterator[Loss]:
+def tag_losses(tag: Tag, why: str) -> Iterator[Loss]:
+    """Yield the properties that the tag states and a description of a CANopen device does not have. `why` is the reason."""
     stated = {
-        OFFSET: tag.offset != 0.0,
-        VALUE_NAMES: bool(tag.values),
         "`scale_by`": tag.scale_by is not None,
         "`sentinels`": bool(tag.sentinels),
         "`counter`": tag.counter,
@@ -101,18 +103,28 @@ def _tag_losses(tag: Tag) -> Iterator[Loss]:
     }
     for what, present in stated.items():
         if present:
-            yield Loss(f"tag {tag.name}", what, "the format has no place for it")
+            yield Loss(f"tag {tag.name}", what, why)
+
+
+def poll_groups_lost(profile: DeviceProfile) -> Iterator[Loss]:
+    """Yield a loss if the profile states poll groups."""
+    if profile.groups != ["values"]:
+        yield Loss("all tags", "the poll groups", NO_PLACE)
 
 
 def _names_lost(profile: DeviceProfile, node: NodeDescription) -> Iterator[Loss]:
     """Yield the tags whose names or poll groups an import of the result would not find again."""
-    listed = [(v.index, v.subindex, each.name, v.name) for each in node.objects for v in each.values]
-    names = {(i, s): name for (i, s, _, _), name in zip(listed, tag_names(listed), strict=True)}
+    names = object_names(node)
     for tag in profile.tags.values():
         if tag.object is not None and names.get(tag.object) != tag.name:
             yield Loss(f"tag {tag.name}", "its name", "the object keeps its name in the object dictionary")
-    if len(profile.groups) > 1 or profile.groups != ["values"]:
-        yield Loss("all tags", "the poll groups", NO_PLACE)
+    yield from poll_groups_lost(profile)
+
+
+def object_names(node: NodeDescription) -> dict[tuple[int, int], str]:
+    """Return the tag name of each value of the object dictionary, by index and subindex, as an import makes it."""
+    listed = [(v.index, v.subindex, each.name, v.name) for each in node.objects for v in each.values]
+    return {(i, s): name for (i, s, _, _), name in zip(listed, tag_names(listed), strict=True)}
 
 
 def _limits(tag: Tag, losses: list[Loss]) -> tuple[str, str]:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from math import isfinite
 from typing import Any
 
-from fieldtwin.descriptions.canopen.node import NodeDescription, NodeValue, number_of
-from fieldtwin.descriptions.canopen.tag_names import TAG_TYPES, TYPE_CODES, tag_names, type_name
+from fieldtwin.descriptions.canopen.node import NodeDescription, NodeValue, mapped_words
+from fieldtwin.descriptions.canopen.tag_names import TYPE_CODES, tag_names, type_name
 from fieldtwin.descriptions.conversion import Loss, Settings, Source, whole_setting
 from fieldtwin.descriptions.profile_text import printable
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES
 from fieldtwin.gateway.core.files.profile_schema import ProfileForm
-from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
+from fieldtwin.gateway.devices.data_sheet import TAG_TYPES
 from fieldtwin.gateway.protocols.canopen.eds.values import read_limit
 from fieldtwin.gateway.protocols.canopen.pdo.mapping import PdoEntry
 
@@ -69,16 +69,12 @@ def profile_of_node(
 
 
 def mapped_objects(node: NodeDescription, node_id: int) -> Iterator[tuple[int, int]]:
-    """Yield index and subindex of the objects that the PDOs of the node carry (CiA 301, 7.5.2.36 and 7.5.2.38).
-
-    The values that a DCF or XDC sets have precedence over the defaults.
-    """
+    """Yield index and subindex of the objects that the PDOs of the node carry."""
     for each in node.objects:
         if not any(each.index in area for area in _MAPPINGS):
             continue
-        words = {v.subindex: number_of(v.configured or v.default, node_id) or 0 for v in each.values}
-        for subindex in range(1, min(words.get(0, 0), 64) + 1):
-            entry = PdoEntry.from_word(words.get(subindex, 0))
+        for word in mapped_words(each, node_id):
+            entry = PdoEntry.from_word(word)
             if entry.index:
                 yield entry.index, entry.subindex
 
@@ -117,7 +113,7 @@ def _fits(value: NodeValue, losses: list[Loss]) -> bool:
 
 
 def _tag(value: NodeValue, mapped: frozenset[tuple[int, int]], losses: list[Loss]) -> dict[str, Any]:
-    kind = TAG_TYPES[DataType(value.type_code)]
+    kind = TAG_TYPES[value.type_code]
     tag: dict[str, Any] = {"object": f"{value.index:04X}:{value.subindex:02X}", "type": kind}
     if value.access in ("rw", "rwr", "rww"):
         tag["access"] = "rw"

@@ -6,25 +6,11 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
+from fieldtwin.gateway.devices.data_sheet import TAG_TYPES
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 
-TAG_TYPES = {
-    DataType.BOOLEAN: "bool",
-    DataType.INTEGER8: "int8",
-    DataType.INTEGER16: "int16",
-    DataType.INTEGER32: "int32",
-    DataType.INTEGER64: "int64",
-    DataType.UNSIGNED8: "uint8",
-    DataType.UNSIGNED16: "uint16",
-    DataType.UNSIGNED32: "uint32",
-    DataType.UNSIGNED64: "uint64",
-    DataType.REAL32: "float32",
-    DataType.REAL64: "float64",
-    DataType.VISIBLE_STRING: "string",
-    DataType.OCTET_STRING: "bytes",
-}
-"""The type of a tag for each data type of CiA 301 that a profile has."""
 TYPE_CODES = {tag_type: int(code) for code, tag_type in TAG_TYPES.items()}
+"""The data type of CiA 301 for each type of a tag."""
 MOST_LETTERS = 60
 
 

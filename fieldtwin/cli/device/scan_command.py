@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanO
 from fieldtwin.commissioning.scan.settings import name_of, seconds_of, with_settings
 from fieldtwin.commissioning.scan.sweep import PROBE
 from fieldtwin.console import stderr
+from fieldtwin.gateway.connections.serial.port import is_pty
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import run as run_precise
@@ -118,8 +118,8 @@ def _modbus(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | N
 
 
 def is_pseudo_terminal(endpoint: Endpoint) -> bool:
-    """Return whether the port is a pseudo-terminal, also through a symbolic link, as `socat` and `fieldtwin emulate` make one."""
-    return endpoint.is_serial and os.path.realpath(endpoint.path).startswith("/dev/pts/")
+    """Return whether the port is a pseudo-terminal, as `socat` and `fieldtwin emulate` make one."""
+    return endpoint.is_serial and is_pty(endpoint.path)
 
 
 def _can(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None, as_json: bool) -> int:

@@ -48,7 +48,7 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
             port=endpoint.path,
             baudrate=settings.baudrate,
             bytesize=settings.data_bits,
-            parity="N" if _is_pty(endpoint.path) else settings.parity,
+            parity="N" if is_pty(endpoint.path) else settings.parity,
             stopbits=settings.stop_bits,
             timeout=read_s,
             write_timeout=write_s,
@@ -73,8 +73,8 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
         raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
 
 
-def _is_pty(path: str) -> bool:
-    """Return whether the port is a pty, which drops parity silently.
+def is_pty(path: str) -> bool:
+    """Return whether the port is a pty, also through a symbolic link. A pty drops parity silently.
 
     glibc reports the lost parity as an error if no other setting changes, so setting 8E1 a second time fails.
     """

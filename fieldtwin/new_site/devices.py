@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.input_file import reading
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.profile_file import load_profile, resolve
 from fieldtwin.gateway.core.files.yaml_file import parse
@@ -182,10 +183,8 @@ def is_shipped(path: Path) -> bool:
 
 
 def _text(path: Path) -> str:
-    try:
+    with reading(path):
         return path.read_bytes().decode("utf-8", "surrogateescape")
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
 
 
 class _Buses:

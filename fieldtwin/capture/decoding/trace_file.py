@@ -12,7 +12,7 @@ from fieldtwin.capture.decoding.decoder import frame_events
 from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture, utc_offset_ns
 from fieldtwin.emulators.virtual.clock import EPOCH_UTC_NS
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.input_file import open_input
+from fieldtwin.gateway.core.files.input_file import open_input, reading
 from fieldtwin.results.trace import TraceEvent, TraceKind, decode_event, refusal_data
 from fieldtwin.results.trace_about import read_about
 from fieldtwin.twin.site.system import System
@@ -50,11 +50,8 @@ def start_utc_ns(path: Path) -> int:
 
 def _is_capture(path: Path) -> bool:
     """Return whether the file is a capture and not a trace. Raises `FileInvalid` if it cannot be read."""
-    try:
-        with open_input(path) as file:
-            return file.read(1) == b"{"
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    with reading(path), open_input(path) as file:
+        return file.read(1) == b"{"
 
 
 def _trace(path: Path) -> Iterator[TraceEvent]:

@@ -35,7 +35,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import line_of, read_log
-from fieldtwin.gateway.core.files.input_file import open_input
+from fieldtwin.gateway.core.files.input_file import open_input, reading
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.recording import RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
@@ -245,11 +245,8 @@ def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path) -> int:
 
 
 def _is_capture(path: Path) -> bool:
-    try:
-        with open_input(path) as file:
-            return b'"t_ns"' in file.readline(4096)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    with reading(path), open_input(path) as file:
+        return b'"t_ns"' in file.readline(4096)
 
 
 def _capture_work(path: Path, kind: str, url: str) -> Callable[[Path], int]:

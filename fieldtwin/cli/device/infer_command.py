@@ -21,6 +21,7 @@ from fieldtwin.commissioning.infer.infer import Inference, infer, series_of
 from fieldtwin.commissioning.infer.recorded_passes import dump_of_recording
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.input_file import reading
 
 MOST_HEADER_BYTES = 65_536
 COLOUR = {Level.CERTAIN: "green", Level.LIKELY: "", Level.GUESS: "yellow", Level.UNKNOWN: "red"}
@@ -77,11 +78,8 @@ def command(
 
 def _load(path: Path, unit: int | None) -> Dump:
     """Load a dump, or a recording of exchanges as a dump. Raises `FileInvalid`, `UsageError`."""
-    try:
-        with path.open("rb") as file:
-            is_recording = b'"fieldtwin_recording"' in file.readline(MOST_HEADER_BYTES)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    with reading(path), path.open("rb") as file:
+        is_recording = b'"fieldtwin_recording"' in file.readline(MOST_HEADER_BYTES)
     if not is_recording:
         return load_dump(path)
     header = header_of(path)

@@ -17,7 +17,7 @@ from fieldtwin.descriptions.conversion import MAX_DESCRIPTION_BYTES, Loss, Sourc
 from fieldtwin.descriptions.formats import FORMATS, check_settings, exporter, format_named, importer
 from fieldtwin.descriptions.profile_text import checked_profile, profile_text
 from fieldtwin.gateway.core.errors import CheckFailed, FileInvalid
-from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.twin.site.data_files import find
 
@@ -62,10 +62,8 @@ def import_command(
     chosen = pairs(settings, "--set")
     check_settings(chosen, row.import_settings, row)
     convert = importer(row)
-    try:
+    with reading(file):
         source = Source(file, read_input(file, MAX_DESCRIPTION_BYTES), file.stat().st_mtime_ns)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(file)) from e
     result = convert(source, chosen)
     text = profile_text(result.profile, f"Imported by `fieldtwin profile import {row.name}` from {file.name}.")
     checked_profile(text, str(out or "the new profile"))

@@ -10,7 +10,7 @@ from fieldtwin.descriptions.canopen.node import VAR, NodeDescription, NodeObject
 from fieldtwin.descriptions.canopen.tag_names import TYPE_CODES, tag_names, type_name
 from fieldtwin.descriptions.conversion import Loss, losses_of_keys, require_protocol
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES, DeviceProfile, Tag
 from fieldtwin.gateway.devices.data_sheet import TAG_TYPES
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import MAX_EDS_BYTES
@@ -62,10 +62,8 @@ def read_profile_eds(profile: DeviceProfile) -> tuple[NodeDescription, tuple[str
     path = profile.eds_path
     if path is None:
         raise FileInvalid("a CANopen profile needs an EDS", path=profile.path, expected="`eds: FILE.eds`")
-    try:
+    with reading(path):
         data = read_input(path, MAX_EDS_BYTES)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     return read_eds(data, path)
 
 

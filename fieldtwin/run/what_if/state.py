@@ -17,7 +17,7 @@ import msgspec
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import WholePlcStatus
 from fieldtwin.twin.site.system import System
@@ -59,10 +59,8 @@ class KnownState:
 
 def read_state(path: Path, system: System) -> KnownState:
     """Read a state file. Raises `FileInvalid`, also for names that the system does not have."""
-    try:
+    with reading(path):
         data = read_input(path, MAX_BYTES)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     if not data:
         raise FileInvalid("not a state of a system", path=str(path), expected=f"JSON of at most {MAX_BYTES >> 20} MiB")
     try:

@@ -10,6 +10,8 @@ import errno
 import io
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -20,6 +22,15 @@ _KINDS = {
     stat.S_IFBLK: "a block device",
     stat.S_IFSOCK: "a socket",
 }
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raise `FileInvalid` with the path in place of an `OSError` of the block, which reads the file at `path`."""
+    try:
+        yield
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
 
 
 def open_input(path: Path) -> io.BufferedReader:

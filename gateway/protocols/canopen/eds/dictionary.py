@@ -18,7 +18,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.objectdictionary.eds import import_eds
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.gateway.protocols.canopen.cob_id import check_node
@@ -112,10 +112,8 @@ def load_dictionary(path: Path, node_id: int | None = None) -> ObjectDictionary:
 
     A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the folder of the DCF: its bytes are the value that the DCF sets.
     """
-    try:
+    with reading(path):
         raw = read_input(path, MAX_EDS_BYTES)
-    except OSError as e:
-        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     text, assumed = decode_eds(raw, str(path))
     return parse_dictionary(text, node_id, path=str(path), mended=assumed, folder=path.parent)
 

@@ -86,7 +86,7 @@ class Decoder:
         try:
             raw = bytes.fromhex(data.get("bytes", ""))
             if "id" in data:
-                return canopen_fields(_can_frame(data, raw), self._can(event.where).nodes)
+                return canopen_fields(can_frame(data, raw), self._can(event.where).nodes)
         except (ValueError, TypeError, FieldtwinError):
             return []
         wire = self._line(event.where)
@@ -100,7 +100,7 @@ class Decoder:
         try:
             raw = bytes.fromhex(data.get("bytes", ""))
             if "id" in data:
-                return self._can(event.where).feed(_can_frame(data, raw), event.t_ns)
+                return self._can(event.where).feed(can_frame(data, raw), event.t_ns)
         except (ValueError, TypeError, FieldtwinError):
             return f"unreadable: {data}", []
         wire = self._line(event.where)
@@ -159,7 +159,13 @@ class Decoder:
         return self._maps[device].show({name: value}).removeprefix(f"{name} ")
 
 
-def _can_frame(data: Mapping[str, Any], raw: bytes) -> CanFrame:
+def direction_of(data: Mapping[str, Any]) -> Direction:
+    """Return the direction of a FRAME event."""
+    return Direction.SENT if data.get("dir") == "sent" else Direction.RECEIVED
+
+
+def can_frame(data: Mapping[str, Any], raw: bytes) -> CanFrame:
+    """Return the CAN frame of a FRAME event, whose bytes are `raw`. Raises `ValueError`, `TypeError` or `FieldtwinError`."""
     return CanFrame(
         data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")), error=bool(data.get("err"))
     )

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.capture.decoding.decoder import Decoder
+from fieldtwin.capture.decoding.decoder import Decoder, direction_of
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.formats.mcap_file import (
     ERROR,
@@ -37,7 +37,7 @@ from fieldtwin.capture.formats.mcap_file import (
 )
 from fieldtwin.capture.recordings.exporting_mcap import frame_message
 from fieldtwin.gateway.core.files.profile import Tag
-from fieldtwin.reports.run.packets import Events, direction_of, frame_item
+from fieldtwin.reports.run.packets import Events, frame_item
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.results.trace_about import TraceAbout
 from fieldtwin.twin.site.system import System

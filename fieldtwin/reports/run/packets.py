@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.capture.decoding.decoder import Decoder
+from fieldtwin.capture.decoding.decoder import Decoder, can_frame, direction_of
 from fieldtwin.capture.formats.pcap import commented_packets, link_type
 from fieldtwin.capture.formats.pcapng import Wire, write_pcapng
 from fieldtwin.gateway.connections.tap import Captured
@@ -49,18 +49,10 @@ def _explained(
             yield Captured(event.t_ns, endpoint, direction, item), "" if piece else decoded.text
 
 
-def direction_of(data: Mapping[str, Any]) -> Direction:
-    """Return the direction of a FRAME event."""
-    return Direction.SENT if data.get("dir") == "sent" else Direction.RECEIVED
-
-
 def frame_item(data: Mapping[str, Any]) -> bytes | CanFrame | None:
     """Return the bytes or the CAN frame of a FRAME event, None if it has neither."""
     try:
         raw = bytes.fromhex(data["bytes"])
-        if "id" not in data:
-            return raw
-        flags = {"extended": bool(data.get("ext")), "remote": bool(data.get("rtr")), "error": bool(data.get("err"))}
-        return CanFrame(data["id"], raw, **flags)
+        return can_frame(data, raw) if "id" in data else raw
     except (KeyError, ValueError, TypeError, FieldtwinError):
         return None

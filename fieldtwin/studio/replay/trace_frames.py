@@ -7,10 +7,10 @@ from bisect import bisect_left, insort
 from collections.abc import Iterator
 from pathlib import Path
 
+from fieldtwin.capture.decoding.decoder import can_frame, direction_of
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.results.trace import TraceEvent, TraceKind, decode_event
 from fieldtwin.studio.live.frame_log import FrameLog, FrameRow
 from fieldtwin.studio.replay.trace_log import AfterCheck
@@ -85,8 +85,8 @@ class TraceFrames(FrameLog):
 
     def _captured_of(self, line: bytes) -> Captured:
         event = decode_event(line)
-        direction = Direction.SENT if event.data.get("dir") == "sent" else Direction.RECEIVED
-        return Captured(event.t_ns, self._system.buses[event.where].endpoint, direction, self._item(event))
+        endpoint = self._system.buses[event.where].endpoint
+        return Captured(event.t_ns, endpoint, direction_of(event.data), self._item(event))
 
     def _item(self, event: TraceEvent) -> bytes | CanFrame:
         data = event.data
@@ -95,6 +95,4 @@ class TraceFrames(FrameLog):
             return raw
         if not isinstance(data["id"], int):
             raise ValueError("the id of a CAN frame is not a number")
-        return CanFrame(
-            data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")), error=bool(data.get("err"))
-        )
+        return can_frame(data, raw)

@@ -105,6 +105,12 @@ class WirePlay:
         left_s = self.start_s + at_ms * SCALE / 1000 - asyncio.get_running_loop().time()
         await asyncio.sleep(max(0.0, left_s))
 
+    def frames_before(self, at_ms: float) -> int:
+        """Return how many frames the client received before a time of the row: a call waits for them, however late they are."""
+        lines = [line.split(" ", 2) for line in self.row.get("bus", [])]
+        received = [rest for time, direction, rest in lines if direction == "<" and float(time) < at_ms]
+        return sum(int(rest.partition(" *")[2] or 1) for rest in received)
+
     def on_event(self, event: NodeEvent) -> None:
         self.events.append(f"{event.node} {event.kind}{' unexpected' if event.unexpected else ''}")
 
@@ -112,6 +118,7 @@ class WirePlay:
         at_ms, name, *rest = call
         named = rest.pop() if rest and isinstance(rest[-1], dict) else {}
         await self.until(at_ms)
+        await eventually(lambda: self.master.counters.frames_in >= self.frames_before(at_ms), within_s=20)
         try:
             return await self.call(name, rest, named)
         except errors.SdoAborted as e:

@@ -14,6 +14,8 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
+from host import AT_START, HostChange, HostState
+
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 if str(ROOT) not in sys.path:
@@ -102,25 +104,38 @@ def row(name: str, values: list[float], base: list[float]) -> str:
 
 
 class Goals:
-    """A goal, and whether it was reached."""
+    """The goals of a benchmark, judged and printed at its end.
 
-    def __init__(self) -> None:
-        self._missed = 0
+    The goals of a timing are inconclusive if the host was not quiet since the benchmark began (`host.py` has the limits).
+    `timed=False` is for results that do not depend on time.
+    """
+
+    def __init__(self, *, timed: bool = True) -> None:
+        self._timed = timed
+        self._results: list[tuple[bool, str]] = []
 
     def least(self, what: str, got: float, goal: float, unit: str = "") -> None:
-        self._judge(what, got, f"at least {goal:g}", got >= goal, unit)
+        self._add(what, got, f"at least {goal:g}", got >= goal, unit)
 
     def most(self, what: str, got: float, goal: float, unit: str = "") -> None:
-        self._judge(what, got, f"at most {goal:g}", got <= goal, unit)
+        self._add(what, got, f"at most {goal:g}", got <= goal, unit)
 
-    def _judge(self, what: str, got: float, goal: str, reached: bool, unit: str) -> None:
-        self._missed += not reached
+    def _add(self, what: str, got: float, goal: str, reached: bool, unit: str) -> None:
         shown = f"{got:.3g}" if abs(got) < 1000 else f"{got:.0f}"
-        print(f"{'reached' if reached else 'MISSED ':<8} {what}: {shown} (goal: {goal}{' ' + unit if unit else ''})")
+        self._results.append((reached, f"{what}: {shown} (goal: {goal}{' ' + unit if unit else ''})"))
 
-    def verdict(self) -> int:
-        """Return the exit status: 0 if all goals were reached."""
-        return 1 if self._missed else 0
+    def verdict(self, before: HostState = AT_START, after: HostState | None = None) -> int:
+        """Print the goals and the state of the host. Return the exit status: 0 all reached, 1 one missed, 3 inconclusive."""
+        change = HostChange(before, after or HostState.read())
+        reason = change.disturbance() if self._timed else ""
+        for reached, text in self._results:
+            print(f"{'INCONCLUSIVE' if reason else 'reached' if reached else 'MISSED':<8} {text}")
+        if self._timed:
+            print(change)
+        if reason:
+            print(f"INCONCLUSIVE: {reason}; repeat the benchmark on a quiet host")
+            return 3
+        return 0 if all(reached for reached, _ in self._results) else 1
 
 
 def python() -> str:

@@ -41,9 +41,6 @@ SCREEN_MS, MEMORY_MB, SHOWN_MS, FIRST_PAGE_S = 250, 400, 200, 2.0
 FOLLOWED = 0.85
 """Share of the appended frames that must reach the screen, because a page that stops following has no late frames. The
 measurement ends half a second before the last frame."""
-MOST_STEAL = 0.02
-MOST_BUSY = 2.0
-"""The load average for each CPU, the benchmark's own processes included."""
 NAME = "bench"
 BATCH_S = 0.01
 INDEXED_WITHIN_S = 900
@@ -475,12 +472,6 @@ def percentile(values: list[float], share: float) -> float:
     return sorted(values)[min(len(values) - 1, int(len(values) * share))]
 
 
-def cpu_ticks() -> tuple[int, int]:
-    """Return the stolen ticks and all ticks of the CPUs since boot."""
-    fields = [int(n) for n in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
-    return fields[7], sum(fields[:8])
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
@@ -498,7 +489,7 @@ def main() -> int:
         (50_000, 6.0, 2, 5.0) if options.quick else (options.frames, options.seconds, options.pairs, PART_S)
     )
     wanted = {options.only} if options.only else {"screen", "many", "load"}
-    before, goals = cpu_ticks(), Goals()
+    goals = Goals()
     folder = Path(tempfile.mkdtemp(prefix="fieldtwin-bench-"))
     reports: list[Callable[[], None]] = []
     try:
@@ -518,16 +509,8 @@ def main() -> int:
         return 2
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    stolen, spent = (b - a for a, b in zip(before, cpu_ticks(), strict=True))
-    steal, busy = stolen / max(spent, 1), os.getloadavg()[0] / (os.cpu_count() or 1)
     for report in reports:
         report()
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs, steal {steal:.1%}")
-    if steal > MOST_STEAL or busy > MOST_BUSY:
-        print(
-            f"INCONCLUSIVE: the host is not quiet (at most {MOST_STEAL:.0%} steal, and a load of {MOST_BUSY:g} for each CPU)"
-        )
-        return 3
     return goals.verdict()
 
 

@@ -38,6 +38,11 @@ def _gauge(name: str, help: str, *labels: str) -> Metric:
     return _metric(name, "gauge", help, labels)
 
 
+def _summary(name: str, help: str, *labels: str) -> Metric:
+    """Declare quantiles that the run computes itself. Only a summary may have the label `quantile`."""
+    return _metric(name, "summary", help, (*labels, "quantile"))
+
+
 def _histogram(name: str, help: str, *labels: str) -> Metric:
     return _metric(name, "histogram", help, labels)
 
@@ -102,6 +107,13 @@ TAG_VALUE = _gauge(
     "unit",
 )
 TAG_GOOD = _gauge("tag_good", "Whether the quality of an exported tag is good.", "device", "tag")
+TAG_PROBLEM = _gauge(
+    "tag_problem",
+    "1 with the reason while an exported tag is not good; otherwise no sample.",
+    "device",
+    "tag",
+    "reason",
+)
 PUBLISHED = _counter("published", "Values published.")
 LOGGED = _counter("logged", "Entries of the exchange log.")
 LOG_DROPPED = _counter("log_dropped", "Entries that the exchange log lost.")
@@ -129,15 +141,10 @@ PLC_OVERRUNS = _counter(
     "plc_overruns", "Scans that began too late (`late_ms`), or ended after the next one was due.", "task"
 )
 PLC_PERIOD = _gauge("plc_period_seconds", "Configured period of a cyclic task.", "task")
-PLC_LATENESS = _gauge(
-    "plc_lateness_seconds",
-    "Start delay of scans since the start, by quantile; 1 is the maximum.",
-    "task",
-    "quantile",
+PLC_LATENESS = _summary(
+    "plc_lateness_seconds", "Start delay of scans since the start, by quantile; 1 is the maximum.", "task"
 )
-PLC_SCAN = _gauge(
-    "plc_scan_seconds", "Duration of scans since the start, by quantile; 1 is the maximum.", "task", "quantile"
-)
+PLC_SCAN = _summary("plc_scan_seconds", "Duration of scans since the start, by quantile; 1 is the maximum.", "task")
 PLC_RUNNING = _gauge("plc_running", "Whether a task runs; 0 is stopped or failed.", "task")
 PLC_STATE = _gauge(
     "plc_state", "Whether a task is in a state: 1 for its present state, 0 for the others.", "task", "state"

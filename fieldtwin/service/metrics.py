@@ -16,10 +16,10 @@ from typing import Any
 from msgspec import UnsetType
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.protocols.canopen.sdo.channel import SdoCounters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client_counters import ClientCounters
-from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus, TagStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread, TaskStatus
 from fieldtwin.service import metric_families as metric
 from fieldtwin.service.exposition import Family
@@ -160,6 +160,7 @@ def _values(page: Page, seen: RunState, gateway: GatewayStatus) -> None:
     series at once, whereas NaN would be a sample that spoils every average and maximum over time.
     """
     values, good = page.family(metric.TAG_VALUE), page.family(metric.TAG_GOOD)
+    problems = page.family(metric.TAG_PROBLEM)
     recent = seen.gateway_ago_s <= OLDEST_STATUS_S
     for tag in seen.exported_tags:
         status = gateway.tags.get(tag.name)
@@ -167,6 +168,17 @@ def _values(page: Page, seen: RunState, gateway: GatewayStatus) -> None:
         number = value if isinstance(value, int | float) else None
         values.add(number, device=tag.device, tag=tag.tag, unit=tag.unit)
         good.add(int(number is not None), device=tag.device, tag=tag.tag)
+        if number is None:
+            problems.add(1, device=tag.device, tag=tag.tag, reason=_problem(status, recent))
+
+
+def _problem(status: TagStatus | None, recent: bool) -> str:
+    """Return the reason why a tag is not good, in the words of `fieldtwin explain`. A status that is not recent says nothing
+    about the present value.
+    """
+    if not recent:
+        return str(Reason.GATEWAY_DEAD)
+    return str(Reason.NEVER_READ) if status is None else status.reason
 
 
 def _writes(page: Page, gateway: GatewayStatus) -> None:

@@ -110,7 +110,7 @@ PRESSURE = ExportedTag("ctd", "pressure", "dbar")
 
 def whole() -> RunState:
     """Return a state in which every metric has a sample."""
-    return seen(thread=THREAD, exported_tags=(PRESSURE,))
+    return seen(thread=THREAD, exported_tags=(PRESSURE, ExportedTag("ctd", "missing", "")))
 
 
 def scraped(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -178,7 +178,7 @@ fieldtwin_outputs_safe gauge
 fieldtwin_plc_alive gauge
 fieldtwin_plc_events_total counter event
 fieldtwin_plc_forces gauge
-fieldtwin_plc_lateness_seconds gauge quantile,task
+fieldtwin_plc_lateness_seconds summary quantile,task
 fieldtwin_plc_losses_total counter
 fieldtwin_plc_missed_periods_total counter task
 fieldtwin_plc_overruns_total counter task
@@ -186,7 +186,7 @@ fieldtwin_plc_period_seconds gauge task
 fieldtwin_plc_programs_waiting gauge
 fieldtwin_plc_restarts_total counter
 fieldtwin_plc_running gauge task
-fieldtwin_plc_scan_seconds gauge quantile,task
+fieldtwin_plc_scan_seconds summary quantile,task
 fieldtwin_plc_scans_total counter task
 fieldtwin_plc_state gauge state,task
 fieldtwin_published_total counter
@@ -196,6 +196,7 @@ fieldtwin_server_events_total counter event,kind,name
 fieldtwin_status_age_seconds gauge
 fieldtwin_store_ok gauge
 fieldtwin_tag_good gauge device,tag
+fieldtwin_tag_problem gauge device,reason,tag
 fieldtwin_tag_value gauge device,tag,unit
 fieldtwin_tags gauge quality
 fieldtwin_tags_oldest_seconds gauge
@@ -254,24 +255,28 @@ def test_an_exported_tag_has_its_value_with_unit_and_no_other_tag_has_one() -> N
     got = scraped(text)
     assert value(got, "tag_value", device="ctd", tag="pressure", unit="dbar") == 31337.25
     assert value(got, "tag_good", device="ctd", tag="pressure") == 1
+    assert not [name for name, _ in got if name == "fieldtwin_tag_problem"]
     assert "secret" not in text
 
 
 @pytest.mark.parametrize(
-    ("status", "changes"),
+    ("status", "changes", "reason"),
     [
-        ({"quality": "bad", "reason": "stale"}, {}),
-        ({"quality": "uncertain"}, {}),
-        ({"quality": "simulated"}, {}),
-        ({"value": None}, {}),
-        ({}, {"gateway_ago_s": OLDEST_STATUS_S + 0.1}),
+        ({"quality": "bad", "reason": "stale"}, {}, "stale"),
+        ({"quality": "uncertain", "reason": "out of range"}, {}, "out of range"),
+        ({"quality": "simulated"}, {}, "none"),
+        ({"value": None}, {}, "none"),
+        ({}, {"gateway_ago_s": OLDEST_STATUS_S + 0.1}, "gateway dead"),
     ],
 )
-def test_a_value_that_is_not_good_has_no_sample_and_says_so(status: dict[str, Any], changes: dict[str, Any]) -> None:
+def test_a_value_that_is_not_good_has_no_sample_and_a_reason(
+    status: dict[str, Any], changes: dict[str, Any], reason: str
+) -> None:
     gateway = gateway_status(tags={"ctd.pressure": {"value": 31337.25, "age_s": 0.5} | status})
     got = scraped(render(families(seen(gateway=gateway, exported_tags=(PRESSURE,), **changes))))
     assert not [name for name, _ in got if name == "fieldtwin_tag_value"]
     assert value(got, "tag_good", device="ctd", tag="pressure") == 0
+    assert value(got, "tag_problem", device="ctd", tag="pressure", reason=reason) == 1
 
 
 def test_a_bit_is_exported_as_0_or_1_and_a_counter_of_64_bits_exactly() -> None:
@@ -281,6 +286,7 @@ def test_a_bit_is_exported_as_0_or_1_and_a_counter_of_64_bits_exactly() -> None:
     assert 'fieldtwin_tag_value{device="d",tag="bit",unit=""} 1\n' in text
     assert f'fieldtwin_tag_value{{device="d",tag="energy",unit="Wh"}} {2**63 + 1}\n' in text
     assert 'fieldtwin_tag_good{device="d",tag="missing"} 0\n' in text
+    assert 'fieldtwin_tag_problem{device="d",tag="missing",reason="never read"} 1\n' in text
 
 
 def test_the_state_of_a_task_is_1_for_its_present_state_only() -> None:

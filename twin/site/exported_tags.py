@@ -19,7 +19,9 @@ from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import MetricsForm
 
 MOST_TAGS = 1000
-"""The largest number of exported tags. Each has two time series, and Prometheus keeps every series in memory."""
+"""The largest number of exported tags. Each has two time series, or three while it is not good, and Prometheus keeps every
+series in memory.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.scenarios.bench import Bench, TagReading
+from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.language.words import BoundsForm, Expect, WireForm
 from fieldtwin.twin.site.system import System
 
@@ -76,7 +77,7 @@ async def _check_value(expect: Expect, watched: ExpectationInput, reading: TagRe
     wanted = watched.system.number_of(expect.tag, expect.value)
     if wanted is not None and not _near(reading.value, wanted, expect.tolerance):
         within = f" ± {expect.tolerance:g}" if expect.tolerance else ""
-        return f"{expect.tag} {expect.value}{within}", str(reading.value)
+        return f"{expect.tag} {expect.value}{within}", str(as_decimal(reading.value))
     if expect.like is not None:
         return await _like_held(expect, watched, reading.value, reading.age_s)
     return None
@@ -93,8 +94,8 @@ async def _like_held(expect: Expect, watched: ExpectationInput, value: object, r
     truths = [(decode_little if can else decode)(tag, raw, 0).value for raw in held_since(held, since_s)]
     if any(_near(value, truth, expect.tolerance) for truth in truths if truth is not None):
         return None
-    last = truths[-1] if truths else "nothing"
-    return f"{expect.tag} as the device's value, ± {expect.tolerance:g}", f"{value!r}; the device holds {last!r}"
+    seen, last = as_decimal(value), as_decimal(truths[-1]) if truths else "nothing"
+    return f"{expect.tag} as the device's value, ± {expect.tolerance:g}", f"{seen!r}; the device holds {last!r}"
 
 
 def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[bytes]:
@@ -108,7 +109,8 @@ def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[byte
 
 def _near(value: object, truth: object, tolerance: float) -> bool:
     if isinstance(value, int | float) and isinstance(truth, int | float) and not isinstance(value, bool):
-        return abs(value - truth) <= tolerance
+        difference: float = abs(as_decimal(value) - as_decimal(truth))
+        return difference <= tolerance
     return value == truth
 
 

@@ -14,6 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.judging.expectation import is_secret
+from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.twin.site.system import System
 
@@ -80,7 +81,7 @@ class Knowledge:
     def _in_words(self, name: str) -> str:
         reading, secret = self._bench.reading(name), is_secret(self._system, name)
         if reading is not None:
-            value = "no value," if reading.value is None else SECRET if secret else repr(reading.value)
+            value = "no value," if reading.value is None else SECRET if secret else repr(as_decimal(reading.value))
             why = f" ({reading.reason.replace('_', ' ')})" if reading.quality == "bad" and reading.reason else ""
             age = f", {reading.age_s:.3f} s old" if reading.value is not None else ""
             return f"{value} {reading.quality}{why}{age}"
@@ -89,6 +90,6 @@ class Knowledge:
             return f"never published{f' ({why})' if why else ''}"
         at = f"{last.t_ns / NS_PER_S:.3f} s"
         if last.kind is TraceKind.STATE and last.data.get("value") is not None:
-            return f"never read back; a program set it to {SECRET if secret else repr(last.data['value'])} at {at}"
+            return f"never read back; a program set it to {SECRET if secret else repr(as_decimal(last.data['value']))} at {at}"
         why = why or str(last.data.get("reason", "")).replace("_", " ")
         return f"no value{f' since {at}' if name in self._valued else ' yet'}{f' ({why})' if why else ''}"

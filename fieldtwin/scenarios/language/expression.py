@@ -14,6 +14,7 @@ from typing import Any
 from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, NotUnderstood, Parsed, dotted
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.scenarios.language.decimals import as_decimal
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
 """Functions of a tag: its quality in words, the seconds since its source's time, its value, how often it was published,
@@ -168,12 +169,13 @@ def _value(node: ast.expr, look: Look) -> Any:
         return node.value
     if isinstance(node, ast.Name | ast.Attribute):
         name = dotted(node)
-        return name == "true" if name in ("true", "false") else _known(look("value", name))
+        return name == "true" if name in ("true", "false") else _known(as_decimal(look("value", name)))
     if isinstance(node, ast.Call):
         function = dotted(node.func)
         if function in OF_NUMBERS:
             return _computed(OF_NUMBERS[function][1], *(_value(part, look) for part in node.args))
-        return _known(look(function, dotted(node.args[0])))
+        found = look(function, dotted(node.args[0]))
+        return _known(as_decimal(found) if function == "value" else found)
     if isinstance(node, ast.IfExp):
         chosen = _truth(_value(node.test, look))
         return None if chosen is None else _value(node.body if chosen else node.orelse, look)

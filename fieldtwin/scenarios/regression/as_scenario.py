@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.regression.run_history import RunHistory, ValueChange
 from fieldtwin.twin.site.system import System
 
@@ -218,7 +219,7 @@ def _at(changes: list[ValueChange], t_ns: int) -> ValueChange | None:
 def _literal(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    return f"'{value}'" if isinstance(value, str) else repr(value)
+    return f"'{value}'" if isinstance(value, str) else repr(as_decimal(value))
 
 
 def _number(value: float) -> str:

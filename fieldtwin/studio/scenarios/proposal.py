@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
+from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.studio.scenarios.recorder import Action, Recording, Seen, State
 
 BRIEF_NS = 500_000_000
@@ -138,7 +139,7 @@ def _held(name: str, seen: Seen, begin_ns: int) -> _Expected | None:
     if seen.quality != "good" or not isinstance(seen.value, bool | int | float):
         return None
     tolerance = f", tolerance: {abs(seen.value) * 1e-6:.3g}" if isinstance(seen.value, float) and seen.value else ""
-    step = f"tag: {name}, value: {json.dumps(seen.value)}{tolerance}, quality: good"
+    step = f"tag: {name}, value: {json.dumps(as_decimal(seen.value))}{tolerance}, quality: good"
     return _Expected(seen.t_ns, step, _delay(seen.t_ns - begin_ns))
 
 

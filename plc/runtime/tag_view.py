@@ -82,6 +82,7 @@ def _row(spec: TagSpec, value: TagValue, force: Force | None, now_ns: int, utc_n
         "time": datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds") if value.t_ns else None,
         "unit": spec.unit,
         "words": dict(spec.words),
+        "value_names": dict(spec.value_names),
         "limits": list(spec.limits) if spec.limits is not None else None,
         "forced": {"value": force.value, "by": force.by, "age_s": (now_ns - force.since_ns) / 1e9} if force else None,
     }

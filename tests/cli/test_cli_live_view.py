@@ -10,7 +10,7 @@ from rich.console import Console
 from statuses import gateway_status
 
 from fieldtwin.cli.run.live_view import age_text, line, render
-from fieldtwin.cli.run.plc_views import value_text
+from fieldtwin.cli.run.plc_views import Row, tag_table, value_text
 from fieldtwin.cli.run.troubles import interference, troubles
 from fieldtwin.plc.status import PlcStatus, Spread
 from fieldtwin.run.live.options import RunOptions
@@ -117,3 +117,27 @@ def test_every_trouble_is_named_once(session: RunSession) -> None:
 def test_values_are_formatted_for_users() -> None:
     assert [value_text(v) for v in (None, 1.0 / 3, 5, "0042", True)] == ["-", "0.333333", "5", "0042", "True"]
     assert [age_text(a) for a in (None, 0.049, 99.5, 1234.5)] == ["-", "0.05 s", "99.50 s", "1234 s"]
+
+
+def test_the_live_table_shows_the_name_of_a_value(session: RunSession) -> None:
+    session.gateway_status = gateway_status(tags={"ctd.status": {"value": 7, "text": "FAULT", "age_s": 0.1}})
+    assert any(text.startswith("ctd.status  7 (FAULT)") for text in shown(session, 80))
+
+
+@pytest.mark.parametrize(
+    ("value", "row", "text"),
+    [
+        (7, {"value_names": {"7": "FAULT"}}, "7 (FAULT)"),
+        (True, {"value_names": {"1": "OPEN"}}, "True (OPEN)"),
+        (5, {"value_names": {"7": "FAULT"}}, "5"),
+        (1.5, {"value_names": {"1": "OPEN"}}, "1.5"),
+        (None, {"value_names": {"1": "OPEN"}}, "-"),
+        (1, {"words": {"1": "PUMPING"}}, "PUMPING"),
+    ],
+)
+def test_plc_watch_shows_a_state_by_its_name_and_a_number_with_its_name(value: object, row: Row, text: str) -> None:
+    whole = {"tag": "tank.pump", "value": value, "unit": "", "limits": None, "quality": "good", "reason": "none"}
+    whole |= {"age_s": 0.1, "forced": None, "side": "input", "seen": {}, "words": {}, "value_names": {}}
+    out = StringIO()
+    Console(file=out, width=100).print(tag_table([whole | row]))
+    assert text in [cell.strip() for cell in out.getvalue().splitlines()[1].split("  ")]

@@ -80,7 +80,8 @@ def plant_tags(system: System) -> dict[str, TagSpec]:
         profile = device.profile
         for tag in profile.tags.values():
             if not tag.is_text:
-                add(TagSpec(f"{device.name}.{tag.name}", _kind(tag), tag.unit, limits=tag.limits))
+                name = f"{device.name}.{tag.name}"
+                add(TagSpec(name, _kind(tag), tag.unit, limits=tag.limits, value_names=tag.values))
         for message in profile.messages.values():
             add(message_tag(f"{device.name}.{message.name}", 2 * message.at.count, MESSAGE_DEPTH))
         if profile.inbox is not None and profile.outbox is not None:

@@ -10,6 +10,7 @@ from itertools import islice
 from types import TracebackType
 from typing import Any
 
+from msgspec import UNSET
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -233,7 +234,7 @@ def _tags(session: RunSession) -> Table:
         quality = tag.quality + (f" ({tag.reason})" if tag.reason != "none" else "")
         table.add_row(
             name,
-            "(secret)" if name in secrets else value_text(tag.value),
+            Text("(secret)" if name in secrets else value_text(tag.value, "" if tag.text is UNSET else tag.text)),
             units.get(name, ""),
             Text(quality, COLOUR.get(tag.quality, "")),
             age_text(tag.age_s),

@@ -105,8 +105,10 @@ def tag_table(rows: list[Row]) -> Table:
 
 
 def _named(row: Row, value: Any) -> str:
-    """Return the name of a value if it has one, such as that of a state, else the value as text."""
-    return str(row["words"].get(str(value), value_text(value)))
+    """Return the name of a state, otherwise the value as text, with the name that the device's profile gives to it."""
+    number = str(int(value)) if isinstance(value, int) else ""
+    word = row["words"].get(number)
+    return str(word) if word is not None else value_text(value, row["value_names"].get(number, ""))
 
 
 def _limits(limits: list[float] | None) -> str:
@@ -284,8 +286,9 @@ def _age(ms: float) -> str:
     return f"{ms:.0f} ms" if ms < 10_000 else f"{ms / 1000:.0f} s" if ms < 600_000 else f"{ms / 60_000:.0f} min"
 
 
-def value_text(value: Any) -> str:
-    """Return a value as text: floats with six digits, a missing value as a dash."""
+def value_text(value: Any, name: str = "") -> str:
+    """Return a value as text: floats with six digits, a missing value as a dash, and its name, if it has one, in brackets."""
     if value is None:
         return "-"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{text} ({name})" if name else text

@@ -49,9 +49,10 @@ class TagKind(Enum):
 class TagSpec:
     """One tag: name (``device.tag`` or ``program.variable``), kind, unit, limits, and names for its values.
 
-    The limits are the smallest and largest value that the tag is meant to have; None stands for the limit of its kind. The names
-    are for values that are, for example, states. A MESSAGE has payloads of at most `max_bytes` and keeps the last `depth` of
-    them. Raises `FileInvalid` for a size that makes no sense.
+    The limits are the smallest and largest value that the tag is meant to have; None stands for the limit of its kind. `words`
+    are the names of a program's enumeration, such as a state, and stand for its numbers. `value_names` are the names that a
+    device's profile gives to some numbers, which programs and tests use as numbers. A MESSAGE has payloads of at most `max_bytes`
+    and keeps the last `depth` of them. Raises `FileInvalid` for a size that makes no sense.
     """
 
     name: str
@@ -61,6 +62,7 @@ class TagSpec:
     depth: int = 0
     limits: tuple[float, float] | None = None
     words: tuple[tuple[int, str], ...] = ()
+    value_names: tuple[tuple[int, str], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -86,6 +88,8 @@ class TagSpec:
             text["limits"] = [float(limit) for limit in self.limits]  # 0 and 0.0 give the same layout
         if self.words:
             text["words"] = [list(word) for word in self.words]
+        if self.value_names:
+            text["value_names"] = [list(name) for name in self.value_names]
         return text
 
     @classmethod
@@ -100,6 +104,7 @@ class TagSpec:
                 int(text.get("depth", 0)),
                 None if text.get("limits") is None else _pair(*text["limits"]),
                 tuple((int(code), str(word)) for code, word in text.get("words", ())),
+                tuple((int(code), str(name)) for code, name in text.get("value_names", ())),
             )
         except (KeyError, ValueError, TypeError, AttributeError) as e:
             raise FileInvalid("not the description of a tag", expected="name, kind, unit", got=str(text)) from e

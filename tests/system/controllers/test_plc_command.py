@@ -43,6 +43,7 @@ def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, m
         assert "PLC: running" in text
         assert "no tag is forced" in text
         assert "relay.state" in plc("watch", "relay.*")
+        wait_for(lambda: "1 (sampling)" in plc("watch", "ctd.status"), 15, "a value with the name of the profile")
         assert "by program relay" in plc("why", "ctd.sample_period_s")
         with pytest.raises(UsageError, match="no terminal for the confirmation"):
             plc("force", "ctd.sample_period_s", "9")

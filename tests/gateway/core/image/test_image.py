@@ -224,14 +224,16 @@ def test_another_layout_or_no_image_is_refused() -> None:
 
 
 def test_descriptions_survive_json_and_impossible_ones_are_refused() -> None:
-    limited = TagSpec("pump.speed", TagKind.INT, "rpm", limits=(0, 1500), words=((0, "off"),))
+    limited = TagSpec(
+        "pump.speed", TagKind.INT, "rpm", limits=(0, 1500), words=((0, "off"),), value_names=((7, "fault"),)
+    )
     layout = process_image([message_tag("modem.inbox", 250, 16)], [message_tag("modem.outbox", 250, 8), limited])
     again = ImageLayout.from_description(json.loads(json.dumps(layout.describe())))
     assert again.digest == layout.digest  # for two processes that read one description
     assert ImageLayout.from_description(layout.describe()) == layout
     assert [t.name for t in layout.regions[0].tags] == ["modem.inbox", taken_name("modem.outbox")]
     assert [t.name for t in layout.regions[1].tags] == ["modem.outbox", "pump.speed", consumed_name("modem.inbox")]
-    assert (again.regions[1].tags[1].limits, again.regions[1].tags[1].words) == ((0, 1500), ((0, "off"),))
+    assert again.regions[1].tags[1] == limited
     assert [r.name for r in layout.regions] == [INPUTS, OUTPUTS]
     for bad in ({}, {"regions": [{}]}, {"regions": [{"name": "r", "tags": [{"name": "x", "kind": "REEL"}]}]}):
         with pytest.raises(FileInvalid):

@@ -22,13 +22,15 @@ MAX_DESCRIPTION_BYTES = 16 * 1024 * 1024
 class Loss:
     """One part of the input that the result does not have.
 
-    `place` names the part of the input, such as ``tag speed`` or ``object 2000h:01``. `what` is the lost property, and `why`
-    the reason, as a clause. Losses with equal `what` and `why` are printed together.
+    `place` names the part of the input, such as ``tag speed`` or ``object 2000h:01``. `what` is the lost property, and `why` the
+    reason, as a clause. Losses with equal `what` and `why` are printed together. A `note` names something that the result never
+    has and a user does not miss there, such as the address of the device in a profile. It is listed, and ``--strict`` permits it.
     """
 
     place: str
     what: str
     why: str
+    note: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +96,11 @@ def whole_setting(settings: Settings, key: str, low: int, high: int) -> int | No
 
 
 def losses_of_keys(profile: DeviceProfile, keys: Mapping[str, str]) -> Iterable[Loss]:
-    """Yield a loss for each of the profile's `keys` that the file sets; the values of `keys` are the reasons."""
+    """Yield a loss for each of the profile's `keys` that the file sets; the values of `keys` are the reasons.
+
+    ``source`` is only a note, because each profile has it and it describes the profile, not the device.
+    """
     stated = profile.form.model_dump(exclude_defaults=True)
     for key, why in keys.items():
         if stated.get(key):
-            yield Loss("the profile", f"`{key}`", why)
+            yield Loss("the profile", f"`{key}`", why, note=key == "source")

@@ -53,6 +53,9 @@ _ONE_DEVICE = {
     "select": "the device, if the file has several: its name, unit ID, or NAME/UNIT",
 }
 _ENDPOINT = {"endpoint": "endpoint of the device, such as tcp://192.168.0.7 or rtu:/dev/ttyUSB0"}
+_NUMBERING = {
+    "numbering": "addresses without zeroBasedAddressing: sent, one (from 1) or printed (40001); default: by the addresses"
+}
 
 FORMATS: dict[str, Format] = {
     row.name: row
@@ -144,6 +147,15 @@ FORMATS: dict[str, Format] = {
             "requests without types",
             "fieldtwin.descriptions.maps.node_red",
             import_settings=_ONE_DEVICE,
+            export_settings=_ENDPOINT,
+        ),
+        Format(
+            "wot",
+            ".td.json",
+            "W3C Thing Description with the Modbus binding",
+            "properties of a thing in registers",
+            "fieldtwin.descriptions.maps.wot",
+            import_settings=_ONE_DEVICE | _NUMBERING,
             export_settings=_ENDPOINT,
         ),
         Format(

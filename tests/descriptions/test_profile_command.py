@@ -14,6 +14,14 @@ from fieldtwin.descriptions.formats import FORMATS
 from fieldtwin.gateway.core.errors import CheckFailed, FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile_file import load_profile
 
+PLAIN = """
+device: acme/plain
+source: a test
+protocol: modbus
+tags:
+  level: {at: 'holding:5', type: int16}
+"""
+
 
 def run(*words: str | Path) -> Result:
     return CliRunner().invoke(cli, ["profile", *map(str, words)], standalone_mode=False)
@@ -73,9 +81,12 @@ def test_losses_are_printed_and_in_json(tmp_path: Path) -> None:
     assert "lost: the names of its values (tag mode, tag mode_display):" in run("export", "eds", "drive-cia402").stderr
     found = json.loads(run("export", "eds", "drive-cia402", "-o", out, "--json").stdout)
     assert found["file"] == str(out)
-    assert {"place": "tag target_torque", "what": "`danger`", "why": "the format has no place for it"} in found[
-        "losses"
-    ]
+    assert {
+        "place": "tag target_torque",
+        "what": "`danger`",
+        "why": "the format has no place for it",
+        "note": False,
+    } in found["losses"]
 
 
 def test_with_strict_a_loss_is_an_error_and_nothing_is_written(tmp_path: Path) -> None:
@@ -87,6 +98,22 @@ def test_with_strict_a_loss_is_an_error_and_nothing_is_written(tmp_path: Path) -
 
 def test_strict_accepts_an_import_without_losses(sheet: Path) -> None:
     assert run("import", "eds", sheet, "--strict", "--set", "objects=pdo").exception is None
+
+
+def test_strict_permits_parts_that_are_only_listed(tmp_path: Path) -> None:
+    (tmp_path / "plain.yaml").write_text(PLAIN, encoding="utf-8")
+    words = ("home-assistant", tmp_path / "plain.yaml", "--set", "endpoint=tcp://192.0.2.7", "--strict")
+    assert run("export", *words).exception is None
+    assert run("export", *words, "-o", tmp_path / "map.yaml").exception is None
+    done = run("import", "home-assistant", tmp_path / "map.yaml", "--strict")
+    assert done.exception is None
+    assert "not converted: address of the hub" in done.stderr
+
+
+def test_source_of_a_profile_is_no_loss(tmp_path: Path) -> None:
+    out = tmp_path / "d.eds"
+    found = json.loads(run("export", "eds", "drive-cia402", "-o", out, "--json").stdout)["losses"]
+    assert [loss["note"] for loss in found if loss["what"] == "`source`"] == [True]
 
 
 @pytest.mark.parametrize(

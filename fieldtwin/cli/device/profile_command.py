@@ -30,7 +30,9 @@ _set_option = click.option(
     help="A setting of the format; `profile formats` lists them.",
 )
 _strict_option = click.option(
-    "--strict", is_flag=True, help="A loss is an error: write nothing, and end with exit code 1."
+    "--strict",
+    is_flag=True,
+    help="A loss is an error: write nothing, and end with exit code 1. Parts listed as `not converted` are permitted.",
 )
 
 
@@ -147,17 +149,19 @@ def formats_command(as_json: bool) -> int:
 
 def _show(losses: Iterable[Loss]) -> None:
     """Print the losses on stderr; those with the same property and reason in one line, with the first places."""
-    together: dict[tuple[str, str], list[str]] = {}
+    together: dict[tuple[bool, str, str], list[str]] = {}
     for loss in losses:
-        together.setdefault((loss.what, loss.why), []).append(loss.place)
-    for (what, why), places in together.items():
+        together.setdefault((loss.note, loss.what, loss.why), []).append(loss.place)
+    for (note, what, why), places in together.items():
         more = f" and {len(places) - SHOWN_PLACES} more" if len(places) > SHOWN_PLACES else ""
-        stderr.print(f"lost: {what} ({', '.join(places[:SHOWN_PLACES])}{more}): {why}", soft_wrap=True, markup=False)
+        label = "not converted" if note else "lost"
+        stderr.print(f"{label}: {what} ({', '.join(places[:SHOWN_PLACES])}{more}): {why}", soft_wrap=True, markup=False)
 
 
 def _refuse_losses(losses: tuple[Loss, ...], strict: bool) -> None:
-    if strict and losses:
-        count = "1 part of the input" if len(losses) == 1 else f"{len(losses)} parts of the input"
+    lost = sum(not loss.note for loss in losses)
+    if strict and lost:
+        count = "1 part of the input" if lost == 1 else f"{lost} parts of the input"
         raise CheckFailed(
             f"the result would lack {count}", hint="without --strict the conversion is done, and lists them"
         )

@@ -18,7 +18,7 @@ import yaml
 
 from fieldtwin.descriptions.conversion import Source
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES
+from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES, BoundedLoader
 
 MAX_VALUES = 200_000
 """The largest number of values in one file. An aliased YAML document could otherwise expand to millions of values."""
@@ -225,8 +225,8 @@ def _is_header(text: str, names: list[str], first: int, i: int) -> bool:
     return i >= first and re.match(rf"\s*\[\[?\s*{re.escape('.'.join(names))}\s*\]", text) is not None
 
 
-class _Loader(yaml.SafeLoader):
-    """A SafeLoader for the files of other programs: tags such as ``!secret`` become `Tagged`."""
+class _Loader(BoundedLoader):
+    """A loader for the files of other programs: tags such as ``!secret`` become `Tagged`."""
 
 
 @dataclass(frozen=True)

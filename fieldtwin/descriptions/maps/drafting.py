@@ -67,7 +67,13 @@ class Draft:
 
     def lose(self, place: str, what: str, why: str) -> None:
         """Add a loss, unless the same loss of the same place is listed already."""
-        loss = Loss(place, what, why)
+        self._list(Loss(place, what, why))
+
+    def note(self, place: str, what: str, why: str) -> None:
+        """Add a loss that is only a note (`Loss.note`), unless the same one is listed already."""
+        self._list(Loss(place, what, why, note=True))
+
+    def _list(self, loss: Loss) -> None:
         if loss not in self.losses:
             self.losses.append(loss)
 
@@ -102,7 +108,7 @@ class Draft:
     def imported(self) -> Imported:
         """Return the profile and the losses. Raises `FileInvalid` if no tag was found."""
         if not self._tags:
-            why = self.losses[0] if self.losses else None
+            why = next((loss for loss in self.losses if not loss.note), None)
             raise FileInvalid(
                 "the file describes no register that a profile can hold",
                 path=self._document.path,

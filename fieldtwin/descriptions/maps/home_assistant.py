@@ -122,7 +122,7 @@ def _import_hub(document: Document, loc: Loc, hub: Mapping[str, Any], draft: Dra
     if kind == "serial":
         draft.serial(loc, hub)
     document.choice(kind, (*loc, "type"), "`type`", _HUB_TYPES)
-    draft.lose("key host", "address of the hub", "an endpoint belongs in the system file")
+    draft.note("key host", "address of the hub", "an endpoint belongs in the system file")
     for key in ("timeout", "delay", "message_wait_milliseconds", "retries"):
         if key in hub:
             draft.lose(f"key {key}", f"`{key}`", "the profile has no equivalent")

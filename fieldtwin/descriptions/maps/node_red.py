@@ -102,7 +102,7 @@ def _import_client(node: Mapping[str, Any], draft: Draft) -> None:
             draft.factory(baudrate=int(rate), frame=frame)
         else:
             draft.lose("modbus-client", "settings of the serial line", f"a profile cannot state {rate} {frame}")
-    draft.lose("modbus-client", "address of the device", "an endpoint belongs in the system file")
+    draft.note("modbus-client", "address of the device", "an endpoint belongs in the system file")
 
 
 def _requests(

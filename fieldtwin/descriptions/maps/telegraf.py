@@ -16,7 +16,7 @@ from fieldtwin.descriptions.maps.documents import Document, Loc, parse_toml
 from fieldtwin.descriptions.maps.drafting import Draft, choose
 from fieldtwin.descriptions.maps.rendering import Abilities, exported, shorten, stated_endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.profile import REGISTERS_OF, DeviceProfile, Table, Tag
+from fieldtwin.gateway.core.files.profile import BIT_TABLES, REGISTERS_OF, DeviceProfile, Table, Tag
 
 ABILITIES = Abilities(
     "Telegraf",
@@ -63,7 +63,7 @@ def import_description(source: Source, settings: Settings) -> Imported:
     draft = Draft(document, labels[index][0], "Telegraf's inputs.modbus", settings)
     draft.factory(unit=unit)
     _import_connection(document, loc, plugin, draft)
-    for place, field, table, order, style in _fields(document, loc, plugin, unit):
+    for place, field, table, order, style in _fields(document, loc, plugin, unit, draft):
         _import_field(document, place, field, table, order, style, draft)
     return draft.imported()
 
@@ -90,25 +90,27 @@ def _import_connection(document: Document, loc: Loc, plugin: Mapping[str, Any], 
     if controller.startswith("file:") or "baud_rate" in plugin:
         draft.serial(loc, plugin, ("baud_rate", "data_bits", "parity", "stop_bits"))
     if controller:
-        draft.lose("key controller", f"address {controller}", "an endpoint belongs in the system file")
+        draft.note("key controller", f"address {controller}", "an endpoint belongs in the system file")
     for key in ("timeout", "busy_retries", "workarounds", "optimization", "tags"):
         if key in plugin:
             draft.lose(f"key {key}", f"`{key}`", "the profile has no equivalent")
 
 
 def _fields(
-    document: Document, loc: Loc, plugin: Mapping[str, Any], unit: int
+    document: Document, loc: Loc, plugin: Mapping[str, Any], unit: int, draft: Draft
 ) -> Iterator[tuple[Loc, dict[str, Any], Table, object, str]]:
-    """Yield each field with its place, its table, its byte order, and the style."""
+    """Yield each field with its place, its table, its byte order, and the style. The tags of a block are listed as a loss."""
     style = _style(document, loc, plugin)
     if style == "register":
         for key, table in _TABLES.items():
             for place, field in document.entries(plugin.get(key), (*loc, key), f"`{key}`"):
                 yield place, field, table, field.get("byte_order", ""), style
         return
-    for place, block in document.entries(plugin.get(style), (*loc, style), f"`{style}`"):
+    for n, (place, block) in enumerate(document.entries(plugin.get(style), (*loc, style), f"`{style}`"), 1):
         if document.integer(block.get("slave_id", 0), (*place, "slave_id"), "`slave_id`", 0, 255) != unit:
             continue
+        for name in document.mapping(block.get("tags") or {}, (*place, "tags"), "`tags`"):
+            draft.lose(f"{style} {n}", f"tag {name} of the metric", "the profile has no equivalent")
         for at, field in document.entries(block.get("fields"), (*place, "fields"), "`fields`"):
             name = (block if style == "request" else field).get("register", "holding")
             table = _REGISTERS[document.choice(name, (*at, "register"), "`register`", _REGISTERS)]
@@ -124,6 +126,8 @@ def _import_field(
     name = document.text(field.get("name"), (*loc, "name"), "`name`")
     address, length = _span(document, loc, field, style)
     fields: dict[str, Any] = {"poll": _poll(field.get("measurement"))}
+    if table in BIT_TABLES and length > 1:
+        draft.lose(f"field {name}", f"the {length - 1} bits after {address}", "a tag is one bit")
     if table in ("holding", "input"):
         kind = str(field.get("data_type" if style == "register" else "type", "")).upper()
         kind = _normal_type(document, loc, kind, length, style)

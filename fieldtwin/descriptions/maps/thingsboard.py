@@ -90,7 +90,7 @@ def _import_device(document: Document, loc: Loc, device: Mapping[str, Any], unit
     draft.factory(unit=unit)
     if device.get("type") == "serial" or "baudrate" in device:
         draft.serial(loc, device, usual_rate=19200)
-    draft.lose("key host", "address of the device", "an endpoint belongs in the system file")
+    draft.note("key host", "address of the device", "an endpoint belongs in the system file")
     kept = {"unitId", "deviceName", "byteOrder", "wordOrder", "host", "port", "type", *_SECTIONS}
     kept |= {"baudrate", "bytesize", "stopbits", "parity", "method"}
     for key in device:

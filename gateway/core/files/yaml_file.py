@@ -31,6 +31,9 @@ MAX_BYTES = 8 * 1024 * 1024
 
 MAX_VALUES = 100_000
 
+MAX_NESTING = 64
+"""The largest number of nested ``[`` and ``{``. PyYAML's time grows with the square of this number."""
+
 MAX_DIGITS = 21
 """The largest number of characters of an integer, including its sign."""
 
@@ -39,8 +42,18 @@ Position = tuple[int, int]
 M = TypeVar("M", bound=BaseModel)
 
 
-class _Loader(yaml.SafeLoader):
-    """A SafeLoader with the scalars of YAML 1.2's core schema."""
+class BoundedLoader(yaml.SafeLoader):
+    """A SafeLoader that refuses more than `MAX_NESTING` nested ``[`` and ``{`` with a `yaml.MarkedYAMLError`."""
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
+        if self.flow_level >= MAX_NESTING:
+            message = f"more than {MAX_NESTING} nested [ and {{"
+            raise yaml.scanner.ScannerError(None, None, message, self.get_mark())
+        super().fetch_flow_collection_start(TokenClass)
+
+
+class _Loader(BoundedLoader):
+    """A loader with the scalars of YAML 1.2's core schema."""
 
     merges = False
 

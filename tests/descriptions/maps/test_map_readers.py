@@ -305,3 +305,16 @@ def test_name_of_the_profile_is_checked() -> None:
     assert read("node_red", json.dumps(FLOW), device="acme/plc-1").profile.device == "acme/plc-1"
     with pytest.raises(UsageError, match="cannot use --set device"):
         read("node_red", json.dumps(FLOW), device="Acme PLC")
+
+
+def test_bits_after_the_first_of_a_coil_of_telegraf_are_listed_as_lost() -> None:
+    text = '[[inputs.modbus]]\ncoils = [{ name = "valves", address = [3, 4, 5] }]\n'
+    found = read("telegraf", text)
+    assert tags(found) == {"valves": {"at": "coil:3", "type": "bool"}}
+    assert [(loss.place, loss.what) for loss in found.losses] == [("field valves", "the 2 bits after 3")]
+
+
+def test_tags_of_a_metric_of_telegraf_are_listed_as_lost() -> None:
+    text = TELEGRAF.rstrip() + '\n    [inputs.modbus.metric.tags]\n      room = "A1"\n'
+    found = read("telegraf", text, select="metrics")
+    assert ("metric 1", "tag room of the metric") in {(loss.place, loss.what) for loss in found.losses}

@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.descriptions.conversion import Source
+from fieldtwin.descriptions.maps.documents import parse_yaml
 from fieldtwin.descriptions.profile_text import checked_profile, profile_text
-from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
 REGISTER = {"tag": "a", "type": "32int", "functionCode": 3, "objectsCount": 2, "address": 10, "divider": 10, "multiplier": 2,
             "byteOrder": "BIG", "variants": {"1": "on"}, "bit": 3}  # fmt: skip
@@ -57,6 +58,17 @@ SAMPLES: dict[str, Any] = {
                                      "symbols": [{"name": "a", "value": 1}]},
                                     {"name": "V_SF", "type": "sunssf", "size": 1}],
             "groups": [{"name": "m", "count": 2, "points": [{"name": "T", "type": "string", "size": 4, "static": "S"}]}],
+        },
+    },
+    "wot": {
+        "title": "t", "base": "modbus+tcp://192.0.2.7:502/1/", "actions": {"go": {}},
+        "properties": {
+            "a": {"type": "integer", "minimum": 0, "maximum": 9, "unit": "V", "description": "text", "readOnly": True, "forms": [
+                {"href": "10?quantity=2", "op": ["readproperty"], "modv:entity": "HoldingRegister", "modv:type": "xsd:int",
+                 "modv:mostSignificantByte": False, "modv:pollingTime": 5,
+                 "contentType": "application/octet-stream;length=4;byteSeq=BIG_ENDIAN;signed=false"},
+                {"href": "/1/10", "modv:function": "writeSingleHoldingRegister", "op": "writeproperty"}]},
+            "b": {"type": "boolean", "forms": [{"href": "modbus+tcp://h/1", "modbus:address": 3, "modbus:function": 1}]},
         },
     },
 }  # fmt: skip
@@ -109,6 +121,12 @@ def test_changed_value_gives_a_profile_or_an_error_with_the_file(name: str, data
     sample = changed(sample, data.draw(st.sampled_from(list(places(sample)))), data.draw(VALUES))
     text = yaml.safe_dump(sample) if name == "home_assistant" else json.dumps(sample)
     read(name, text.encode())
+
+
+def test_nested_brackets_of_yaml_are_refused_before_they_are_parsed() -> None:
+    with pytest.raises(FileInvalid, match="more than 64 nested") as error:
+        parse_yaml(Source(Path("map.txt"), b"modbus: " + b"[" * 200_000))
+    assert (error.value.line, error.value.column) == (1, 73)
 
 
 CELLS = st.one_of(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES, load, parse, validate
+from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES, MAX_NESTING, load, parse, validate
 
 
 class Inner(BaseModel):
@@ -153,3 +153,10 @@ def test_another_kind_of_file_is_named(tmp_path: Path, begins: bytes, told: str)
 def test_files_of_editors_on_other_systems_are_read(tmp_path: Path, begins: bytes) -> None:
     (tmp_path / "given").write_bytes(begins)
     assert load(tmp_path / "given").data["a"] == 1
+
+
+def test_brackets_may_be_nested_up_to_the_limit_only() -> None:
+    inside = "a: " + "[" * MAX_NESTING + "]" * MAX_NESTING
+    assert parse(inside, "x.yaml").data["a"] is not None
+    with pytest.raises(FileInvalid, match=f"more than {MAX_NESTING} nested"):
+        parse("a: " + "{b: " * (MAX_NESTING + 1), "x.yaml")

@@ -54,7 +54,7 @@ class Plant:
 
     def __init__(self, folder: Path, tags: int) -> None:
         from fieldtwin.gateway.core.image.image import INPUTS
-        from fieldtwin.northbound.opcua.config import OpcuaProcessConfig
+        from fieldtwin.northbound.process_config import ServerProcessConfig
         from fieldtwin.twin.plant.physical import attached, image_layout, make_image
         from fieldtwin.twin.site.resolved import write_resolved
         from fieldtwin.twin.site.system import load_system
@@ -68,7 +68,7 @@ class Plant:
         self.url = f"opc.tcp://127.0.0.1:{port}"
         self.count = 0
         self.names = [f"d{n // TAGS_OF_A_DEVICE}.t{n % TAGS_OF_A_DEVICE}" for n in range(tags)]
-        config = OpcuaProcessConfig(write_resolved(folder / "system.pickle", system), str(folder), "scada", False)
+        config = ServerProcessConfig(write_resolved(folder / "system.pickle", system), str(folder), "scada", False)
         (folder / "config.json").write_bytes(msgspec.json.encode(config))
         self.publish(1.0)
         command = [sys.executable, "-m", "fieldtwin.northbound.opcua.process", str(folder / "config.json")]

@@ -10,7 +10,7 @@ def studio_page() -> str:
     """Return the table of all operations: method, path, summary, and the role that may use it."""
     rows = [
         f"| `{method.upper()} {path}` | {about['summary']} | {'operate' if 'description' in about else 'view'} |"
-        for path, methods in describe(OPERATIONS)["paths"].items()
+        for path, methods in describe(OPERATIONS, "fieldtwin Studio")["paths"].items()
         for method, about in methods.items()
     ]
     lines = [

@@ -1,4 +1,4 @@
-"""Access to Studio: a token for each role, checks against other web sites, and headers that restrict the pages.
+"""Access to the interface: a token for each role, checks against other web sites, and headers that restrict the pages.
 
 A web page of another site can send requests to this server from the user's browser. It cannot read the answers, but a
 request could change a plant. Three checks prevent that: the ``Host`` header has to name this server (DNS rebinding), the
@@ -21,14 +21,20 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from fieldtwin.northbound.token_file import LONGEST_TOKEN
+
 COOKIE = "fieldtwin_studio"
 VIEW, OPERATE = "view", "operate"
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""The names under which programs on this computer know a server that listens on loopback."""
 MOST_FAILURES = 10
 """Number of wrong tokens from one address after which that address has to wait."""
 FORGET_FAILURES_S = 60.0
 MOST_ADDRESSES = 1_000
-LONGEST_TOKEN = 200
 
+NO_TOKEN = (
+    "a token is required: in the header `Authorization: Bearer TOKEN`, or in the address that `fieldtwin studio` prints"
+)
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -53,12 +59,13 @@ class Access:
     """The rules of access to the server. `operate` and `view` are the tokens of the roles; an empty one is not valid. `hosts`
     are the accepted ``Host`` headers.
 
-    Without any token, every client has the role operate. That is only for loopback.
+    Without any token, every client has the role `open_role`. That is only for loopback.
     """
 
     hosts: frozenset[str]
     operate: str = field(default="", repr=False)
     view: str = field(default="", repr=False)
+    open_role: str = OPERATE
 
     def role_of(self, token: str) -> str:
         """Return the role of a token, "" for a wrong one. The time of a comparison does not depend on the token."""
@@ -102,13 +109,11 @@ class AccessMiddleware:
             await _refuse(scope, receive, send, 429, "too many wrong tokens; wait a minute")
             return
         token = _token_of(scope, headers)
-        role = OPERATE if self._access.is_open else self._access.role_of(token)
+        role = self._access.open_role if self._access.is_open else self._access.role_of(token)
         if not role:
             if token:
                 self._note_failure(client)
-            await _refuse(
-                scope, receive, send, 401, "a token is required: open the address that `fieldtwin studio` prints"
-            )
+            await _refuse(scope, receive, send, 401, NO_TOKEN)
             return
         scope["role"] = role
         if _in_query(scope) and scope["type"] == "http" and not scope["path"].startswith("/api/"):

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
-import socket
-import ssl
 import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 from pathlib import Path
 from urllib.parse import quote
 
-import uvicorn
-
 from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
-from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, UsageError, os_reason
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.studio.access import Access, allowed_hosts, new_token
+from fieldtwin.studio.access import LOOPBACK, Access, allowed_hosts, new_token
 from fieldtwin.studio.app import STATIC, application
 from fieldtwin.studio.replay.traces import Traces
+from fieldtwin.studio.web_server import WebServer, listening_socket
+from fieldtwin.twin.site.loopback import is_loopback
 
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-CLOSES_WITHIN_S = 2
 MOST_CONNECTIONS = 200
 
 
@@ -70,12 +64,7 @@ class StudioOptions:
     @property
     def is_loopback(self) -> bool:
         """Return whether only programs on this computer can connect."""
-        if self.host in LOOPBACK:
-            return True
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return False
+        return is_loopback(self.host)
 
 
 @dataclass(frozen=True)
@@ -103,39 +92,17 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
     Raises `UsageError`, `EndpointBusy`, `Unreachable` or `FileInvalid`.
     """
     options.check()
-    listener = _listener(options)
+    listener = listening_socket(options.host, options.port, "--listen HOST:0 selects a free port")
     port = listener.getsockname()[1]
     names = {options.host, *options.names} | (set(LOOPBACK) if options.is_loopback else set())
     operate = "" if options.no_token else options.operate_token or new_token()
     access = Access(allowed_hosts(names, port), operate, options.view_token)
     traces = Traces(Path.cwd(), () if options.trace is None else (options.trace,), options.trace_system)
     app = application(access, WallClock(), Path.cwd(), traces)
-    config = uvicorn.Config(
-        app,
-        log_config=None,
-        log_level="critical",
-        access_log=False,
-        server_header=False,
-        lifespan="on",
-        ws="websockets-sansio",
-        limit_concurrency=MOST_CONNECTIONS,
-        timeout_graceful_shutdown=CLOSES_WITHIN_S,
-        ssl_certfile=str(options.certificate) if options.certificate else None,
-        ssl_keyfile=str(options.key) if options.key else None,
-    )
-    server = _Server(config)
-    try:
-        config.load()
-    except (ssl.SSLError, OSError) as e:
-        raise FileInvalid(f"the certificate or its key cannot be used: {e}", path=str(options.certificate)) from e
+    server = WebServer(app, listener, MOST_CONNECTIONS, options.certificate, options.key)
     on_stop_signal(server.stop)
-    running = asyncio.ensure_future(server.serve(sockets=[listener]))
     try:
-        while not server.started and not running.done():
-            await asyncio.sleep(0.01)
-        if running.done():
-            running.result()
-            raise Unreachable("the server did not start", where=options.host)
+        await server.start()
         scheme = "https" if options.certificate else "http"
         shown = f"[{options.host}]" if ":" in options.host else options.host
         address = f"{scheme}://{shown}:{port}/"
@@ -145,11 +112,9 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
         place = f"#/{instance}" if instance else await _first_trace(traces, options)
         url = (f"{address}?token={operate}" if operate else address) + place
         on_ready(Serving(url, address, access))
-        await running
+        await server.wait()
     finally:
-        server.stop()
-        await asyncio.gather(running, return_exceptions=True)
-        listener.close()
+        await server.aclose()
 
 
 async def _first_trace(traces: Traces, options: StudioOptions) -> str:
@@ -173,36 +138,3 @@ def open_browser(url: str) -> bool:
         return webbrowser.open(url)
     except webbrowser.Error:
         return False
-
-
-class _Server(uvicorn.Server):
-    """A server whose signals are handled by the caller."""
-
-    def install_signal_handlers(self) -> None:
-        return None
-
-    def capture_signals(self):  # type: ignore[no-untyped-def]
-        from contextlib import nullcontext
-
-        return nullcontext()
-
-    def stop(self) -> None:
-        self.should_exit = True
-
-
-def _listener(options: StudioOptions) -> socket.socket:
-    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((options.host, options.port))
-        listener.listen(128)
-    except OSError as e:
-        listener.close()
-        where = f"{options.host}:{options.port}"
-        if e.errno in (98, 48):
-            raise EndpointBusy(
-                "another program listens there", where=where, hint="--listen HOST:0 selects a free port"
-            ) from e
-        raise Unreachable(f"cannot listen: {os_reason(e)}", where=where) from e
-    return listener

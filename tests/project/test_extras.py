@@ -22,8 +22,9 @@ from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
-from fieldtwin.northbound.opcua.config import require_library
+from fieldtwin.northbound.process_config import require_packages
 from fieldtwin.run.processes import event_loop as loops
+from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import twin_carrier
 
@@ -42,7 +43,7 @@ def use_postgres(folder: Path) -> None:
 
 
 def use_opcua(folder: Path) -> None:
-    require_library("scada")
+    require_packages(OpcuaServeConfig("scada", "127.0.0.1", 4840))
 
 
 def use_plot(folder: Path) -> None:

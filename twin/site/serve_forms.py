@@ -12,7 +12,7 @@ from pydantic import Discriminator, Field, Tag
 
 from fieldtwin.twin.site.base_forms import Address, SiteModel, TagName
 
-KINDS = ("modbus", "opcua")
+KINDS = ("modbus", "opcua", "http")
 """The kinds of servers. The first one is that of a server without `kind`."""
 
 
@@ -62,13 +62,34 @@ class OpcuaServeForm(SiteModel):
     clients: int = Field(default=16, ge=1, le=1000)
 
 
+class HttpServeForm(SiteModel):
+    """Studio's REST and WebSocket interface to this run, without Studio's pages.
+
+    Paths are relative to the system file. Without a token the server listens on loopback only, and clients only read.
+    """
+
+    kind: Literal["http"]
+    url: str = Field(examples=["http://127.0.0.1:8080"])
+    view_token: str | None = Field(default=None, description="file with the token of clients that only read")
+    operate_token: str | None = Field(
+        default=None, description="file with the token of clients that may also write, within the rules of the run"
+    )
+    names: list[str] = Field(default=[], max_length=32, description="other names of this computer that clients use")
+    certificate: str | None = Field(default=None, description="https: PEM file with the server's certificate")
+    key: str | None = Field(default=None, description="https: PEM file with the certificate's key, without a password")
+    insecure: bool = Field(default=False, description="allow http beyond loopback: the network can read the token")
+    clients: int = Field(default=32, ge=1, le=1000)
+
+
 def kind_of(section: Any) -> Any:
     """Return the kind that a server of the file states; that of a server without `kind` is `modbus`."""
     return section.get("kind", KINDS[0]) if isinstance(section, dict) else getattr(section, "kind", KINDS[0])
 
 
 ServeForm = Annotated[
-    Annotated[ModbusServeForm, Tag("modbus")] | Annotated[OpcuaServeForm, Tag("opcua")],
+    Annotated[ModbusServeForm, Tag("modbus")]
+    | Annotated[OpcuaServeForm, Tag("opcua")]
+    | Annotated[HttpServeForm, Tag("http")],
     Discriminator(kind_of),
 ]
 """One server of the `serve` section."""

@@ -24,12 +24,16 @@ from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, 
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import AllowForm, BridgeForm
-from fieldtwin.twin.site.serve_forms import ModbusServeForm, OpcuaServeForm, ServedTagForm, ServeForm
+from fieldtwin.twin.site.serve_forms import HttpServeForm, ModbusServeForm, OpcuaServeForm, ServedTagForm, ServeForm
+from fieldtwin.twin.site.serving_http import HttpServeConfig, resolve_http
 from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig, resolve_opcua
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000
 WORDS = {"read": READ_FUNCTIONS, "write": WRITE_FUNCTIONS}
+
+SeparateServer = OpcuaServeConfig | HttpServeConfig
+"""A server that runs in a separate process."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +45,13 @@ class Serving:
     bridges: tuple[BridgeConfig, ...] = ()
     opcua: tuple[OpcuaServeConfig, ...] = ()
     """The servers of kind `opcua`, each of which runs in a separate process."""
+    http: tuple[HttpServeConfig, ...] = ()
+    """The servers of kind `http`, each of which runs in a separate process."""
 
     @property
-    def separate(self) -> tuple[OpcuaServeConfig, ...]:
+    def separate(self) -> tuple[SeparateServer, ...]:
         """Return the servers that run in separate processes."""
-        return self.opcua
+        return *self.opcua, *self.http
 
     def for_run(self, *, allow_writes: bool, free_ports: bool, read_only: Collection[str] = ()) -> Serving:
         """Return the sections as a gateway runs them. A bridge to a bus in `read_only` passes no writes.
@@ -58,11 +64,12 @@ class Serving:
             for b in self.bridges
         ]
         if not free_ports:
-            return Serving(self.serve, tuple(bridges), self.opcua)
+            return Serving(self.serve, tuple(bridges), self.opcua, self.http)
         return Serving(
             tuple(replace(s, listen=_free(s.listen)) for s in self.serve),
             tuple(replace(b, listen=_free(b.listen)) for b in bridges),
             tuple(o.on_free_port() for o in self.opcua),
+            tuple(h.on_free_port() for h in self.http),
         )
 
 
@@ -83,10 +90,13 @@ def resolve_serving(
     outputs = set(plc_outputs)
     servers: list[ServeConfig] = []
     opcua: list[OpcuaServeConfig] = []
+    http: list[HttpServeConfig] = []
     for name, form in serve.items():
         with errors.collect():
             if isinstance(form, OpcuaServeForm):
                 opcua.append(resolve_opcua(file, name, form))
+            elif isinstance(form, HttpServeForm):
+                http.append(resolve_http(file, name, form))
             else:
                 servers.append(_server(file, name, form, devices, outputs, errors))
     bridges: list[BridgeConfig] = []
@@ -105,12 +115,13 @@ def resolve_serving(
         taken[str(listen)] = f"{section} {name!r}"
     fronts = [*(s.listen for s in servers), *(b.listen for b in bridges)]
     places = {(listen.host, listen.port): taken[str(listen)] for listen in fronts if str(listen) in taken}
-    for server in opcua:
+    separate: list[SeparateServer] = [*opcua, *http]
+    for server in separate:
         place = (server.host, server.port)
         if server.port and place in places:
             errors.add(file.error(("serve", server.name, "url"), f"{server.url} is taken by {places[place]}"))
         places[place] = f"serve {server.name!r}"
-    return Serving(tuple(servers), tuple(bridges), tuple(opcua))
+    return Serving(tuple(servers), tuple(bridges), tuple(opcua), tuple(http))
 
 
 # -- serve ---------------------------------------------------------------------------------------------------------------

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from ipaddress import ip_address
 from urllib.parse import SplitResult, urlsplit
 
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
+from fieldtwin.twin.site.loopback import is_loopback
 from fieldtwin.twin.site.serve_forms import OpcuaServeForm
 
 SCHEME = "opc.tcp"
@@ -49,7 +49,7 @@ def resolve_opcua(file: YamlFile, name: str, form: OpcuaServeForm) -> OpcuaServe
         raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url) from None
     if parts.scheme != SCHEME or not parts.hostname or port is None or _has_more(parts):
         raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url)
-    if not _is_loopback(parts.hostname):
+    if not is_loopback(parts.hostname):
         raise file.error(
             loc,
             "an OPC UA server listens on loopback only, because it does not authenticate its clients",
@@ -62,10 +62,3 @@ def resolve_opcua(file: YamlFile, name: str, form: OpcuaServeForm) -> OpcuaServe
 
 def _has_more(parts: SplitResult) -> bool:
     return parts.path not in ("", "/") or bool(parts.query or parts.fragment or parts.username or parts.password)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

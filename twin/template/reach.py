@@ -36,6 +36,8 @@ def _reach(system: System, prototype: Prototype) -> Iterator[str]:
     for section, servers in (("serve", system.serving.serve), ("bridge", system.serving.bridges)):
         for server in servers:
             yield from _listening(server.listen, f"{section} {server.name}")
+    for separate in system.serving.separate:
+        yield from _reachable(separate.host, f"serve {separate.name}")
 
 
 def _listening(at: Endpoint, what: str) -> Iterator[str]:
@@ -53,6 +55,10 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
         return  # opened at its mapped endpoint, or refused
     else:
         host = at.host
+    yield from _reachable(host, what)
+
+
+def _reachable(host: str, what: str) -> Iterator[str]:
     if not _is_loopback(host):
         yield f"it listens on {host}, where other computers can reach it ({what})"
 

@@ -10,18 +10,17 @@ import asyncio
 import sys
 from pathlib import Path
 
-import msgspec
-
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
-from fieldtwin.gateway.core.errors import Bug, EndpointBusy, FieldtwinError, Unreachable
+from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
 from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.northbound.opcua.config import OpcuaProcessConfig
 from fieldtwin.northbound.opcua.samples import ImageSamples, TextSamples
 from fieldtwin.northbound.opcua.server import OpcuaServer
+from fieldtwin.northbound.process_config import ServerProcessConfig, server_of
+from fieldtwin.northbound.status_report import report_status
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
@@ -30,7 +29,6 @@ from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
 
 TEXTS_EVERY_NS = NS_PER_S // 2
-REPORT_EVERY_NS = NS_PER_S
 LISTEN_EVERY_S = 1.0
 """Pause in seconds before the server tries again to listen at an address that is taken."""
 STOPS_WITHIN_S = 1.0
@@ -39,23 +37,26 @@ STOPS_WITHIN_S = 1.0
 class OpcuaProcess:
     """One OPC UA server with its connections to the run, which runs until it is stopped."""
 
-    def __init__(self, config: OpcuaProcessConfig) -> None:
-        run_dir = Path(config.run_dir)
+    def __init__(self, config: ServerProcessConfig) -> None:
+        self._run_dir = run_dir = Path(config.run_dir)
         [system] = read_resolved(config.resolved)
         assert isinstance(system, System)
         self._system = system
-        self._config = _server_of(system, config)
+        server = server_of(system, config)
+        assert isinstance(server, OpcuaServeConfig)
+        self._config = server
         self._image = run_dir / "image"
         self._clock = WallClock()
         self._server = OpcuaServer(self._config, system, self._clock)
         self._gateway = Channel(run_dir / "gateway.sock", "gateway")
-        self._reports = Channel(run_dir / "gateway.sock", "gateway")
 
     async def run(self) -> int:
         stop = stop_signal()
         with attached(image_layout(self._system), self._image) as image:
             async with Nursery() as nursery:
-                nursery.start(self._report(), "status reports")
+                nursery.start(
+                    report_status(self._run_dir, self._config.name, self._server.status, self._clock), "status reports"
+                )
                 serving = nursery.start(self._serve(image.reader(INPUTS), image.reader(OUTPUTS)), "server")
                 stopping = asyncio.ensure_future(stop.wait())
                 await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
@@ -68,7 +69,6 @@ class OpcuaProcess:
             except TimeoutError:
                 pass  # a client that does not read must not delay the end of the run
         await self._gateway.aclose()
-        await self._reports.aclose()
         return 0
 
     async def _serve(self, inputs: RegionReader, outputs: RegionReader) -> None:
@@ -116,27 +116,10 @@ class OpcuaProcess:
                 await server.publish(names, texts.changes(answer["tags"], answer["now_ns"]))
             await self._clock.sleep_until_ns(now_ns + TEXTS_EVERY_NS)
 
-    async def _report(self) -> None:
-        """Report the status to the gateway once a second. Without a gateway no client of its status exists either."""
-        while True:
-            try:
-                status = msgspec.to_builtins(self._server.status())
-                await self._reports.call("report", server=self._config.name, status=status)
-            except FieldtwinError:
-                pass
-            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + REPORT_EVERY_NS)
-
-
-def _server_of(system: System, config: OpcuaProcessConfig) -> OpcuaServeConfig:
-    for server in system.serving.for_run(allow_writes=False, free_ports=config.free_port).opcua:
-        if server.name == config.server:
-            return server
-    raise Bug(f"the system has no OPC UA server {config.server!r}")
-
 
 def main(argv: list[str]) -> int:
     """Run the process; an error is printed to stderr as one line."""
-    return child_main(argv, OpcuaProcessConfig, lambda config: OpcuaProcess(config).run())
+    return child_main(argv, ServerProcessConfig, lambda config: OpcuaProcess(config).run())
 
 
 if __name__ == "__main__":

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.northbound.opcua.config import OpcuaProcessConfig
+from fieldtwin.northbound.process_config import ServerProcessConfig
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.processes.run_record import RunRecord
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapping_to_json
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.serving import SeparateServer
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.place import delegated_transmitter
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
@@ -109,9 +109,9 @@ def gateway_config(
     )
 
 
-def server_config(o: RunOptions, run_dir: Path, server: OpcuaServeConfig, resolved: str) -> OpcuaProcessConfig:
+def server_config(o: RunOptions, run_dir: Path, server: SeparateServer, resolved: str) -> ServerProcessConfig:
     """Return the configuration of the process of a server of tags."""
-    return OpcuaProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=o.prototype)
+    return ServerProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=o.prototype)
 
 
 def thread_config(

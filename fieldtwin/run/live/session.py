@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, StoppedGateway
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.northbound.opcua.config import require_library
+from fieldtwin.northbound.process_config import MODULES, check_server
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
 from fieldtwin.run.live.child_configs import (
@@ -56,7 +56,7 @@ from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.serving import SeparateServer
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.thread.place import MODEM
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
@@ -92,8 +92,8 @@ class RunSession(AsyncResource):
         self.options = options
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
-        for server in self.system.serving.opcua:
-            require_library(server.name)
+        for server in self.system.serving.separate:
+            check_server(server)
         self.twin = PhysicalTwin(self.system)
         self.delegated = transmitter_of_thread(options, self.system)
         self._prototype: Prototype | None = None
@@ -243,10 +243,10 @@ class RunSession(AsyncResource):
             self._stack.push_async_callback(process.end)
             self._nursery.start(process.run(), f"process of server {server.name}")
 
-    def _server_child(self, server: OpcuaServeConfig) -> Child:
+    def _server_child(self, server: SeparateServer) -> Child:
         name, run_dir = f"{server.kind}-{server.name}", self.instance.dir
         config = self._write(f"{name}.json", server_config(self.options, run_dir, server, self._resolved))
-        return Child(name, "fieldtwin.northbound.opcua.process", config, run_dir)
+        return Child(name, MODULES[server.kind], config, run_dir)
 
     async def _start_thread(self, run_dir: Path) -> None:
         """Start the plant's side of the digital thread, which observes the process image."""

@@ -64,7 +64,7 @@ def tag_of(request: HTTPConnection, attachment: Attachment) -> tuple[str, str]:
     return device, name
 
 
-def by_studio(request: HTTPConnection) -> str:
-    """Return the name under which audit logs record the client of a request: ``studio`` and its address."""
-    client = request.client
-    return f"studio {client.host}" if client is not None else "studio"
+def by_client(request: HTTPConnection) -> str:
+    """Return the name under which audit logs record the client of a request: that of the server, and the client's address."""
+    server, client = of_server(request, "audited_as", str), request.client
+    return f"{server} {client.host}" if client is not None else server

@@ -10,7 +10,7 @@ from starlette.requests import Request
 from fieldtwin.studio.api.common import INSTANCE, attached, folder_of, gallery_of, of_server
 from fieldtwin.studio.api.errors import NotFound
 from fieldtwin.studio.api.operation import Operation, body_of
-from fieldtwin.studio.live.instances import FoundInstance, find_instances
+from fieldtwin.studio.live.instances import FoundInstance
 from fieldtwin.studio.live.launching import Launcher, known_systems
 
 
@@ -22,9 +22,12 @@ class StartPrototype(msgspec.Struct, forbid_unknown_fields=True):
 
 
 async def list_instances(request: Request) -> list[dict[str, Any]]:
-    """Return all instances on this computer, running ones first."""
-    launcher = _launcher(request)
-    return [_described(found) | {"started_here": launcher.owns(found.name)} for found in await find_instances()]
+    """Return all instances that this server shows, running ones first."""
+    launcher = getattr(request.app.state, "launcher", None)  # the server of a run starts no instances
+    return [
+        _described(found) | {"started_here": launcher is not None and launcher.owns(found.name)}
+        for found in await gallery_of(request).found()
+    ]
 
 
 async def list_systems(request: Request) -> list[dict[str, Any]]:
@@ -92,11 +95,13 @@ def _described(found: FoundInstance) -> dict[str, Any]:
     }
 
 
-OPERATIONS = (
+OBSERVING = (
     Operation("GET", "/instances", list_instances, "List the instances on this computer"),
+    Operation("GET", INSTANCE, get_instance, "Describe an instance"),
+    Operation("GET", f"{INSTANCE}/status", get_status, "Read the statuses of an instance"),
+)
+LAUNCHING = (
     Operation("GET", "/systems", list_systems, "List the systems whose prototype can be started"),
     Operation("POST", "/instances", start_prototype, "Start a prototype", body=StartPrototype, changes=True),
     Operation("DELETE", INSTANCE, stop_instance, "Stop an instance that Studio has started", changes=True),
-    Operation("GET", INSTANCE, get_instance, "Describe an instance"),
-    Operation("GET", f"{INSTANCE}/status", get_status, "Read the statuses of an instance"),
 )

@@ -14,8 +14,8 @@ from fieldtwin.studio.api.operation import PREFIX, Operation
 REFERENCE = "#/components/schemas/{name}"
 
 
-def describe(operations: Iterable[Operation]) -> dict[str, Any]:
-    """Return the description as data for JSON."""
+def describe(operations: Iterable[Operation], title: str) -> dict[str, Any]:
+    """Return the description as data for JSON. `title` names the server."""
     operations = list(operations)
     forms = [operation.body for operation in operations if operation.body is not None]
     schemas, components = msgspec.json.schema_components(forms, ref_template=REFERENCE)
@@ -25,7 +25,7 @@ def describe(operations: Iterable[Operation]) -> dict[str, Any]:
         paths.setdefault(PREFIX + _plain(operation.path), {})[operation.method.lower()] = _described(operation, of_form)
     return {
         "openapi": "3.1.0",
-        "info": {"title": "fieldtwin Studio", "version": __version__, "description": DESCRIPTION},
+        "info": {"title": title, "version": __version__, "description": DESCRIPTION},
         "paths": paths,
         "components": {
             "schemas": components,

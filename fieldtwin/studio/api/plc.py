@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from starlette.requests import Request
 
-from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, recordings_of
+from fieldtwin.studio.api.common import INSTANCE, attached, by_client, recordings_of
 from fieldtwin.studio.api.operation import Operation, body_of
 from fieldtwin.studio.live.state_history import StateChange
 
@@ -51,7 +51,7 @@ async def force_tag(request: Request) -> Any:
     """Force a tag."""
     attachment = await attached(request)
     form = await body_of(request, Force)
-    result = await attachment.plc_channel.call("force", tag=form.tag, value=form.value, by=by_studio(request))
+    result = await attachment.plc_channel.call("force", tag=form.tag, value=form.value, by=by_client(request))
     recordings_of(request).note(attachment, attachment.now_ns(), None, f"force {form.tag} to {form.value}")
     return result
 
@@ -60,7 +60,7 @@ async def unforce_tag(request: Request) -> Any:
     """Remove the force on a tag."""
     attachment = await attached(request)
     tag = request.path_params["tag"]
-    result = await attachment.plc_channel.call("unforce", tag=tag, by=by_studio(request))
+    result = await attachment.plc_channel.call("unforce", tag=tag, by=by_client(request))
     recordings_of(request).note(attachment, attachment.now_ns(), None, f"remove the force on {tag}")
     return result
 
@@ -68,26 +68,26 @@ async def unforce_tag(request: Request) -> Any:
 async def unforce_all(request: Request) -> Any:
     """Remove all forces."""
     attachment = await attached(request)
-    result = await attachment.plc_channel.call("unforce", all=True, by=by_studio(request))
+    result = await attachment.plc_channel.call("unforce", all=True, by=by_client(request))
     recordings_of(request).note(attachment, attachment.now_ns(), None, "remove all forces")
     return result
 
 
 async def pause_plc(request: Request) -> Any:
     """Stop executing programs; outputs keep their values."""
-    return await (await attached(request)).plc_channel.call("pause", by=by_studio(request))
+    return await (await attached(request)).plc_channel.call("pause", by=by_client(request))
 
 
 async def continue_plc(request: Request) -> Any:
     """Continue after a pause."""
-    return await (await attached(request)).plc_channel.call("go", by=by_studio(request))
+    return await (await attached(request)).plc_channel.call("go", by=by_client(request))
 
 
 async def step_plc(request: Request) -> Any:
     """Execute some scans while paused."""
     attachment = await attached(request)
     form = await body_of(request, Steps)
-    return await attachment.plc_channel.call("step", count=form.count, by=by_studio(request))
+    return await attachment.plc_channel.call("step", count=form.count, by=by_client(request))
 
 
 PLC = f"{INSTANCE}/plc"

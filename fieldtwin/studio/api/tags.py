@@ -8,7 +8,7 @@ import msgspec
 from starlette.requests import Request
 
 from fieldtwin.gateway.core.errors import CheckFailed, Unreachable, UsageError
-from fieldtwin.studio.api.common import INSTANCE, attached, by_studio, prototype, recordings_of, tag_of
+from fieldtwin.studio.api.common import INSTANCE, attached, by_client, prototype, recordings_of, tag_of
 from fieldtwin.studio.api.operation import Operation, Parameter, body_of, whole
 from fieldtwin.studio.live.marks import Mark, all_marks
 from fieldtwin.studio.live.tag_history import MOST_POINTS, recent
@@ -33,10 +33,9 @@ class WriteValue(msgspec.Struct, forbid_unknown_fields=True):
 async def list_tags(request: Request) -> dict[str, Any]:
     """Return every tag with value, quality, reason and age in seconds."""
     attachment = await attached(request)
-    status = attachment.status()
-    if status["gateway"] is None:
+    if attachment.gateway is None:
         raise Unreachable(attachment.troubles.get("gateway", "the gateway has not answered yet"))
-    tags: dict[str, Any] = status["gateway"]["tags"]
+    tags: dict[str, Any] = msgspec.to_builtins(attachment.present_tags())
     return tags
 
 
@@ -100,12 +99,12 @@ async def write_value(request: Request) -> Any:
     device, name = tag_of(request, attachment)
     form = await body_of(request, WriteValue)
     tag = f"{device}.{name}"
-    seen = attachment.gateway.tags[tag].value if attachment.gateway is not None else None
+    seen = attachment.present_tags()[tag].value if attachment.gateway is not None else None
     if seen != form.old:
         raise CheckFailed(
             f"{tag} has changed since it was shown", expected=repr(form.old), got=repr(seen), hint="look again"
         )
-    await attachment.gateway_channel.call("write", WRITE_WITHIN_S, tag=tag, value=form.value, by=by_studio(request))
+    await attachment.gateway_channel.call("write", WRITE_WITHIN_S, tag=tag, value=form.value, by=by_client(request))
     return {"tag": tag, "value": form.value}
 
 

@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, TagStatus
 from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, read_record
@@ -162,6 +162,10 @@ class Attachment:
             "frames": None if frames is None else _counts(frames),
         }
 
+    def present_tags(self) -> dict[str, TagStatus]:
+        """Return all tags as of now, while `gateway` may be half a second old. Raises `FileInvalid` or `Unreachable`."""
+        return self._present.statuses(self._image.inputs(), self.now_ns())
+
     def point(self, name: str, t_ns: int, value: Any, quality: str, reason: str) -> Point:
         """Return a change of a tag; the value of a secret tag is masked."""
         return Point(t_ns, SECRET if name in self.secrets else value, quality, reason)
@@ -197,7 +201,7 @@ class Attachment:
         if gateway.config is not UNSET and gateway.config.reloads != self._reloads:
             self._reloads = gateway.config.reloads
             self._present.describe_values(self._read_system())
-        self.gateway = structs.replace(gateway, tags=self._present.statuses(self._image.inputs(), self.now_ns()))
+        self.gateway = structs.replace(gateway, tags=self.present_tags())
         self.updates.publish({"type": "status", "status": self.status()})
 
     async def read_plc(self, buckets: bool = True) -> WholePlcStatus:

@@ -1,4 +1,4 @@
-"""The instances that Studio observes: each is attached when a page first asks for it, and kept until Studio ends."""
+"""The instances that a server observes: each is attached when a client first asks for it, and kept until the server ends."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.studio.live.attachment import Attachment
-from fieldtwin.studio.live.instances import find_instance, find_instances
+from fieldtwin.studio.live.instances import FoundInstance, find_instance, find_instances
 
 MOST_ATTACHED = 8
 
@@ -18,10 +18,11 @@ class NoInstance(UsageError):
 
 
 class Gallery:
-    """The attached instances by name. Use it as ``async with Gallery(clock) as gallery``."""
+    """The attached instances by name. Use it as ``async with Gallery(clock) as gallery``. With `only` it knows one instance."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, only: str = "") -> None:
         self._clock = clock
+        self._only = only
         self._attached: dict[str, tuple[Attachment, AsyncExitStack]] = {}
         self._lock = asyncio.Lock()
 
@@ -32,6 +33,10 @@ class Gallery:
         for name in list(self._attached):
             await self._detach(name)
 
+    async def found(self) -> list[FoundInstance]:
+        """Return the instances on this computer that the gallery may show, running ones first."""
+        return [found for found in await find_instances() if self._only in ("", found.name)]
+
     async def attached(self, name: str) -> Attachment:
         """Return the attachment of an instance.
 
@@ -39,9 +44,9 @@ class Gallery:
         run of another version.
         """
         async with self._lock:
-            found = await find_instance(name)
+            found = await find_instance(name) if self._only in ("", name) else None
             if found is None:
-                others = ", ".join(other.name for other in await find_instances())
+                others = ", ".join(other.name for other in await self.found())
                 raise NoInstance(
                     f"no instance {name!r} on this computer", expected=others or "an instance, but none exists"
                 )

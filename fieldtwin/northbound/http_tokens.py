@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.northbound.token_file import read_token
-from fieldtwin.twin.site.serving_http import HttpServeConfig
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 
 
 def tokens_of(server: HttpServeConfig) -> tuple[str, str]:

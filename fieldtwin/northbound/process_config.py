@@ -9,8 +9,8 @@ import msgspec
 from fieldtwin.gateway.core.errors import Bug, UsageError
 from fieldtwin.installation import install_hint
 from fieldtwin.northbound.http_tokens import tokens_of
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 from fieldtwin.twin.site.serving import SeparateServer
-from fieldtwin.twin.site.serving_http import HttpServeConfig
 from fieldtwin.twin.site.system import System
 
 PACKAGES = {"opcua": ("opcua", ("asyncua",)), "http": ("studio", ("starlette", "uvicorn", "websockets"))}

@@ -15,8 +15,8 @@ from starlette.staticfiles import StaticFiles
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.studio.access import Access
 from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces, twin
-from fieldtwin.studio.api.application import api_application
 from fieldtwin.studio.api.operation import PREFIX, Operation
+from fieldtwin.studio.api_application import api_application
 from fieldtwin.studio.commissioning.jobs import Jobs
 from fieldtwin.studio.commissioning.work_folder import WorkFolder
 from fieldtwin.studio.live.gallery import Gallery

@@ -15,7 +15,7 @@ from fieldtwin.studio.access import LOOPBACK, Access, allowed_hosts, new_token
 from fieldtwin.studio.app import STATIC, application
 from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.web_server import WebServer, listening_socket
-from fieldtwin.twin.site.loopback import is_loopback
+from fieldtwin.twin.site.servers.loopback import is_loopback
 
 MOST_CONNECTIONS = 200
 

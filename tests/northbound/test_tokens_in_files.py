@@ -9,7 +9,7 @@ import pytest
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.northbound.http_tokens import tokens_of
 from fieldtwin.northbound.token_file import LONGEST_TOKEN, read_token
-from fieldtwin.twin.site.serving_http import HttpServeConfig
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 
 TOKEN = "0123456789abcdef"
 

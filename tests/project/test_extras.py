@@ -24,7 +24,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
 from fieldtwin.northbound.process_config import require_packages
 from fieldtwin.run.processes import event_loop as loops
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import twin_carrier
 

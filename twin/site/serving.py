@@ -25,8 +25,8 @@ from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConf
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import AllowForm, BridgeForm
 from fieldtwin.twin.site.serve_forms import HttpServeForm, ModbusServeForm, OpcuaServeForm, ServedTagForm, ServeForm
-from fieldtwin.twin.site.serving_http import HttpServeConfig, resolve_http
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig, resolve_opcua
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig, resolve_http
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, resolve_opcua
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000

@@ -25,7 +25,7 @@ from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
 from fieldtwin.twin.site.resolved import read_resolved
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
 
 TEXTS_EVERY_NS = NS_PER_S // 2

@@ -27,7 +27,7 @@ from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.samples import Sample
 from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
-from fieldtwin.twin.site.serving_opcua import OpcuaServeConfig, url_of
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, url_of
 from fieldtwin.twin.site.system import System
 
 MAX_SUBSCRIPTIONS = 1000

@@ -11,11 +11,11 @@ from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.northbound.http_tokens import tokens_of
 from fieldtwin.studio.access import LOOPBACK, VIEW, Access, allowed_hosts
 from fieldtwin.studio.api import faults, frames, instances, plc, tags
-from fieldtwin.studio.api.application import api_application
+from fieldtwin.studio.api_application import api_application
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.scenarios.recordings import Recordings
-from fieldtwin.twin.site.loopback import is_loopback
-from fieldtwin.twin.site.serving_http import HttpServeConfig
+from fieldtwin.twin.site.servers.loopback import is_loopback
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 
 OPERATIONS = (
     *instances.OBSERVING,

@@ -21,7 +21,7 @@ from fieldtwin.studio.run_api.app import access_to, run_application
 from fieldtwin.studio.web_server import WebServer, listening_socket
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.site.resolved import read_resolved
-from fieldtwin.twin.site.serving_http import HttpServeConfig
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 from fieldtwin.twin.site.system import System
 
 LISTEN_EVERY_S = 1.0

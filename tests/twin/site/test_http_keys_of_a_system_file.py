@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.site.serving_http import HttpServeConfig
+from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 from fieldtwin.twin.site.system import System, load_system
 
 SYSTEM = """\

@@ -8,8 +8,8 @@ from pathlib import Path
 from urllib.parse import SplitResult, urlsplit
 
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.twin.site.loopback import is_loopback
 from fieldtwin.twin.site.serve_forms import HttpServeForm
+from fieldtwin.twin.site.servers.loopback import is_loopback
 
 URL = "http://HOST:PORT or https://HOST:PORT, such as http://127.0.0.1:8080"
 

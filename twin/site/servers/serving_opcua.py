@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from urllib.parse import SplitResult, urlsplit
 
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.twin.site.loopback import is_loopback
 from fieldtwin.twin.site.serve_forms import OpcuaServeForm
+from fieldtwin.twin.site.servers.loopback import is_loopback
 
 SCHEME = "opc.tcp"
 URL = f"{SCHEME}://HOST:PORT, such as {SCHEME}://127.0.0.1:4840"

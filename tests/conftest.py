@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 import threading
 from collections import Counter
@@ -13,6 +14,9 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+
+# jsonschema imports it for the format "iri", which no test checks, and it then builds 38 parsers: five seconds in each process.
+sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 
 TESTS = Path(__file__).parent
 RIGS = sorted(folder for folder in (TESTS / "rigs").iterdir() if folder.is_dir() and folder.name != "__pycache__")
@@ -52,6 +56,22 @@ def pytest_collection_finish() -> None:
     """Do the same for the objects created while tests were imported and collected."""
     gc.collect()
     gc.freeze()
+
+
+ONE_MARK = re.compile(r"(socketcan|long)( and not \w+)*")
+"""A selection whose tests all have one mark."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Skip files without the mark that all selected tests have.
+
+    The import of all files takes half a minute of processor time in each process, and minutes in the virtual machine of
+    scripts/test-vcan. Tests have these marks in their own file (tests/project/test_folders.py).
+    """
+    selected = ONE_MARK.fullmatch(str(config.getoption("markexpr")))
+    if selected is None or collection_path.suffix != ".py":
+        return None
+    return True if f"mark.{selected[1]}" not in collection_path.read_text("utf-8") else None
 
 
 LINES = {"system": "systems", "studio": "studio", "spec": "programs", "docs": "programs", "interop": "programs"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -32,3 +33,13 @@ def test_each_folder_of_modules_is_a_package_that_states_its_concept() -> None:
         if not (folder / "__init__.py").is_file() or '"""' not in (folder / "__init__.py").read_text(encoding="utf-8")
     ]
     assert not silent
+
+
+def test_marks_that_select_files_are_in_the_files_of_the_tests() -> None:
+    elsewhere = [
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "tests").rglob("*.py")
+        if not path.name.startswith("test_")
+        and re.search(r"mark\.(long|socketcan)\b", path.read_text(encoding="utf-8"))
+    ]
+    assert not elsewhere, "pytest_ignore_collect of tests/conftest.py would omit tests that get the mark from here"

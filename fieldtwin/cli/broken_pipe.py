@@ -11,7 +11,9 @@ import io
 import os
 import sys
 
-VERDICTS = frozenset({"run", "simulate", "test", "check", "compare", "doctor", "template", "what-if", "with"})
+VERDICTS = frozenset(
+    {"run", "simulate", "test", "campaign", "check", "compare", "doctor", "template", "what-if", "with"}
+)
 """Commands that end by themselves and whose exit code is a verdict."""
 
 

@@ -21,7 +21,9 @@ def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[s
 
 @dataclass(frozen=True)
 class SeedOptions:
-    """The options for the seeds of several runs, as text such as ``1..200`` or empty, and for the number of runs at a time."""
+    """The options for the seeds of several runs, as text such as ``1..200`` or empty, for the part of them that this computer
+    runs, such as ``3/16`` or empty, and for the number of runs at a time.
+    """
 
     seeds: str = option(
         "--seeds",
@@ -29,7 +31,19 @@ class SeedOptions:
         metavar="1..200",
         help="In virtual time: one run for each of these seeds, such as 1..200.",
     )
+    shard: str = option(
+        "--shard",
+        default="",
+        metavar="3/16",
+        help="With --seeds: run only this part of the seeds, for several computers or CI jobs.",
+    )
     jobs: int = option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time.")
+
+    def chosen(self) -> range:
+        """Return the seeds that this computer runs. Raises `UsageError`."""
+        from fieldtwin.run.campaigns.seeds import parse_seeds
+
+        return parse_seeds(self.seeds, self.shard)
 
 
 @dataclass(frozen=True)
@@ -100,7 +114,7 @@ class CampaignOptions(FaultChoice, _ScenarioRuns):
     def check(self) -> None:
         """Raise `UsageError` for options that have no effect without --seeds, or without random faults."""
         self.of(self.faults)
-        if not self.seeds and (self.faults or self.jobs != 1 or self.duration_s):
-            raise UsageError("--faults, --for and --jobs of scenarios need --seeds", expected="--seeds 1..200")
+        if not self.seeds and (self.faults or self.jobs != 1 or self.shard or self.duration_s):
+            raise UsageError("--faults, --for, --shard and --jobs of scenarios need --seeds", expected="--seeds 1..200")
         if self.duration_s and not self.faults:
             raise UsageError("--for needs --faults random: without it the steps determine the length of a run")

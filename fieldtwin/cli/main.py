@@ -96,6 +96,7 @@ COMMANDS = {
         "Simulate the effect of a plan from the present state.",
     ),
     "test": ("fieldtwin.cli.test.test_command", "Run test scenarios against a prototype."),
+    "campaign": ("fieldtwin.cli.test.campaign_command", "Join the results of campaigns that ran on several computers."),
     "test-host": ("fieldtwin.cli.test.worker_command", "Emulated devices for tests, over stdin and stdout."),
     "with": (
         "fieldtwin.cli.run.with_command",
@@ -131,7 +132,7 @@ SECTIONS = {
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer", "profile"),
         *("record", "import", "export", "compare", "check", "report"),
     ),
-    "Test": ("test", "faults", "trace"),
+    "Test": ("test", "campaign", "faults", "trace"),
     "Twins": ("template", "shadow", "twin", "what-if"),
     "Help and setup": ("explain", "doctor", "schema", "completion", "test-host"),
 }

@@ -14,7 +14,7 @@ from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, systems_of
-from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
+from fieldtwin.cli.run.virtual_view import run_many, run_one
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.template import system_file
@@ -22,7 +22,7 @@ from fieldtwin.run.template import system_file
 if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
-OF_A_GROUP = "--for, --seed, --seeds, --jobs, --ledger, --commands, --faults, --trace, --json"
+OF_A_GROUP = "--for, --seed, --seeds, --shard, --jobs, --ledger, --commands, --faults, --trace, --json"
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,10 @@ def command(
             raise UsageError(
                 "--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run"
             )
-        return run_many(options, parse_seeds(runs.seeds), runs.jobs, as_json, runs.ledger)
-    if runs.ledger is not None:
-        raise UsageError("--ledger needs --seeds", expected="--seeds 1..200")
+        return run_many(options, runs.chosen(), runs.jobs, as_json, runs.ledger)
+    if runs.ledger is not None or runs.shard:
+        option_name = "--shard" if runs.shard else "--ledger"
+        raise UsageError(f"{option_name} needs --seeds", expected="--seeds 1..200")
     return run_one(options, as_json) if compare is None else _run_against(options, compare, as_json)
 
 

@@ -15,7 +15,6 @@ from rich.table import Table
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
-from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
@@ -23,17 +22,8 @@ if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
 
-def parse_seeds(text: str) -> range:
-    """Parse ``7`` or ``1..200``. Raises `UsageError`."""
-    from fieldtwin.run.campaigns.many_seeds import MAX_SEEDS
-
-    first, dots, last = text.partition("..")
-    if not first.isdigit() or (dots and not last.isdigit()):
-        raise UsageError("seeds", expected="a number, or 1..200", got=text)
-    seeds = range(int(first), int(last or first) + 1)
-    if not 0 < len(seeds) <= MAX_SEEDS:
-        raise UsageError("seeds", expected=f"1 to {MAX_SEEDS} of them, the lower first", got=text)
-    return seeds
+OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--ledger")
+"""Options that the command line of a single run does not have."""
 
 
 def run_one(options: VirtualOptions, as_json: bool) -> int:
@@ -73,9 +63,9 @@ def again(seed: int) -> str:
     for word in sys.argv[1:]:
         if skip:
             skip = False
-        elif word in ("--seeds", "--jobs", "--ledger"):
+        elif word in OF_MANY_RUNS:
             skip = True
-        elif not word.startswith(("--seeds=", "--jobs=", "--ledger=")):
+        elif not word.startswith(tuple(f"{option}=" for option in OF_MANY_RUNS)):
             words.append(word)
     return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
 

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, shrunk_texts
+from fieldtwin.cli.run.virtual_view import progress_bar, shrunk_texts
 from fieldtwin.console import stderr, stdout
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
@@ -29,7 +29,7 @@ def run_scenario_campaign(
     Return the result of the whole campaign, of each seed, and of the scenario that the first failing seed was shrunk to. `show`
     None: nothing is printed to stdout.
     """
-    seeds = parse_seeds(options.seeds)
+    seeds = options.chosen()
     campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
     with progress_bar(float(len(seeds)), "seeds") as at:
         count = 0
@@ -40,7 +40,8 @@ def run_scenario_campaign(
             at(float(count))
 
         results = run_campaign(campaign, seeds, options.jobs, ended)
-    whole = verdict_of(campaign, results)
+    shard = ("--shard", options.shard) if options.shard else ()
+    whole = verdict_of(campaign, results, ("--seeds", options.seeds, *shard))
     if show is not None:
         for result in results:
             _show_seed(result, show)

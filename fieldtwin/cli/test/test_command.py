@@ -173,14 +173,13 @@ def command(
     seeds: list[ScenarioResult] = []
     for scenario, file in zip(scenarios, events, strict=True):
         if campaign.seeds:
-            from fieldtwin.cli.run.virtual_view import parse_seeds
             from fieldtwin.cli.test.campaign_view import run_scenario_campaign
 
             found = run_scenario_campaign(scenario.path, folders, campaign, None if as_json else _show)
             found = [replace(result, system=scenario.system) for result in found]
             waived_ones = [waive(result, waived, datetime.now(UTC).date()) for result in found]
             results += waived_ones
-            seeds += waived_ones[1 : 1 + len(parse_seeds(campaign.seeds))]
+            seeds += waived_ones[1 : 1 + len(campaign.chosen())]
             continue
         result = run_scenario(scenario, where, file, retries, shown)
         result = replace(result, system=scenario.system)

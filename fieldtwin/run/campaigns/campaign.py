@@ -116,11 +116,11 @@ def run_campaign(
     return each(jobs, partial(_slim, campaign), seeds, on_result)
 
 
-def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult]) -> ScenarioResult:
+def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult], chosen: Sequence[str]) -> ScenarioResult:
     """Return the result of the campaign: how many seeds checked each rule, and how often faults took effect.
 
     It is FAILED if a seed is. It is INCONCLUSIVE if a seed is, if no seed checked a rule of the scenario, or if no
-    fault took effect.
+    fault took effect. `chosen`: the command-line options that choose these seeds.
     """
     scenario = load_scenario(campaign.path, campaign.profiles)
     checks = [*_seeds_check(results), *_rule_checks(results)]
@@ -134,7 +134,7 @@ def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult]) -> Scenari
     return replace(
         made,
         name=f"{made.name} [{len(results)} seeds]",
-        reproduce=reproduce(scenario, *campaign.words, "--seeds", f"{results[0].seed}..{results[-1].seed}"),
+        reproduce=reproduce(scenario, *campaign.words, *chosen),
         simulated_s=sum(result.simulated_s for result in results),
         took_s=sum(result.took_s for result in results),
     )

@@ -7,6 +7,7 @@ fingerprint mark a seed as done.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
@@ -19,7 +20,7 @@ from fieldtwin.run.campaigns.many_seeds import SeedResult
 
 class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One finished run. `what` is the fingerprint that `many_seeds.what_runs` returns; `wrong` of the `checked` values were
-    never held by their device.
+    never held by their device. `sha256` is the hash of the trace: the same seed has the same hash on every computer.
     """
 
     what: str
@@ -36,21 +37,36 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 MAX_BYTES = 256 * 1024 * 1024
 
 
+def read_entries(path: Path) -> tuple[list[LedgerEntry], int]:
+    """Return the entries of a ledger, and the number of bytes of an incomplete last line, which a kill leaves.
+
+    Raises `FileInvalid`, `Unreachable`.
+    """
+    entries: list[LedgerEntry] = []
+    *lines, rest = read_input(path, MAX_BYTES).split(b"\n")
+    for number, line in enumerate(lines, 1):
+        try:
+            entries.append(msgspec.json.decode(line, type=LedgerEntry))
+        except msgspec.DecodeError as e:
+            raise FileInvalid(f"not a line of a ledger: {e}", path=str(path), line=number) from e
+    return entries, len(rest)
+
+
+def write_entries(path: Path, entries: Iterable[LedgerEntry]) -> None:
+    """Write a new ledger with these entries. Raises `OSError`."""
+    path.write_bytes(b"".join(msgspec.json.encode(entry) + b"\n" for entry in entries))
+
+
 class Ledger:
     """A file of entries, appended to. A last line that a kill truncated is removed. Raises `FileInvalid`, `Unreachable`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: list[LedgerEntry] = []
-        data = read_input(path, MAX_BYTES) if path.exists() else b""
-        *lines, rest = data.split(b"\n")
-        for number, line in enumerate(lines, 1):
-            try:
-                self.entries.append(msgspec.json.decode(line, type=LedgerEntry))
-            except msgspec.DecodeError as e:
-                raise FileInvalid(f"not a line of a ledger: {e}", path=str(path), line=number) from e
-        if rest:
-            os.truncate(path, len(data) - len(rest))
+        if path.exists():
+            self.entries, incomplete = read_entries(path)
+            if incomplete:
+                os.truncate(path, path.stat().st_size - incomplete)
 
     def done(self, what: str) -> set[int]:
         """Return the seeds with which this version has run `what`."""

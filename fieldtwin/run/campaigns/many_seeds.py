@@ -12,7 +12,6 @@ from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.processes.workers import each
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
-MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
 
 

@@ -201,7 +201,7 @@ def test_under_random_faults_steps_only_drive(folder: Path) -> None:
 def test_a_rule_without_a_verdict_of_any_seed_and_faults_without_effect_are_inconclusive(folder: Path) -> None:
     (folder / "well.st").write_text(PROTECTED)
     campaign = Campaign(folder / "dry.scenario.yaml", (), RandomFaults(1e9), 60.0)
-    whole = verdict_of(campaign, run_campaign(campaign, range(1, 3), 1))
+    whole = verdict_of(campaign, run_campaign(campaign, range(1, 3), 1), ("--seeds", "1..2"))
     assert whole.verdict is Verdict.INCONCLUSIVE
     found = {check.number: check.verdict for check in whole.checks}
     assert (found["within 1"], found["faults"], found["seeds"]) == (

@@ -1,0 +1,55 @@
+"""Join ledgers of virtual hours that several computers wrote, for example one for each shard of a campaign.
+
+Joining is commutative and idempotent: the order of the ledgers has no effect, and a run that several of them contain counts once.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fieldtwin.run.campaigns.ledger import LedgerEntry
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """All recorded runs of the same system with the same files, options and version: `what` is their fingerprint."""
+
+    what: str
+    version: str
+    entries: tuple[LedgerEntry, ...]
+
+    @property
+    def seeds(self) -> frozenset[int]:
+        return frozenset(entry.seed for entry in self.entries)
+
+    @property
+    def failed(self) -> list[LedgerEntry]:
+        """Return the runs that failed, by seed."""
+        return [entry for entry in self.entries if not entry.ok]
+
+    @property
+    def hours(self) -> float:
+        """Return the virtual hours; a seed counts once."""
+        return sum({entry.seed: entry.hours for entry in self.entries}.values())
+
+    @property
+    def different(self) -> list[int]:
+        """Return the seeds that have several results: a run was not reproduced, which is a defect."""
+        counts = Counter(entry.seed for entry in self.entries)
+        return sorted(seed for seed, count in counts.items() if count > 1)
+
+
+def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:
+    """Return each different entry of all ledgers once, in an order that depends on the entries only."""
+    unique = {entry for ledger in ledgers for entry in ledger}
+    return sorted(unique, key=lambda entry: (entry.what, entry.version, entry.seed, repr(entry)))
+
+
+def by_fingerprint(entries: Iterable[LedgerEntry]) -> list[Runs]:
+    """Return the runs by fingerprint and version, in this order."""
+    groups: dict[tuple[str, str], list[LedgerEntry]] = {}
+    for entry in entries:
+        groups.setdefault((entry.what, entry.version), []).append(entry)
+    return [Runs(*key, tuple(groups[key])) for key in sorted(groups)]

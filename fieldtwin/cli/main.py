@@ -27,6 +27,7 @@ COMMANDS = {
         "Simulate a system in virtual time, with seeds and random faults.",
     ),
     "studio": ("fieldtwin.cli.run.studio_command", "See and operate running systems in the browser."),
+    "mcp": ("fieldtwin.cli.run.mcp_command", "Serve tools to a language-model agent; plants are read-only."),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
@@ -125,8 +126,8 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("new", "run", "simulate", "studio", "reload", "emulate", "with", "plc"),
-        *("topside", "link", "bridge", "can-bus", "draw"),
+        *("new", "run", "simulate", "studio", "mcp", "reload", "emulate", "with"),
+        *("plc", "topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer", "profile"),

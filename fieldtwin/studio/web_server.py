@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import uvicorn
-from starlette.applications import Starlette
+from starlette.types import ASGIApp
 
 from fieldtwin.gateway.core.errors import EndpointBusy, FileInvalid, Unreachable, os_reason
 
@@ -26,11 +26,12 @@ class WebServer:
 
     def __init__(
         self,
-        app: Starlette,
+        app: ASGIApp,
         listener: socket.socket,
         most_connections: int,
         certificate: Path | None = None,
         key: Path | None = None,
+        websockets: bool = True,
     ) -> None:
         self._listener = listener
         self._certificate = certificate
@@ -41,7 +42,7 @@ class WebServer:
             access_log=False,
             server_header=False,
             lifespan="on",
-            ws="websockets-sansio",
+            ws="websockets-sansio" if websockets else "none",
             ws_max_size=MOST_WEBSOCKET_BYTES,
             limit_concurrency=most_connections,
             timeout_graceful_shutdown=CLOSES_WITHIN_S,

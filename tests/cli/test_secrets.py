@@ -66,8 +66,8 @@ def test_every_secret_option_is_one_of_these() -> None:
             if any(word in (option.name or "") for word in ("token", "password", "secret", "key")):
                 (secret if isinstance(option.type, Secret) else plain).add((name, option.name))
     of_studio = {("studio", "operate_token"), ("studio", "view_token")}
-    assert secret == {(name, "token") for name in WITH_SECRETS} | of_studio
-    assert plain == {("studio", "key"), ("studio", "no_token")}  # a file, and a switch
+    assert secret == {(name, "token") for name in (*WITH_SECRETS, "mcp")} | of_studio
+    assert plain == {("studio", "key"), ("mcp", "key"), ("studio", "no_token")}  # a file, and a switch
 
 
 def _options(command: click.Command) -> list[click.Parameter]:

@@ -14,6 +14,7 @@ import pytest
 
 from fieldtwin.capture.formats.mcap_file import McapFile
 from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
+from fieldtwin.cli.main import cli
 from fieldtwin.commissioning.access.plotting import check_plot
 from fieldtwin.descriptions.canopen.dbc import export_description
 from fieldtwin.emulators.simulation.fmu.description import describe
@@ -46,6 +47,10 @@ def use_opcua(folder: Path) -> None:
     require_packages(OpcuaServeConfig("scada", "127.0.0.1", 4840))
 
 
+def use_mcp(folder: Path) -> None:
+    cli.main(["mcp", str(folder)], standalone_mode=False)
+
+
 def use_plot(folder: Path) -> None:
     check_plot(folder / "x.png")
 
@@ -71,6 +76,7 @@ USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "opcua": ("asyncua", use_opcua, ""),
     "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
+    "mcp": ("mcp", use_mcp, "fieldtwin.agents.mcp_server"),
     "plot": ("matplotlib", use_plot, ""),
     "fmi": ("fmpy", use_fmi, ""),
     "parquet": ("pyarrow", use_parquet, ""),

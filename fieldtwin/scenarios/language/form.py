@@ -89,7 +89,13 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = (), errors: ErrorColl
     With `errors`, the errors of its separate parts, and those of its system file, are added to it; the result must not be
     run then.
     """
-    file = load(path)
+    return read_scenario(load(path), path, profiles, errors)
+
+
+def read_scenario(
+    file: YamlFile, path: Path, profiles: tuple[Path, ...] = (), errors: ErrorCollector | None = None
+) -> Scenario:
+    """Check a parsed scenario, as `load_scenario` does. References to other files are relative to the folder of `path`."""
     _check_one_thing(file)
     form = validate(file, ScenarioForm)
     with collecting(errors) as collector:

@@ -1,0 +1,1 @@
+"""The tools of an agent, by what they are about."""

@@ -1,0 +1,7 @@
+"""All tools of an agent, in the order in which they are listed."""
+
+from __future__ import annotations
+
+from fieldtwin.agents.tools import instances, knowledge, prototypes, records, scenarios
+
+TOOLS = (*knowledge.TOOLS, *records.TOOLS, *instances.TOOLS, *prototypes.TOOLS, *scenarios.TOOLS)

@@ -59,6 +59,9 @@ class Calls:
                 answer = Answer(self._workplace.results.shown(await work()))
         except FieldtwinError as e:
             answer = Answer(f"{type(e).__name__}: {e}"[:MOST_CHARACTERS], failed=True)
+        except asyncio.CancelledError:
+            self._audit.note("call", "", by=self._by, result="cancelled", tool=name[:80])
+            raise
         result = f"failed: {answer.text[:MOST_AUDITED]}" if answer.failed else "done"
         try:
             self._audit.note("call", "", by=self._by, result=result, tool=name[:80])

@@ -184,6 +184,8 @@ def test_an_agent_cannot_leave_the_project_or_operate_what_it_did_not_start(tmp_
                 await one.data("save_scenario", path="../s", text=SCENARIO)
             other = SCENARIO.replace("system: shed.yaml", "system: ../elsewhere/shed.yaml")
             assert "outside of the project" in (await one.data("check_scenario", text=other))["errors"][0]
+            other = SCENARIO.replace("shed.yaml\n", "shed.yaml\nprototype: ../elsewhere/shed.prototype.yaml\n")
+            assert "the prototype is outside" in (await one.data("check_scenario", text=other))["errors"][0]
             with pytest.raises(Failed, match=r"0\.0\.0\.0, where other computers can reach it"):
                 await one.data("start_prototype", system="open.yaml")
             for tool, arguments in (

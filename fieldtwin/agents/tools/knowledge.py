@@ -109,12 +109,17 @@ async def check_scenario(work: Workplace, given: OfText) -> dict[str, Any]:
 
 
 def scenario_of(work: Workplace, text: str, path: str) -> Scenario:
-    """Return a checked scenario. Raises `FileInvalid` for its errors, also if its system is outside of the project."""
+    """Return a checked scenario. Raises `FileInvalid` for its errors, also if its system or prototype file is outside of the
+    project, because their Python code would be executed.
+    """
     place = work.project.inside(path)
     scenario = read_scenario(parse(text, str(place)), place)
-    file = Path(scenario.system.path).resolve()
-    if not any(file.is_relative_to(folder) for folder in (work.project.folder, data_root().resolve())):
-        raise scenario.file.error(("system",), "the system is outside of the project", got=str(file))
+    files = {"system": Path(scenario.system.path)}
+    if scenario.form.prototype is not None:
+        files["prototype"] = place.parent / scenario.form.prototype
+    for key, file in files.items():
+        if not any(file.resolve().is_relative_to(folder) for folder in (work.project.folder, data_root().resolve())):
+            raise scenario.file.error((key,), f"the {key} is outside of the project", got=str(file))
     return scenario
 
 

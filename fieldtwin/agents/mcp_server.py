@@ -8,7 +8,6 @@ from typing import Any
 
 import mcp_types as types
 from mcp.server.lowlevel import Server
-from mcp.server.stdio import stdio_server
 from mcp.shared.exceptions import MCPError
 
 from fieldtwin.__about__ import __version__
@@ -84,6 +83,8 @@ def _described(tool: Tool) -> types.Tool:
 
 async def serve_stdio(calls: Calls) -> None:
     """Serve one agent on standard input and output, until it closes the input or a signal arrives."""
+    from mcp.server.stdio import stdio_server  # imported late, because on Unix it needs modules that other systems lack
+
     stop = stop_signal()
     server = agent_server(calls)
     async with stdio_server() as (read, write):

@@ -15,6 +15,7 @@ HEADINGS = {
     "error": "Errors",
     "exit code": "Exit codes",
     "verdict": "Verdicts of test cases",
+    "certainty": "Certainty of results of commissioning",
     "fault": "Faults",
 }
 

@@ -17,6 +17,7 @@ _CASE = re.compile(r"(mb|co)-?0*(\d{1,3})([a-h]?)")
 def everything() -> tuple[Explanation, ...]:
     """Return all explanations, grouped by kind."""
     from fieldtwin.explain.cases import CASES
+    from fieldtwin.explain.commissioning_words import COMMISSIONING_WORDS
     from fieldtwin.explain.errors import ERRORS
     from fieldtwin.explain.faults import EXPLAINED_FAULTS
     from fieldtwin.explain.modbus_exceptions import EXCEPTIONS
@@ -24,7 +25,7 @@ def everything() -> tuple[Explanation, ...]:
     from fieldtwin.explain.sdo_aborts import ABORTS
     from fieldtwin.explain.verdicts import VERDICTS
 
-    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *VERDICTS, *CASES)
+    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *VERDICTS, *COMMISSIONING_WORDS, *CASES)
 
 
 def explain(text: str) -> Sequence[Explanation]:
@@ -45,6 +46,6 @@ def explain(text: str) -> Sequence[Explanation]:
     raise UsageError(
         f"no explanation of {text!r}",
         expected="a test case (MB-015), a fault, `exception 02`, an SDO abort code, a quality or its reason, a verdict, "
-        "an error, `exit 4`",
+        "a certainty, an error, `exit 4`",
         hint=f"similar: {', '.join(near)}" if near else "`fieldtwin explain` without a word lists all",
     )

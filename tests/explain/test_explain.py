@@ -9,6 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
+from fieldtwin.commissioning.identify.matching import Sureness
+from fieldtwin.commissioning.infer.fields import Level
 from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CLIENTS
 from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_CLIENTS
 from fieldtwin.conformance.devices.canopen.cases import CASES as CANOPEN_DEVICES
@@ -37,6 +39,7 @@ PRINTED = {
     "errors": sorted({kind.__name__ for kind in kinds_of_errors()}),
     "exit codes": [f"exit {code}" for code in (0, 1, 2, 3, 4, 5, 70, 130)],
     "faults": list(FAULTS),
+    "certainties": [*map(str, Sureness), *map(str, Level), "fidelity"],
     "verdicts": [*(verdict.name for verdict in Verdict), "robustness", "field problem"],
     "cases": [
         *(case.id for cases in (MODBUS_DEVICES, CANOPEN_DEVICES) for case in cases),

@@ -84,6 +84,15 @@ def export(path: Path, out: Path, *, profile: DeviceProfile | None = None, frami
 
 def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, url: str) -> Callable[[Path], int]:
     first = parts_of(path)[0]
+    if path.suffix.lower() in _PACKETS:
+        raise UsageError(
+            f"{path.name!r} has packets, not a recording", hint=f"make recordings of it: fieldtwin import {path}"
+        )
+    if path.suffix.lower() == _MCAP:
+        raise UsageError(
+            f"{path.name!r} is an MCAP file, which fieldtwin only writes",
+            expected="a recording, a capture or a CAN log",
+        )
     if path.suffix == ".log":
         if kind in _PACKETS:
             return log_packets(path, kind)

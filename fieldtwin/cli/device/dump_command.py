@@ -25,6 +25,9 @@ from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import run as run_precise
 
+MOST_FRAMES = 100
+"""The largest number of frames that `--dry-run` prints as text."""
+
 
 @dataclass(frozen=True)
 class ReadingOptions:
@@ -78,7 +81,11 @@ class ReadingOptions:
         "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="The dump; default dump-ADDRESS.jsonl."
     ),
     click.option("--resume", is_flag=True, help="Continue the existing file."),
-    click.option("--dry-run", is_flag=True, help="Print the frames for a device that refuses nothing; send nothing."),
+    click.option(
+        "--dry-run",
+        is_flag=True,
+        help="Print the first 100 frames for a device that refuses nothing (all with --json); send nothing.",
+    ),
     log_option,
     json_option,
 )
@@ -125,8 +132,7 @@ def command(
         spacing_s=spacing_s,
     )
     if dry_run:
-        for frame in frames(job):
-            click.echo(frame)
+        _print_frames(frames(job), as_json=as_json)
         return 0
     out = out or Path(f"dump-{target.address}.jsonl")
     stderr.print(estimate_text(estimate(job, spacing_s), reading.passes, reading.rate), soft_wrap=True)
@@ -158,6 +164,19 @@ def command(
         stderr.print(unknown_text(found), soft_wrap=True)
         return Unreachable.exit_code
     return 0
+
+
+def _print_frames(all_frames: list[str], *, as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps({"frames": all_frames}))
+        return
+    for frame in all_frames[:MOST_FRAMES]:
+        click.echo(frame)
+    if len(all_frames) > MOST_FRAMES:
+        stderr.print(
+            f"{MOST_FRAMES} of {len(all_frames):,} frames; --dry-run --json prints all, and RANGE (such as holding:0..999) makes the "
+            "dump shorter", soft_wrap=True,
+        )  # fmt: skip
 
 
 def _tell_what_is_left_out(job: DumpJob) -> None:

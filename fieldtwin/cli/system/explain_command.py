@@ -21,8 +21,8 @@ from fieldtwin.console import stdout
 @json_option
 def command(words: tuple[str, ...], as_json: bool) -> int:
     """Explain what WORDS mean, where they are defined, and what to do: a test case (MB-015), a fault (late-reply), a Modbus
-    exception (exception 02), an SDO abort code (06020000), a quality or its reason (stale), a verdict (inconclusive), an error
-    (CrcError), an exit code (exit 4). Without WORDS, list all.
+    exception (exception 02), an SDO abort code (06020000), a quality or its reason (stale), a verdict (inconclusive), a certainty
+    (likely), an error (CrcError), an exit code (exit 4). Without WORDS, list all.
 
     Words of a message can be copied as they are printed.
     """

@@ -105,6 +105,20 @@ def test_unrecordable_items_are_reported(
         called(record, *words)
 
 
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("site.pcapng", "has packets, not a recording .*fieldtwin import .*site.pcapng"),
+        ("site.PCAP", "has packets, not a recording"),
+        ("run.mcap", "is an MCAP file, which fieldtwin only writes; expected a recording"),
+    ],
+)
+def test_an_export_of_a_packet_capture_names_the_import(tmp_path: Path, name: str, error: str) -> None:
+    (tmp_path / name).write_bytes(b"\n\r\r\n")
+    with pytest.raises(UsageError, match=error):
+        called(export, tmp_path / name, tmp_path / "out.csv")
+
+
 def _write(path: Path, *requests: str) -> Path:
     header = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
     lines = [encode_exchange(RecordedExchange(0.0, 1, bytes.fromhex(r), bytes.fromhex(r))) for r in requests]

@@ -290,3 +290,22 @@ def test_a_wrong_size_is_only_a_hint() -> None:
         pass
     assert any(q.count == 5 for q in questions)
     assert not sweep.found.readable
+
+
+def test_a_dry_run_prints_the_first_100_frames_and_says_how_to_get_all() -> None:
+    words = ["dump", "tcp://192.0.2.1", "--dry-run"]
+    done = CliRunner().invoke(cli, words, standalone_mode=False, catch_exceptions=False)
+    shown = done.stdout.splitlines()
+    every = CliRunner().invoke(cli, [*words, "--json"], standalone_mode=False, catch_exceptions=False)
+    frames = json.loads(every.stdout)["frames"]
+    assert len(frames) > 1000
+    assert shown == frames[:100]
+    assert f"100 of {len(frames):,} frames; --dry-run --json prints all" in done.stderr
+    assert every.stderr == ""
+
+
+def test_a_dry_run_of_a_short_range_prints_every_frame() -> None:
+    words = ["dump", "tcp://192.0.2.1", "holding:0..300", "--dry-run"]
+    done = CliRunner().invoke(cli, words, standalone_mode=False, catch_exceptions=False)
+    assert len(done.stdout.splitlines()) == 3
+    assert done.stderr == ""

@@ -7,7 +7,9 @@ from fieldtwin.explain.explanation import Explanation
 _COMMISSIONING = "docs/how-to/commissioning.md"
 _INFERRING = "docs/how-to/infer.md"
 _TO_CERTAIN = "Compare the values with the manual or the display of the device."
-_TO_CHANGE = "Make more passes while the values change: `fieldtwin dump --passes 20 --every 15s`. Compare the draft with the manual."
+_TO_CHANGE = (
+    "Make more passes while the values change: `fieldtwin dump --passes 20 --every 15s`. Compare the draft with the manual."
+)
 
 _IDENTIFY: dict[str, tuple[str, str]] = {
     "certain": (
@@ -30,8 +32,7 @@ _IDENTIFY: dict[str, tuple[str, str]] = {
 }
 _INFER: dict[str, tuple[str, str]] = {
     "certain": (
-        "The probability of this type is at least 99.97 %, from at least six different samples, and no other type would look the "
-        "same.",
+        "The probability of this type is at least 99.97 %, from at least six different samples, and no other type looks alike.",
         "Name the tag and give it a unit.",
     ),
     "likely": (
@@ -56,10 +57,10 @@ COMMISSIONING_WORDS: tuple[Explanation, ...] = (
     ),
     Explanation(
         "compare fidelity", "certainty", "agreement with a recording",
-        "Fidelity of values: the share of exchanges that are alike. Fidelity of timing: the mean ratio of the smaller to the larger "
-        "latency, over the 5 % to 95 % quantiles, with a millisecond added to both.",
-        "`--least` sets the required fidelity of values, `--tolerance` the permitted difference of values, and `--latency` that of "
-        "latencies.",
+        "Fidelity of values: the share of exchanges that are alike. Fidelity of timing: the mean ratio of the smaller to the "
+        "larger latency, over the 5 % to 95 % quantiles, with a millisecond added to both.",
+        "`--least` sets the required fidelity of values, `--tolerance` the permitted difference of values, and `--latency` that "
+        "of latencies.",
         "docs/how-to/compare.md", ("fidelity",),
     ),
 )  # fmt: skip

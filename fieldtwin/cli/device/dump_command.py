@@ -174,9 +174,10 @@ def _print_frames(all_frames: list[str], *, as_json: bool) -> None:
         click.echo(frame)
     if len(all_frames) > MOST_FRAMES:
         stderr.print(
-            f"{MOST_FRAMES} of {len(all_frames):,} frames; --dry-run --json prints all, and RANGE (such as holding:0..999) makes the "
-            "dump shorter", soft_wrap=True,
-        )  # fmt: skip
+            f"{MOST_FRAMES} of {len(all_frames):,} frames; --dry-run --json prints all, and RANGE (such as holding:0..999) "
+            "makes the dump shorter",
+            soft_wrap=True,
+        )
 
 
 def _tell_what_is_left_out(job: DumpJob) -> None:

@@ -27,7 +27,7 @@ from fieldtwin.cli.test.check_options import JunitOptions
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
 from fieldtwin.conformance.core.case import Impact
-from fieldtwin.console import show_warnings, stdout
+from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.language.file_name import SUFFIX
 
@@ -218,6 +218,8 @@ def command(
         sys.stdout.write("\n")
     else:
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
+        if not campaign.seeds:
+            _tell_how_to_see_more(results)
     return 0 if all_well(results) else 1
 
 
@@ -327,6 +329,22 @@ def _show(result: object) -> None:
     for n, line in enumerate(result.evidence):
         stdout.print(f"  {'  ' if n else ''}{escape(line)}", soft_wrap=True, highlight=False)
     stdout.print(f"  {escape(result.reproduce)}", soft_wrap=True)
+
+
+def _tell_how_to_see_more(results: Sequence[ScenarioResult]) -> None:
+    """Name the command that shows every event of the first scenario that failed."""
+    from fieldtwin.results.model import Verdict
+
+    failed = next((result for result in results if result.verdict is Verdict.FAILED and result.reproduce), None)
+    if failed is None:
+        return
+    if failed.trace_file:
+        text = f"all events: fieldtwin studio {shlex.quote(failed.trace_file)}"
+    elif failed.target == "virtual":
+        text = f"all events: {failed.reproduce} --trace fail.jsonl; fieldtwin studio fail.jsonl"
+    else:
+        return  # a second run in real time has different events
+    stderr.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def _plain(result: object) -> dict[str, object]:

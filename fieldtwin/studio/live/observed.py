@@ -50,6 +50,7 @@ def _tag(tag: Tag, writable: bool) -> dict[str, Any]:
         "at": place(tag),
         "values": {str(number): name for number, name in tag.values},
         "range": list(tag.range) if tag.range else None,
+        "readable": tag.readable,
         "writable": writable,
         "secret": tag.secret,
         "impact": tag.danger,

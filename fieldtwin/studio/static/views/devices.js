@@ -22,7 +22,7 @@ export function Devices({ store, query }) {
     .filter(([name]) => !device || name === device)
     .flatMap(([name, d]) => Object.entries(d.tags).map(([tag, about]) => ({ full: `${name}.${tag}`, name, about })))
     .filter(({ full, about }) => !search || `${full} ${about.at} ${about.unit}`.toLowerCase().includes(search.toLowerCase()))
-    .filter(({ full }) => !onlyBad || store.tags[full]?.quality !== "good");
+    .filter(({ full, about }) => !onlyBad || (about.readable && store.tags[full]?.quality !== "good"));
   const set = store.status?.field?.set ?? {};
   const now = store.now();
   return html`<h1 class="visually-hidden">Devices</h1>

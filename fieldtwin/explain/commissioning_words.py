@@ -8,7 +8,7 @@ _COMMISSIONING = "docs/how-to/commissioning.md"
 _INFERRING = "docs/how-to/infer.md"
 _TO_CERTAIN = "Compare the values with the manual or the display of the device."
 _TO_CHANGE = (
-    "Make more passes while the values change: `fieldtwin dump --passes 20 --every 15s`. Compare the draft with the manual."
+    "Make more passes while values change: `fieldtwin dump --passes 20 --every 15s`. Compare the draft with the manual."
 )
 
 _IDENTIFY: dict[str, tuple[str, str]] = {

@@ -60,8 +60,9 @@ PUBLISHED_AT_ONCE = 20_000
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of the process.
 
-    `mapping` gives for each endpoint of the plant the endpoint that is opened instead; None on a plant. `capture` is the file
-    in which bus traffic is recorded; empty for none. `allow_writes` does not apply to the buses in `read_only`.
+    `mapping` gives for each endpoint of the plant the endpoint that is opened instead; None on a plant. With `fixed_ports` a
+    prototype serves and bridges at the addresses of the system file, otherwise on free ports. `capture` is the file in which bus
+    traffic is recorded; empty for none. `allow_writes` does not apply to the buses in `read_only`.
     """
 
     system: str
@@ -69,6 +70,7 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     allow_writes: bool
     read_only: tuple[str, ...] = ()
     mapping: dict[str, str] | None = None
+    fixed_ports: bool = False
     profiles: tuple[str, ...] = ()
     capture: str = ""
     delegated: tuple[str, ...] = ()
@@ -126,7 +128,8 @@ class GatewayProcess:
                     log,
                     allow_writes=self._config.allow_writes,
                     read_only=self._config.read_only,
-                    free_ports=self._config.mapping is not None,
+                    free_ports=self._config.mapping is not None and not self._config.fixed_ports,
+                    true_silences=self._config.mapping is None,
                     delegated=self._config.delegated,
                     taken=AckedCommandStore(run_dir / f"taken{of}.json"),
                 )
@@ -301,10 +304,10 @@ class GatewayProcess:
             if changes:
                 texts = [str(c) for c in changes]
                 self._audit.note("reload", new.name, by=str(args.get("by", ""))[:64], result="asked", changes=texts)
-                writes, free = self._config.allow_writes, self._config.mapping is not None
+                writes, plant = self._config.allow_writes, self._config.mapping is None
                 await reconfigure(
                     self._gateway,
-                    gateway_config(new, allow_writes=writes, free_ports=free, delegated=self._config.delegated),
+                    gateway_config(new, allow_writes=writes, true_silences=plant, delegated=self._config.delegated),
                 )
                 self._reloads, self._changed = self._reloads + 1, texts[:MOST_REPORTED_CHANGES]
             self._system = new

@@ -59,12 +59,19 @@ class PlaceOptions:
         "--for", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run until Ctrl-C."
     )
     instance: str = option("--instance", default="", help="Name of the run directory; default: the system's name.")
+    fixed_ports: bool = option(
+        "--fixed-ports",
+        is_flag=True,
+        help="With --prototype: servers and bridges listen at the addresses of the system file, not on free ports.",
+    )
     cold: bool = option("--cold", is_flag=True, help="Start the PLC's retained variables with their initial values.")
 
     def check(self) -> None:
         """Raise `UsageError` unless the user has chosen either the plant or a prototype, and only options that apply to it."""
         if self.prototype == self.plant:
             raise UsageError(NEITHER if not self.plant else "--plant and --prototype exclude each other")
+        if self.fixed_ports and self.plant:
+            raise UsageError("--fixed-ports needs --prototype", hint="a plant always uses the addresses of its file")
 
 
 @dataclass(frozen=True)
@@ -194,6 +201,7 @@ def command(
     others = {
         **replay.given(), "--field": field.field_host, "--listen": listen, "--can": field.can, "--capture": capture,
         "--thread-store": thread.thread_store, "--metrics": metrics, "--log": log, "--studio": studio,
+        "--fixed-ports": place.fixed_ports,
     }  # fmt: skip
     systems = systems_of(system, sources, others, OF_A_GROUP, plant=place.plant, virtual=False)
     if systems is not None:
@@ -240,6 +248,7 @@ def command(
         commands=commands,
         capture=capture,
         record_frames=bool(studio),
+        fixed_ports=place.fixed_ports,
         cold=place.cold,
         thread=thread.thread,
         thread_store=thread.thread_store,

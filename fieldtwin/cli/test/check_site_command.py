@@ -11,6 +11,7 @@ import click
 
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import show_warnings, stdout
+from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.gateway.core.errors import FileInvalid
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command("site")
-@click.argument("folder", metavar="[DIR]", default=".", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", metavar="[DIR]", default=".", type=click.Path(exists=True, path_type=Path))
 @click.option(
     "--profiles",
     multiple=True,
@@ -37,6 +38,10 @@ def site(folder: Path, profiles: tuple[Path, ...], as_json: bool) -> int:
 
     Exit code 0 without errors, else 1.
     """
+    if folder.is_file():
+        raise UsageError(
+            f"{str(folder)!r} is a file, and a site is checked as a whole", expected=f"its folder: {folder.parent}"
+        )
     from fieldtwin.cli import command_lines
     from fieldtwin.site.check import check_site
 

@@ -102,6 +102,7 @@ def gateway_config(
         allow_writes=o.prototype or o.allow_writes,
         read_only=read_only,
         mapping=mapping_to_json(mapping) if o.prototype else None,
+        fixed_ports=o.fixed_ports,
         profiles=tuple(str(p.resolve()) for p in o.profiles),
         capture=str(capture.resolve()) if capture else "",
         delegated=(delegated,) if delegated else (),
@@ -111,7 +112,8 @@ def gateway_config(
 
 def server_config(o: RunOptions, run_dir: Path, server: SeparateServer, resolved: str) -> ServerProcessConfig:
     """Return the configuration of the process of a server of tags."""
-    return ServerProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=o.prototype)
+    free_port = o.prototype and not o.fixed_ports
+    return ServerProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=free_port)
 
 
 def thread_config(

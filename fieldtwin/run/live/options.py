@@ -35,6 +35,8 @@ class RunOptions:
     capture: Path | None = None
     record_frames: bool = False
     """Whether to capture into the instance's own file (`capture_path`) if `capture` names none, as Studio needs it."""
+    fixed_ports: bool = False
+    """Whether the servers and bridges of a prototype listen at the addresses of the system file instead of on free ports."""
     cold: bool = False
     thread: str = ""
     """The destination of the plant's side of a digital thread (`fieldtwin.twin.thread.place`), empty for none."""

@@ -113,6 +113,10 @@ COMMANDS = {
         "fieldtwin.cli.recordings.trace_command",
         "Show the events of a run: decoded frames, JSON, or waveforms.",
     ),
+    "opcua": (
+        "fieldtwin.cli.system.opcua_command",
+        "Create the certificate of an OPC UA server, and manage its users.",
+    ),
     "schema": ("fieldtwin.cli.system.schema_command", "Print the JSON schema of a kind of file."),
     "explain": (
         "fieldtwin.cli.system.explain_command",
@@ -135,7 +139,7 @@ SECTIONS = {
     ),
     "Test": ("test", "campaign", "faults", "trace"),
     "Twins": ("template", "shadow", "twin", "what-if"),
-    "Help and setup": ("explain", "doctor", "schema", "completion", "test-host"),
+    "Help and setup": ("explain", "doctor", "schema", "opcua", "completion", "test-host"),
 }
 """The order of commands in `--help`; each command is in one section."""
 RENAMED = {"shore": "topside"}

@@ -53,13 +53,37 @@ class ModbusServeForm(SiteModel):
     )
 
 
+class OpcuaSecurityForm(SiteModel):
+    """Certificates and users of an OPC UA server. Relative paths begin at the folder of the system file."""
+
+    certificate: str = Field(
+        min_length=1,
+        examples=["pki/server.der"],
+        description="file of the server's application certificate, DER or PEM",
+    )
+    key: str = Field(min_length=1, examples=["pki/server.key.pem"], description="file of its private key, PEM")
+    trusted: str = Field(
+        min_length=1,
+        examples=["pki/trusted"],
+        description="folder with the certificates of the clients, or of their authorities",
+    )
+    users: str = Field(
+        min_length=1, examples=["pki/users.yaml"], description="file of the users and their roles: view, operate"
+    )
+
+
 class OpcuaServeForm(SiteModel):
-    """Every tag as a variable of an OPC UA server (IEC 62541), read-only. It listens on loopback only."""
+    """Every tag as a variable of an OPC UA server (IEC 62541). Without `security` it is read-only and listens on loopback
+    only.
+    """
 
     kind: Literal["opcua"]
     url: str = Field(examples=["opc.tcp://127.0.0.1:4840"])
     every_ms: int = Field(default=100, ge=10, le=60_000, description="interval at which the process image is read, ms")
     clients: int = Field(default=16, ge=1, le=1000)
+    security: OpcuaSecurityForm | None = Field(
+        default=None, description="admit only users of this file, over signed channels of trusted clients"
+    )
 
 
 class HttpServeForm(SiteModel):

@@ -47,7 +47,8 @@ class OpcuaProcess:
         self._config = server
         self._image = run_dir / "image"
         self._clock = WallClock()
-        self._server = OpcuaServer(self._config, system, self._clock)
+        rejected = run_dir / f"opcua-{config.server}-rejected"
+        self._server = OpcuaServer(self._config, system, self._clock, rejected)
         self._gateway = Channel(run_dir / "gateway.sock", "gateway")
 
     async def run(self) -> int:

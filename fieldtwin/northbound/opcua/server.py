@@ -12,22 +12,25 @@ import socket
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from asyncua import Server, ua
+from asyncua import ua
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, os_reason
 from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.northbound.opcua.access.channels import checked_server
+from fieldtwin.northbound.opcua.access.trust import load_identity
 from fieldtwin.northbound.opcua.address_space import Variables, build
 from fieldtwin.northbound.opcua.data_types import fitted
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.samples import Sample
 from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
-from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, url_of
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, application_uri, url_of
 from fieldtwin.twin.site.system import System
 
 MAX_SUBSCRIPTIONS = 1000
@@ -43,7 +46,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 class OpcuaServer:
     """The server of one `serve` section. Call `build`, then `listen`; `aclose` ends it."""
 
-    def __init__(self, config: OpcuaServeConfig, system: System, clock: Clock) -> None:
+    def __init__(self, config: OpcuaServeConfig, system: System, clock: Clock, rejected: Path | None = None) -> None:
+        """Create the server. `rejected` is the folder for the certificates of clients that are not trusted."""
         self.variables = Variables()
         self.updates = 0
         """Number of samples that were written to variables."""
@@ -52,7 +56,7 @@ class OpcuaServer:
         self._config = config
         self._system = system
         self._clock = clock
-        self._server = Server()
+        self._server = checked_server(config.security, clock, rejected)
         self._nodes: NodeWriter | None = None
         self._listening = ""
         self._utc_offset_ns = clock.utc_ns() - clock.monotonic_ns()
@@ -68,11 +72,18 @@ class OpcuaServer:
         """Create the address space. Until its first sample, each variable waits for initial data."""
         server = self._server
         await server.init()
-        await server.set_application_uri(f"urn:fieldtwin:{self._system.name}:{self._config.name}")
+        uri = application_uri(self._system.name, self._config.name)
+        await server.set_application_uri(uri)
         server.set_server_name(f"fieldtwin {self._system.name}")
         server.set_endpoint(self._config.url)
-        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-        server.set_identity_tokens([ua.AnonymousIdentityToken])
+        if self._config.security is None:
+            server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        else:
+            own = load_identity(self._config.security.certificate, self._config.security.key, uri)
+            server.iserver.certificate, server.iserver.private_key = own.certificate, own.key
+            server.set_security_policy(
+                [ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt, ua.SecurityPolicyType.Basic256Sha256_Sign]
+            )
         server.iserver.max_connections = self._config.clients
         server.iserver.max_subscriptions = MAX_SUBSCRIPTIONS
         server.iserver.max_monitored_item_queue_size = MAX_QUEUE

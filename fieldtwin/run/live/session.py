@@ -26,6 +26,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, StoppedGateway
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.opcua.access.files import check_files
 from fieldtwin.northbound.process_config import MODULES, check_server
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
@@ -94,6 +95,8 @@ class RunSession(AsyncResource):
         self.system: System = load_system(options.system, options.profiles)
         for server in self.system.serving.separate:
             check_server(server)
+        for opcua in self.system.serving.opcua:
+            check_files(opcua, self.system.name)
         self.twin = PhysicalTwin(self.system)
         self.delegated = transmitter_of_thread(options, self.system)
         self._prototype: Prototype | None = None

@@ -167,10 +167,9 @@ class ComposeCheck:
             return
         listening = {int(port) for word in [*words, *service.environment.values()] for port in _PORT.findall(word)}
         if service.words[0] == "run" and "--plant" in words:
-            # a server of kind opcua is reached only from inside the container
             endpoints = [one.listen for one in system.serving.serve] + [one.listen for one in system.serving.bridges]
             listening |= {one.port for one in endpoints if not one.is_serial and one.host not in _INSIDE}
-            listening |= {one.port for one in system.serving.http if one.host not in _INSIDE}
+            listening |= {one.port for one in system.serving.separate if one.host not in _INSIDE}
         elif service.words[0] == "emulate":
             listening |= self._ports_of_prototype(service, system, words)
         for port, text in service.ports.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
+from fieldtwin.twin.site.servers.serving_opcua import OpcuaSecurity, OpcuaServeConfig
 from fieldtwin.twin.site.system import System, load_system
 
 SYSTEM = """\
@@ -51,7 +51,7 @@ def test_every_loopback_address_is_accepted(tmp_path: Path, host: str) -> None:
         ('{kind: opcua, url: "opc.tcp://127.0.0.1"}', "7:24", "expected opc.tcp://HOST:PORT"),
         ('{kind: opcua, url: "opc.tcp://127.0.0.1:99999"}', "7:24", "expected opc.tcp://HOST:PORT"),
         ('{kind: opcua, url: "opc.tcp://me@127.0.0.1:4840"}', "7:24", "expected opc.tcp://HOST:PORT"),
-        ('{kind: opcua, url: "opc.tcp://0.0.0.0:4840"}', "7:24", "loopback only, because it does not authenticate"),
+        ('{kind: opcua, url: "opc.tcp://0.0.0.0:4840"}', "7:24", "without `security` listens on loopback only"),
         ('{kind: opcua, url: "opc.tcp://scada.example:4840"}', "7:24", "loopback only"),
         ('{kind: opcua, url: "opc.tcp://127.0.0.1:1502"}', "7:24", "is taken by serve 'hmi'"),
     ],
@@ -60,6 +60,28 @@ def test_an_error_states_its_place(tmp_path: Path, server: str, place: str, text
     with pytest.raises(FileInvalid, match=text) as caught:
         load(tmp_path, server)
     assert f"site.yaml:{place}:" in str(caught.value)
+
+
+SECURITY = "security: {certificate: pki/own.der, key: /keys/own.key, trusted: pki/trusted, users: users.yaml}"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1", "gateway.example", "[::]"])
+def test_a_server_with_security_may_listen_anywhere_and_its_paths_begin_at_the_system_file(
+    tmp_path: Path, host: str
+) -> None:
+    [server] = load(tmp_path, f'{{kind: opcua, url: "opc.tcp://{host}:4840", {SECURITY}}}').serving.opcua
+    assert server.url == f"opc.tcp://{host}:4840"
+    assert server.security == OpcuaSecurity(
+        certificate=tmp_path / "pki/own.der",
+        key=Path("/keys/own.key"),
+        trusted=tmp_path / "pki/trusted",
+        users=tmp_path / "users.yaml",
+    )
+
+
+def test_security_needs_all_of_its_files(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match="the key 'users' is missing"):
+        load(tmp_path, f'{{kind: opcua, url: "opc.tcp://127.0.0.1:1", {SECURITY.replace(", users: users.yaml", "")}}}')
 
 
 def test_two_servers_cannot_share_a_port(tmp_path: Path) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from urllib.parse import SplitResult, urlsplit
 
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.twin.site.serve_forms import OpcuaServeForm
+from fieldtwin.twin.site.serve_forms import OpcuaSecurityForm, OpcuaServeForm
 from fieldtwin.twin.site.servers.loopback import is_loopback
 
 SCHEME = "opc.tcp"
@@ -14,8 +15,21 @@ URL = f"{SCHEME}://HOST:PORT, such as {SCHEME}://127.0.0.1:4840"
 
 
 @dataclass(frozen=True)
+class OpcuaSecurity:
+    """The files of a server that admits only authenticated users over signed channels of trusted clients."""
+
+    certificate: Path
+    key: Path
+    trusted: Path
+    users: Path
+
+
+@dataclass(frozen=True)
 class OpcuaServeConfig:
-    """The configuration of one OPC UA server. It reads the process image every `every_ms` milliseconds."""
+    """The configuration of one OPC UA server. It reads the process image every `every_ms` milliseconds.
+
+    Without `security` every client is an anonymous user, and `host` is a loopback address.
+    """
 
     name: str
     host: str
@@ -23,6 +37,7 @@ class OpcuaServeConfig:
     every_ms: int = 100
     clients: int = 16
     kind: str = "opcua"
+    security: OpcuaSecurity | None = None
 
     @property
     def url(self) -> str:
@@ -39,6 +54,11 @@ def url_of(host: str, port: int) -> str:
     return f"{SCHEME}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
+def application_uri(system: str, server: str) -> str:
+    """Return the application URI of a server, which its certificate has to contain (OPC 10000-6, 6.2.2)."""
+    return f"urn:fieldtwin:{system}:{server}"
+
+
 def resolve_opcua(file: YamlFile, name: str, form: OpcuaServeForm) -> OpcuaServeConfig:
     """Resolve and check one server. Raises `FileInvalid` with the place of its URL."""
     loc: tuple[Key, ...] = ("serve", name, "url")
@@ -49,15 +69,26 @@ def resolve_opcua(file: YamlFile, name: str, form: OpcuaServeForm) -> OpcuaServe
         raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url) from None
     if parts.scheme != SCHEME or not parts.hostname or port is None or _has_more(parts):
         raise file.error(loc, "not the address of an OPC UA server", expected=URL, got=form.url)
-    if not is_loopback(parts.hostname):
+    if form.security is None and not is_loopback(parts.hostname):
         raise file.error(
             loc,
-            "an OPC UA server listens on loopback only, because it does not authenticate its clients",
+            "an OPC UA server without `security` listens on loopback only, because it does not authenticate its clients",
             expected="127.0.0.1 or ::1",
             got=parts.hostname,
-            hint="use an SSH tunnel to reach it from a different computer",
+            hint="add `security` with certificates and users, or reach the server through an SSH tunnel",
         )
-    return OpcuaServeConfig(name, parts.hostname, port, form.every_ms, form.clients)
+    security = _security(file, form.security) if form.security is not None else None
+    return OpcuaServeConfig(name, parts.hostname, port, form.every_ms, form.clients, security=security)
+
+
+def _security(file: YamlFile, form: OpcuaSecurityForm) -> OpcuaSecurity:
+    folder = Path(file.path).absolute().parent
+    return OpcuaSecurity(
+        certificate=folder / form.certificate,
+        key=folder / form.key,
+        trusted=folder / form.trusted,
+        users=folder / form.users,
+    )
 
 
 def _has_more(parts: SplitResult) -> bool:

@@ -1,0 +1,103 @@
+"""The part of asyncua that holds sessions, with the checks of users that it lacks.
+
+asyncua 2.1 accepts a password that was encrypted for an earlier session, and passwords and signatures with unsafe algorithms (RSA
+PKCS #1 v1.5 and SHA-1).
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+from collections.abc import Callable
+from struct import unpack_from
+from typing import Any
+
+from asyncua import ua
+from asyncua.common.utils import ServiceError
+from asyncua.crypto import uacrypto
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.internal_server import InternalServer
+from asyncua.server.internal_session import InternalSession
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.northbound.opcua.access.users import Account, Users
+
+_OAEP = "http://www.w3.org/2001/04/xmlenc#rsa-oaep"
+_RSA_SHA256 = "http://www.w3.org/2001/04/xmldsig-more#rsa-sha256"
+_log = logging.getLogger(__name__)
+
+
+class SessionUser(User):  # type: ignore[misc]
+    """The user of a session; `account` is None for an anonymous one."""
+
+    def __init__(self, account: Account | None = None) -> None:
+        super().__init__(role=UserRole.User, name=account.name if account is not None else "anonymous")
+        self.account = account
+
+
+class Session(InternalSession):  # type: ignore[misc]
+    """A client's session, with the certificate of the channel that created it; None without security."""
+
+    client_certificate: bytes | None = None
+
+
+class SessionServer(InternalServer):  # type: ignore[misc]
+    """The services of a server. With `load_users` each user must have an account in the users that it returns; without it
+    every user is anonymous.
+    """
+
+    def __init__(self, load_users: Callable[[], Users] | None) -> None:
+        super().__init__(user_manager=_Accounts(load_users))
+        tokens = [ua.UserNameIdentityToken, ua.X509IdentityToken]
+        self.supported_tokens = tuple(tokens) if load_users is not None else (ua.AnonymousIdentityToken,)
+
+    def create_session(self, name: Any, user: User | None = None, external: bool = False) -> Session:
+        return Session(
+            self, self.aspace, self.subscription_service, name, user=user or User(UserRole.Anonymous), external=external
+        )
+
+    def decrypt_user_token(self, isession: Any, token: Any) -> tuple[str, str]:
+        """Return name and password. An encrypted password ends with the nonce of the session (OPC 10000-4, 7.41.2.2)."""
+        secret = token.Password or b""
+        if token.EncryptionAlgorithm:
+            if token.EncryptionAlgorithm != _OAEP:
+                raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+            plain = uacrypto.decrypt_rsa_oaep(self.private_key, secret)
+            (length,) = unpack_from("<I", plain)
+            secret, nonce = plain[4 : 4 + length - len(isession.nonce)], plain[4 + length - len(isession.nonce) :]
+            if length != len(plain) - 4 or not hmac.compare_digest(nonce, isession.nonce):
+                raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+        return str(token.UserName or ""), secret.decode() if isinstance(secret, bytes) else str(secret)
+
+    def verify_x509_token(self, isession: Any, token: Any, signature: Any) -> bytes:
+        """Return the user's certificate (DER) if the signature proves possession of its key."""
+        if signature.Algorithm != _RSA_SHA256:
+            raise ServiceError(ua.StatusCodes.BadUserSignatureInvalid)
+        found: bytes = super().verify_x509_token(isession, token, signature)
+        return found
+
+
+class _Accounts:
+    """The user manager that asyncua asks for the user of a session; None means that the user is refused."""
+
+    def __init__(self, load_users: Callable[[], Users] | None) -> None:
+        self._load_users = load_users
+
+    def get_user(
+        self, iserver: Any, username: str | None = None, password: str | None = None, certificate: bytes | None = None
+    ) -> SessionUser | None:
+        if self._load_users is None:
+            return SessionUser()
+        try:
+            users = self._load_users()
+        except FileInvalid as e:
+            _log.error("no user is admitted: %s", e)
+            return None
+        if username is not None:
+            account = users.with_password(username, password or "")
+        else:
+            account = users.with_certificate(certificate) if certificate is not None else None
+        if account is None:
+            _log.warning("no user %r with this password or certificate", (username or "")[:48])
+            return None
+        return SessionUser(account)

@@ -85,6 +85,10 @@ class NotAllowed(UsageError):
     """The request is well formed, but the configuration forbids it (read-only plant, unmarked tag, limits, rate)."""
 
 
+class OutOfLimits(NotAllowed):
+    """A value may not be written, because it is outside the limits of its tag, or because its type cannot hold it."""
+
+
 class FileInvalid(FieldtwinError):
     """A file that a user wrote or recorded cannot be used as it is.
 

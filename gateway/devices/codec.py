@@ -12,7 +12,7 @@ import struct
 
 from msgspec.structs import replace
 
-from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.core.errors import NotAllowed, OutOfLimits
 from fieldtwin.gateway.core.files.profile import REGISTERS_OF, Tag
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
@@ -108,7 +108,7 @@ def encode(tag: Tag, value: Scalar) -> bytes:
     low_high = tag.limits
     if not math.isfinite(value) or (low_high is not None and not low_high[0] <= value <= low_high[1]):
         expected = f"{low_high[0]:g} to {low_high[1]:g} {tag.unit}".rstrip() if low_high else "a finite number"
-        raise NotAllowed(f"{tag.name}: the value is outside its limits", expected=expected, got=f"{value:g}")
+        raise OutOfLimits(f"{tag.name}: the value is outside its limits", expected=expected, got=f"{value:g}")
     if tag.type == "bool":
         return int(bool(value)).to_bytes(2)
     if tag.bits is not None or tag.scale_by is not None:
@@ -118,7 +118,7 @@ def encode(tag: Tag, value: Scalar) -> bytes:
         return reorder(_packed(tag.type, number), tag.order)
     # a `range` wider than the type, or a float that is too large
     except (struct.error, OverflowError, ValueError) as e:
-        raise NotAllowed(
+        raise OutOfLimits(
             f"{tag.name}: the value is outside its limits", expected=f"what a {tag.type} can hold", got=f"{value:g}"
         ) from e
 

@@ -210,6 +210,19 @@ class Gateway:
         if not isinstance(self.drivers[name], TransmitterDriver):
             self.outputs.outputs.append(self._make_output(tag))
 
+    def client_tags(self) -> list[str]:
+        """Return the tags that a client may write: those that are `writable`, on a bus that may be written to, that neither a
+        program commands nor a group contains.
+        """
+        return [
+            f"{device.name}.{local}"
+            for device in self.config.devices.values()
+            if self.config.may_write(device.bus) and not isinstance(self.drivers[device.name], TransmitterDriver)
+            for local in device.writable
+            if f"{device.name}.{local}" not in self.config.outputs
+            and not self.outputs.is_in_group(f"{device.name}.{local}")
+        ]
+
     def _message_sources(self) -> dict[str, Consumer[DATA]]:
         sources: dict[str, Consumer[DATA]] = {pump.driver.message_tag: pump.inbox for pump in self.pumps}
         for driver in self.drivers.values():

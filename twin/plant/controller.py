@@ -2,7 +2,7 @@
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
 instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
-write, command, report, reload, stop.
+write, client_tags, refuse, command, report, reload, stop.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.modbus.learnt_gaps import LearntFile, learnt_statuses
 from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus, StoppedGateway
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
+from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
@@ -52,6 +53,8 @@ of each program.
 """
 MOST_COMMAND_BYTES = 64
 WRITE_WITHIN_S = 5.0
+MOST_NAME = 128
+"""The largest number of characters of the name of a client in the audit log."""
 MOST_REPORTED_CHANGES = 20
 PUBLISHED_AT_ONCE = 20_000
 """The largest number of journal entries (published values) that fits into one line of the control channel."""
@@ -157,6 +160,8 @@ class GatewayProcess:
                 "watch": self._watch,
                 "gate": self._gate,
                 "write": self._write,
+                "client_tags": self._client_tags,
+                "refuse": self._refuse,
                 "command": self._command,
                 "report": self._reports.report,
                 "reload": self._reload,
@@ -258,7 +263,7 @@ class GatewayProcess:
                 done.set_result(error)
 
         self._gateway.offer(tag)
-        self._gateway.outputs.request(tag, float(value), str(args.get("by", ""))[:64], end)
+        self._gateway.outputs.request(tag, float(value), str(args.get("by", ""))[:MOST_NAME], end)
         try:
             async with asyncio.timeout(WRITE_WITHIN_S):
                 error = await done
@@ -269,6 +274,25 @@ class GatewayProcess:
         if error is not None:
             raise error
         return {"tag": tag, "value": value}
+
+    async def _client_tags(self, args: dict[str, Any]) -> list[str]:
+        """Return the tags that a client may write now. A reload may change them."""
+        return self._gateway.client_tags()
+
+    async def _refuse(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Record a write that a server in a separate process has refused (``tag``, ``value``, ``reason``, ``cause``, ``by``).
+
+        `cause` is the value of a `RefusalCause`. Raises `UsageError` for any other.
+        """
+        cause = args.get("cause")
+        if cause not in (RefusalCause.LIMIT.value, RefusalCause.NOT_WRITABLE.value):
+            expected = f"{RefusalCause.LIMIT.value} or {RefusalCause.NOT_WRITABLE.value}"
+            raise UsageError("the cause of a refusal", expected=expected, got=repr(cause)[:80])
+        tag, value, reason, by = (str(args.get(key, ""))[:MOST_NAME] for key in ("tag", "value", "reason", "by"))
+        self._gateway.outputs.refusals += 1
+        journal, now_ns = self._gateway.outputs.journal, self._clock.monotonic_ns()
+        journal.note(tag.partition(".")[0], tag, value, RefusalCause(cause), reason, by, now_ns)
+        return {"recorded": True}
 
     async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
         """Pass a command of the digital twin (``payload`` in hex) to the control logic, as if the transmitter had received it."""

@@ -19,6 +19,7 @@ from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.northbound.opcua.samples import ImageSamples, TextSamples
 from fieldtwin.northbound.opcua.server import OpcuaServer
+from fieldtwin.northbound.opcua.write_channels import WriteChannels
 from fieldtwin.northbound.process_config import ServerProcessConfig, server_of
 from fieldtwin.northbound.status_report import report_status
 from fieldtwin.twin.plant.channel import Channel
@@ -29,6 +30,7 @@ from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
 
 TEXTS_EVERY_NS = NS_PER_S // 2
+PERMISSIONS_EVERY_NS = NS_PER_S
 LISTEN_EVERY_S = 1.0
 """Pause in seconds before the server tries again to listen at an address that is taken."""
 STOPS_WITHIN_S = 1.0
@@ -48,8 +50,10 @@ class OpcuaProcess:
         self._image = run_dir / "image"
         self._clock = WallClock()
         rejected = run_dir / f"opcua-{config.server}-rejected"
-        self._server = OpcuaServer(self._config, system, self._clock, rejected)
+        self._writes = WriteChannels(run_dir / "gateway.sock")
+        self._server = OpcuaServer(self._config, system, self._clock, self._writes.call, rejected)
         self._gateway = Channel(run_dir / "gateway.sock", "gateway")
+        self._permissions = Channel(run_dir / "gateway.sock", "gateway")
 
     async def run(self) -> int:
         stop = stop_signal()
@@ -70,6 +74,8 @@ class OpcuaProcess:
             except TimeoutError:
                 pass  # a client that does not read must not delay the end of the run
         await self._gateway.aclose()
+        await self._permissions.aclose()
+        await self._writes.aclose()
         return 0
 
     async def _serve(self, inputs: RegionReader, outputs: RegionReader) -> None:
@@ -78,6 +84,8 @@ class OpcuaProcess:
             nursery.start(self._follow_image(inputs, outputs), "process image")
             if self._server.variables.texts:
                 nursery.start(self._follow_texts(), "texts")
+            if self._config.security is not None:
+                nursery.start(self._follow_permissions(), "tags that clients may write")
             nursery.start(self._listen(), "listener")
             await nursery.wait()
 
@@ -116,6 +124,16 @@ class OpcuaProcess:
             else:
                 await server.publish(names, texts.changes(answer["tags"], answer["now_ns"]))
             await self._clock.sleep_until_ns(now_ns + TEXTS_EVERY_NS)
+
+    async def _follow_permissions(self) -> None:
+        """Ask the gateway once a second which tags clients may write, because a reload may change that."""
+        while True:
+            try:
+                tags = await self._permissions.call("client_tags")
+            except FieldtwinError:
+                tags = []
+            await self._server.permit_writes(tags)
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + PERMISSIONS_EVERY_NS)
 
 
 def main(argv: list[str]) -> int:

@@ -1,7 +1,7 @@
 """The OPC UA server: its address space, and the present samples as values of its variables.
 
-Clients read and subscribe only. asyncua refuses every write, because no variable has the access level for it, and every change of
-the address space, because no client is an administrator.
+A client's write goes to the gateway and changes no variable here. asyncua refuses every change of the address space, because no
+client is an administrator.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
 from fieldtwin.northbound.opcua.access.channels import checked_server
 from fieldtwin.northbound.opcua.access.trust import load_identity
+from fieldtwin.northbound.opcua.access.users import Account
 from fieldtwin.northbound.opcua.address_space import Variables, build
 from fieldtwin.northbound.opcua.data_types import fitted
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.samples import Sample
 from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
+from fieldtwin.northbound.opcua.writes import Call, TagWrites
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, application_uri, url_of
 from fieldtwin.twin.site.system import System
 
@@ -46,8 +48,14 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 class OpcuaServer:
     """The server of one `serve` section. Call `build`, then `listen`; `aclose` ends it."""
 
-    def __init__(self, config: OpcuaServeConfig, system: System, clock: Clock, rejected: Path | None = None) -> None:
-        """Create the server. `rejected` is the folder for the certificates of clients that are not trusted."""
+    def __init__(
+        self, config: OpcuaServeConfig, system: System, clock: Clock, call: Call, rejected: Path | None = None
+    ) -> None:
+        """Create the server.
+
+        `call` calls a command of the gateway for a write of a client. `rejected` is the folder for the certificates of clients
+        that are not trusted.
+        """
         self.variables = Variables()
         self.updates = 0
         """Number of samples that were written to variables."""
@@ -58,6 +66,9 @@ class OpcuaServer:
         self._clock = clock
         self._server = checked_server(config.security, clock, rejected)
         self._nodes: NodeWriter | None = None
+        self._call = call
+        self._writable: set[str] = set()
+        self.writes = TagWrites(config.name, call, {}, ())
         self._listening = ""
         self._utc_offset_ns = clock.utc_ns() - clock.monotonic_ns()
         self._server_time: datetime | None = None
@@ -91,6 +102,8 @@ class OpcuaServer:
             "urn:fieldtwin", "fieldtwin", "fieldtwin gateway", __version__, "", datetime.fromtimestamp(0, UTC)
         )
         self._nodes, self.variables = await build(server, self._system)
+        self.writes = TagWrites(self._config.name, self._call, self.variables.data_types, self.variables.inputs)
+        server.iserver.write_value = self._write_for_client
         waiting = Sample(None, BAD_CODES[Reason.NEVER_READ], 0)
         for name in self.variables.data_types:
             await self._write(name, waiting)
@@ -129,7 +142,7 @@ class OpcuaServer:
         return ServerStatus(
             listening=self._listening or None,
             error=self.error,
-            counters={"updates": self.updates},
+            counters={"updates": self.updates, **self.writes.counters},
             clients=clients,
             kind="opcua",
         )
@@ -141,6 +154,26 @@ class OpcuaServer:
         for tag, sample in changes:
             await self._write(names[tag], sample)
             self.updates += 1
+
+    async def permit_writes(self, tags: Iterable[str]) -> None:
+        """Give exactly these tags the access level for writes, and no tag if the server has no users."""
+        wanted = set(tags) & set(self.variables.inputs) if self._config.security is not None else set()
+        for name in wanted ^ self._writable:
+            level = ua.AccessLevel.CurrentRead.mask
+            if name in wanted:
+                level |= ua.AccessLevel.CurrentWrite.mask
+            value = ua.DataValue(ua.Variant(level, ua.VariantType.Byte))
+            for attribute in (ua.AttributeIds.AccessLevel, ua.AttributeIds.UserAccessLevel):
+                await self._server.iserver.write_attribute_value(self._id_of(name), value, attribute)
+        self._writable = wanted
+
+    async def _write_for_client(self, item: ua.WriteValue, account: Account | None, address: str) -> str:
+        """Write a value for a client. Return the name of the status code."""
+        if item.NodeId not in self._server.iserver.aspace:
+            return "BadNodeIdUnknown"
+        is_own = self._nodes is not None and item.NodeId.NamespaceIndex == self._nodes.own
+        name = str(item.NodeId.Identifier) if is_own else item.NodeId.to_string()
+        return await self.writes.write(item, name, account, address)
 
     def _follow_utc(self) -> None:
         offset_ns = self._clock.utc_ns() - self._clock.monotonic_ns()
@@ -169,13 +202,10 @@ class OpcuaServer:
             held.data.SourceTimestamp = self._utc(source_ns)
             held.data.ServerTimestamp = self._server_time
             return
-        assert self._nodes is not None
         code = self._statuses.get(status)
         if code is None:
             code = self._statuses[status] = ua.StatusCode(status.number)
-        node = self._ids.get(name)
-        if node is None:
-            node = self._ids[name] = self._nodes.id(name)
+        node = self._id_of(name)
         data = _SharedValue(
             self._variant(value, kind), code, SourceTimestamp=self._utc(source_ns), ServerTimestamp=self._server_time
         )
@@ -184,6 +214,13 @@ class OpcuaServer:
             self._held.pop(name, None)  # asyncua has stored a copy of a bad value
         else:
             self._held[name] = _Held(value, status, data)
+
+    def _id_of(self, name: str) -> ua.NodeId:
+        assert self._nodes is not None
+        node = self._ids.get(name)
+        if node is None:
+            node = self._ids[name] = self._nodes.id(name)
+        return node
 
     @staticmethod
     def _variant(value: Any, kind: str) -> ua.Variant:

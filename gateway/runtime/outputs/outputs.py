@@ -87,6 +87,10 @@ class OutputWriter:
                 self._note(output, "nan", RefusalCause.LIMIT, error, "plc")
                 self.refusals += 1
 
+    def is_in_group(self, tag: str) -> bool:
+        """Return whether a tag is written only together with the other tags of its group."""
+        return tag in self._group_of
+
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
         """Write a tag once for a client (`by`); the tag must not be one that the PLC commands. `done` is called with
         the result.

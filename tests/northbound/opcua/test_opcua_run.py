@@ -6,24 +6,22 @@ import asyncio
 import os
 import signal
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from asyncua import Client, Node, ua
 from procs import Asking, Fieldtwin, no_tracebacks, wait_for
+from received_samples import Received, check, history
 from served_hall import client, running
+from support import eventually
 
 from fieldtwin.emulators.faults.registry import FAULTS
-from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.northbound.opcua.status_codes import status_code
 
+soon = partial(eventually, within_s=30.0)
 pytestmark = [pytest.mark.long, pytest.mark.timeout(180)]
-NEAR_NS = 30_000_000
-"""How far a source time may be from the gateway's own time: the server follows the host's UTC in steps of 10 ms."""
-REASONS = {str(reason): reason for reason in Reason}
 
 
 @pytest.fixture(scope="module")
@@ -135,56 +133,6 @@ def test_clients_can_change_nothing(hall: tuple[Fieldtwin, str]) -> None:
     asyncio.run(tries(hall[1]))
 
 
-class Received:
-    """The samples of a subscription, by tag: data value and the monotonic time of its arrival."""
-
-    def __init__(self) -> None:
-        self.samples: list[tuple[str, ua.DataValue, int]] = []
-
-    def datachange_notification(self, node: Node, value: Any, data: Any) -> None:
-        name = str(node.nodeid.Identifier)
-        self.samples.append((name, data.monitored_item.Value, WallClock().monotonic_ns()))
-
-    def latest(self, name: str) -> str:
-        return next((v.StatusCode.name for n, v, _ in reversed(self.samples) if n == name), "")
-
-
-async def until(condition: Any, within_s: float = 30.0) -> None:
-    async with asyncio.timeout(within_s):
-        while not condition():
-            await asyncio.sleep(0.05)
-
-
-def history(gateway: Asking) -> tuple[dict[str, list[tuple[Any, int]]], list[tuple[int, str, str, str]]]:
-    """The gateway's own record: the good values of each tag with their times, and the changes of qualities."""
-    good: dict[str, list[tuple[Any, int]]] = {}
-    for _, tag, _, t_ns, value in gateway("published", since=0)["entries"]:
-        good.setdefault(tag, []).append((value, t_ns))
-    changes = [(t, tag, quality, reason) for _, t, tag, _, quality, reason in gateway("watch", since=0)["changes"]]
-    return good, changes
-
-
-def check(sample: tuple[str, ua.DataValue, int], offset_ns: int, good: Any, changes: Any) -> None:
-    """Require that the gateway has recorded exactly this sample: value, status and time."""
-    name, data, arrived_ns = sample
-    stamp = data.SourceTimestamp
-    assert stamp is not None, f"{name}: {data.StatusCode.name} without a time"
-    source_ns = int((stamp.replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds() * 1e9) - offset_ns
-    if data.StatusCode.is_good():
-        near = [value for value, t_ns in good[name] if abs(t_ns - source_ns) < NEAR_NS]
-        assert data.Value.Value in near, f"{name}: {data.Value.Value} at {source_ns}: {near}"
-        return
-    assert data.Value.Value is None
-    known = [
-        (t_ns, reason)
-        for t_ns, tag, quality, reason in changes
-        if tag == name and status_code(Quality[quality.upper()], REASONS[reason]).number == data.StatusCode.value
-    ]
-    assert any(t_ns - NEAR_NS <= source_ns <= arrived_ns + NEAR_NS for t_ns, _ in known), (
-        f"{name}: {data.StatusCode.name} at {source_ns}, arrived {arrived_ns}: {known}"
-    )
-
-
 def test_every_sample_equals_the_gateways_record_under_each_fault(hall: tuple[Fieldtwin, str]) -> None:
     run, url = hall
     gateway, field = run.control("hall", "gateway"), run.control("hall", "field")
@@ -195,22 +143,22 @@ def test_every_sample_equals_the_gateways_record_under_each_fault(hall: tuple[Fi
             subscription = await connected.create_subscription(50, received)
             tags = [connected.get_node(f"ns=2;s=sensor.{tag}") for tag in ("temperature", "ticks", "flow")]
             await subscription.subscribe_data_change(tags)
-            await until(lambda: received.latest("sensor.flow") == "Good")
+            await soon(lambda: received.latest("sensor.flow") == "Good")
             for name in FAULTS:
                 if name not in LIVE:
                     continue
                 await asyncio.to_thread(field, "fault", fault={"id": "f", "name": name, "device": "sensor"})
                 await asyncio.sleep(0.6)
                 await asyncio.to_thread(field, "clear", id="f")
-                await until(lambda: received.latest("sensor.flow") == "Good")
+                await soon(lambda: received.latest("sensor.flow") == "Good")
             await asyncio.to_thread(field, "fault", fault={"id": "f", "name": "silence", "device": "sensor"})
-            await until(lambda: received.latest("sensor.temperature") == "BadNoCommunication")
+            await soon(lambda: received.latest("sensor.temperature") == "BadNoCommunication")
             await asyncio.to_thread(field, "clear", id="f")
-            await until(lambda: received.latest("sensor.temperature") == "Good")
+            await soon(lambda: received.latest("sensor.temperature") == "Good")
             await asyncio.to_thread(field, "fault", fault={"id": "f", "name": "exception", "device": "sensor"})
-            await until(lambda: received.latest("sensor.temperature") == "BadDeviceFailure")
+            await soon(lambda: received.latest("sensor.temperature") == "BadDeviceFailure")
             await asyncio.to_thread(field, "clear", id="f")
-            await until(lambda: received.latest("sensor.temperature") == "Good")
+            await soon(lambda: received.latest("sensor.temperature") == "Good")
 
     asyncio.run(follow())
     clock = WallClock()

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
+from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.northbound.opcua.access.files import create_certificate
 from fieldtwin.northbound.opcua.access.passwords import hash_of
@@ -98,7 +99,7 @@ def secured_server(folder: Path) -> Iterator[str]:
 
     async def serve() -> None:
         clock = WallClock()
-        server = OpcuaServer(replace(config, port=0), system, clock, folder / "rejected")
+        server = OpcuaServer(replace(config, port=0), system, clock, _no_gateway, folder / "rejected")
         try:
             await server.build()
             good = Sample(50.0, GOOD, clock.monotonic_ns())
@@ -119,6 +120,10 @@ def secured_server(folder: Path) -> Iterator[str]:
         loop.call_soon_threadsafe(stop.set)
         thread.join(30)
         loop.close()
+
+
+async def _no_gateway(command: str, **args: object) -> None:
+    raise Unreachable("this server has no gateway")
 
 
 async def client_of(url: str, certificate: Path, mode: ua.MessageSecurityMode = ENCRYPT, user: str = "anna") -> Client:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 from asyncua import Client
 from procs import Fieldtwin, fieldtwin, wait_for
+from secured_server import make_certificate, write_users
+
+from fieldtwin.northbound.opcua.access.files import create_certificate
+from fieldtwin.twin.site.servers.serving_opcua import application_uri
+from fieldtwin.twin.site.system import load_system
 
 FILES = {
     "sensor.yaml": """\
@@ -30,6 +36,7 @@ protocol: modbus
 tags:
   mode: {at: "holding:0", type: uint16, poll: status, access: rw}
   lamp: {at: "coil:0", type: bool, poll: status, access: rw}
+  limit: {at: "holding:1", type: int16, scale: 0.1, poll: status, access: rw, range: [0, 100]}
 """,
     "fan.st": """\
 PROGRAM Fan
@@ -53,7 +60,7 @@ devices:
     poll: {values: {every_ms: 200}, identity: {every_ms: 1000}}
     backoff_first_ms: 100
     backoff_limit_ms: 200
-  fan: {profile: ./fan.yaml, bus: lan, unit: 2, poll: {status: {every_ms: 200}}, writable: [mode, lamp]}
+  fan: {profile: ./fan.yaml, bus: lan, unit: 2, poll: {status: {every_ms: 200}}, writable: [mode, lamp, limit]}
 plc:
   cycle_ms: 20
   programs:
@@ -79,17 +86,35 @@ devices:
 START_WITHIN_S = 60.0
 
 
-def write_site(folder: Path) -> Path:
-    """Write the files, and return the system file."""
+SECURITY = "security: {certificate: pki/own.der, key: pki/own.key, trusted: pki/trusted, users: pki/users.yaml}"
+
+
+def write_site(folder: Path, *, secured: bool = False) -> Path:
+    """Write the files, and return the system file. With `secured` its OPC UA server has certificates and users."""
     for name, text in FILES.items():
         (folder / name).write_text(text, encoding="utf-8")
-    return folder / "hall.yaml"
+    path = folder / "hall.yaml"
+    if secured:
+        path.write_text(FILES["hall.yaml"].replace("every_ms: 50}", f"every_ms: 50, {SECURITY}}}"), encoding="utf-8")
+        make_pki(path)
+    return path
+
+
+def make_pki(system_file: Path) -> None:
+    """Make the server's certificate, its users, and the certificate of a trusted client: ``hmi.der``."""
+    system = load_system(str(system_file))
+    [server] = system.serving.opcua
+    assert server.security is not None
+    create_certificate(server.security, application_uri(system.name, server.name), ["127.0.0.1"], 30)
+    write_users(server.security.users)
+    certificate = make_certificate(system_file.parent, "hmi")
+    shutil.copy(certificate, server.security.trusted)
 
 
 @contextmanager
-def running(folder: Path, *options: str) -> Iterator[tuple[Fieldtwin, str]]:
+def running(folder: Path, *options: str, secured: bool = False) -> Iterator[tuple[Fieldtwin, str]]:
     """A run of the site's prototype, with the URL of its OPC UA server."""
-    with fieldtwin(folder, "run", str(write_site(folder)), "--prototype", *options) as run:
+    with fieldtwin(folder, "run", str(write_site(folder, secured=secured)), "--prototype", *options) as run:
         wait_for((folder / "hall" / "gateway.sock").is_socket, START_WITHIN_S, "the gateway")
         gateway = run.control("hall", "gateway")
         url = wait_for(lambda: gateway("get", brief=True)["serve"]["scada"]["listening"], START_WITHIN_S, "the server")

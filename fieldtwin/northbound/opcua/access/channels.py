@@ -7,6 +7,7 @@ refuses all of that, and closes a connection after a message that is not authent
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from asyncua.crypto.security_policies import SecurityPolicyFactory, SecurityPoli
 from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.internal_session import SessionState
 from asyncua.server.uaprocessor import UaProcessor
-from asyncua.ua.ua_binary import uatcp_to_binary
+from asyncua.ua.ua_binary import struct_from_binary, uatcp_to_binary
 from cryptography.x509 import Certificate
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -35,6 +36,10 @@ CheckCertificate = Callable[[bytes], bytes]
 MOST_FAILURES = 10
 """The number of failed log-ins from one address after which the address has to wait."""
 FORGET_FAILURES_NS = 60 * NS_PER_S
+MOST_WRITES = 8
+"""The number of requests to write, of all clients together, that may be in flight at a time."""
+MOST_VALUES = 100
+"""The number of values in one request to write."""
 MOST_ADDRESSES = 1000
 """The number of addresses whose failed log-ins are remembered."""
 _log = logging.getLogger(__name__)
@@ -48,6 +53,7 @@ _DISCOVERY = _requests("GetEndpoints", "FindServers", "CloseSecureChannel")
 """The requests that a channel without security may send to every server (OPC 10000-4, 5.4.1)."""
 _REGISTRATION = _requests("RegisterServer", "RegisterServer2")
 [_CREATE] = _requests("CreateSession")
+[_WRITE] = _requests("Write")
 [_ACTIVATE] = _requests("ActivateSession")
 
 
@@ -95,7 +101,10 @@ class ChannelServer(Server):  # type: ignore[misc]
     def __init__(self, sessions: SessionServer, clock: Clock, check: CheckCertificate | None) -> None:
         super().__init__(iserver=sessions)
         self.check = check
+        self.clock = clock
         self.failures = LoginFailures(clock)
+        self.writes: set[asyncio.Task[None]] = set()
+        """The requests to write that are in flight."""
 
     async def start(self) -> None:
         await self._setup_server_nodes()
@@ -107,6 +116,11 @@ class ChannelServer(Server):  # type: ignore[misc]
             self._policies = [_CheckedPolicy(each, self.check) for each in self._policies]
         self.bserver.set_policies(self._policies)
         await self.bserver.start()
+
+    async def stop(self) -> None:
+        for write in list(self.writes):
+            write.cancel()
+        await super().stop()
 
 
 async def _check_application(certificate: Certificate, description: Any) -> None:
@@ -159,6 +173,8 @@ class _Processor(UaProcessor):  # type: ignore[misc]
         self._is_secured = server.check is not None
         self._failures = server.failures
         self._address = str(self.name[0])
+        self._clock = server.clock
+        self._writes = server.writes
 
     async def process(self, header: Any, body: Any) -> bool:
         """Process one message. A channel whose client or message is not authentic gets the reason, and is closed."""
@@ -182,6 +198,8 @@ class _Processor(UaProcessor):  # type: ignore[misc]
         is_open = isinstance(self._connection.security_policy, SecurityPolicyNone)
         if self._is_secured and is_open and typeid not in _DISCOVERY:
             raise ServiceError(ua.StatusCodes.BadSecurityPolicyRejected)
+        if typeid == _WRITE and self.session is not None and self.session.is_activated():
+            return self._start_write(requesthdr, seqhdr, body)
         if typeid == _ACTIVATE:
             return await self._activate(typeid, requesthdr, seqhdr, body)
         if typeid != _CREATE:
@@ -191,6 +209,26 @@ class _Processor(UaProcessor):  # type: ignore[misc]
         result = await super()._process_message(typeid, requesthdr, seqhdr, body)
         self.session.client_certificate = self._connection.security_policy.peer_certificate
         return result
+
+    def _start_write(self, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
+        """Start a write, which waits for its device. The connection meanwhile processes the client's other requests."""
+        self.session.touch()
+        self.session_last_activity = self._clock.monotonic_ns() / NS_PER_S
+        parameters = struct_from_binary(ua.WriteParameters, body)
+        if len(parameters.NodesToWrite) > MOST_VALUES:
+            raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+        if len(self._writes) >= MOST_WRITES:
+            raise ServiceError(ua.StatusCodes.BadServerTooBusy)
+        task = asyncio.create_task(self._write(self.session, parameters, requesthdr, seqhdr))
+        self._writes.add(task)
+        task.add_done_callback(self._writes.discard)
+        return True
+
+    async def _write(self, session: Session, parameters: Any, requesthdr: Any, seqhdr: Any) -> None:
+        response = ua.WriteResponse()
+        response.Results = await session.write(parameters)
+        if not self._transport.is_closing():
+            self.send_response(requesthdr.RequestHandle, seqhdr, response)
 
     async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> Any:
         """Activate a session. A new channel may continue a session only of a client with the same certificate."""

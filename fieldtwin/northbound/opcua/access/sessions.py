@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hmac
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from struct import unpack_from
 from typing import Any
 
@@ -27,6 +27,14 @@ _RSA_SHA256 = "http://www.w3.org/2001/04/xmldsig-more#rsa-sha256"
 _log = logging.getLogger(__name__)
 
 
+WriteValue = Callable[[Any, Account | None, str], Awaitable[str]]
+"""Writes a `ua.WriteValue` for a user at an address. Returns the name of the status code."""
+
+
+async def _refuse_write(item: Any, account: Account | None, address: str) -> str:
+    return "BadNotWritable"
+
+
 class SessionUser(User):  # type: ignore[misc]
     """The user of a session; `account` is None for an anonymous one."""
 
@@ -39,6 +47,29 @@ class Session(InternalSession):  # type: ignore[misc]
     """A client's session, with the certificate of the channel that created it; None without security."""
 
     client_certificate: bytes | None = None
+    user: User
+
+    @property
+    def account(self) -> Account | None:
+        """Return the account of the user; None for an anonymous one."""
+        return self.user.account if isinstance(self.user, SessionUser) else None
+
+    async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
+        """Pass the values, one after the other, to the function for writes, with user and address of the client."""
+        write, address = self.iserver.write_value, str(self.name[0])
+        codes = [await write(item, self.account, address) for item in params.NodesToWrite]
+        return [ua.StatusCode(getattr(ua.StatusCodes, code)) for code in codes]
+
+    async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
+        """Read attributes. The `UserAccessLevel` is that of the user of this session."""
+        found: list[ua.DataValue] = await super().read(params)
+        if self.account is None or self.account.may_write:
+            return found
+        for n, item in enumerate(params.NodesToRead):
+            if item.AttributeId == ua.AttributeIds.UserAccessLevel and found[n].StatusCode.is_good():
+                level = found[n].Value.Value & ~ua.AccessLevel.CurrentWrite.mask
+                found[n] = ua.DataValue(ua.Variant(level, ua.VariantType.Byte))
+        return found
 
 
 class SessionServer(InternalServer):  # type: ignore[misc]
@@ -48,6 +79,8 @@ class SessionServer(InternalServer):  # type: ignore[misc]
 
     def __init__(self, load_users: Callable[[], Users] | None) -> None:
         super().__init__(user_manager=_Accounts(load_users))
+        self.write_value: WriteValue = _refuse_write
+        """Writes one value of a client."""
         tokens = [ua.UserNameIdentityToken, ua.X509IdentityToken]
         self.supported_tokens = tuple(tokens) if load_users is not None else (ua.AnonymousIdentityToken,)
 

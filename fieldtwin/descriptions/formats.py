@@ -159,6 +159,18 @@ FORMATS: dict[str, Format] = {
             export_settings=_ENDPOINT,
         ),
         Format(
+            "aid",
+            ".json",
+            "Asset Interfaces Description of an Asset Administration Shell (IDTA 02017)",
+            "properties of a device in registers",
+            "fieldtwin.descriptions.aas.aid",
+            extra="aas",
+            import_settings=_ONE_DEVICE
+            | _NUMBERING
+            | {"interface": "idShort of the interface, if the file has several"},
+            export_settings=_ENDPOINT,
+        ),
+        Format(
             "sunspec",
             ".json",
             "SunSpec model definition",

@@ -16,6 +16,7 @@ from fieldtwin.capture.formats.mcap_file import McapFile
 from fieldtwin.capture.recordings.exporting import TableColumn, _write_parquet
 from fieldtwin.cli.main import cli
 from fieldtwin.commissioning.access.plotting import check_plot
+from fieldtwin.descriptions.aas.aid import require_library as require_aas
 from fieldtwin.descriptions.canopen.dbc import export_description
 from fieldtwin.emulators.simulation.fmu.description import describe
 from fieldtwin.gateway.core.errors import UsageError
@@ -72,6 +73,10 @@ def use_dbc(folder: Path) -> None:
     export_description(load_profile(CHECKOUT / "profiles/devices/io-cia401.yaml"), {})
 
 
+def use_aas(folder: Path) -> None:
+    require_aas()
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "opcua": ("asyncua", use_opcua, ""),
@@ -82,7 +87,11 @@ USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "parquet": ("pyarrow", use_parquet, ""),
     "mcap": ("mcap", use_mcap, ""),
     "dbc": ("cantools", use_dbc, ""),
+    "aas": ("basyx", use_aas, ""),
 }
+
+DISTRIBUTIONS = {"basyx": "basyx-python-sdk"}
+"""The distribution of each package whose name differs."""
 
 
 @pytest.mark.parametrize("extra", list(USES))
@@ -90,7 +99,7 @@ def test_a_missing_extra_is_reported_with_its_package(
     extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package, use, ours = USES[extra]
-    assert [re.split("[ ><=]", wanted)[0] for wanted in EXTRAS[extra]] == [package]
+    assert [re.split("[ ><=]", wanted)[0] for wanted in EXTRAS[extra]] == [DISTRIBUTIONS.get(package, package)]
     if ours:
         monkeypatch.delitem(sys.modules, ours, raising=False)
         parent, _, name = ours.rpartition(".")

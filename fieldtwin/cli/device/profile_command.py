@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import click
 from rich.table import Table
 
+from fieldtwin.cli.losses import show_losses
 from fieldtwin.cli.options import json_option, pairs, profiles_option
 from fieldtwin.cli.output_files import write_bytes, write_text
 from fieldtwin.console import stderr, stdout
@@ -21,7 +22,6 @@ from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.twin.site.data_files import find
 
-SHOWN_PLACES = 4
 _set_option = click.option(
     "--set",
     "settings",
@@ -72,7 +72,7 @@ def import_command(
     if not as_json:
         for repair in result.repairs:
             stderr.print(f"repaired: {repair}", soft_wrap=True, markup=False)
-        _show(result.losses)
+        show_losses(result.losses)
     _refuse_losses(result.losses, strict)
     written: list[str] = []
     if out is not None:
@@ -115,7 +115,7 @@ def export_command(
     check_settings(chosen, row.export_settings, row)
     result = exporter(row)(load_profile(find("devices", profile, extra=profiles)), chosen)
     if not as_json:
-        _show(result.losses)
+        show_losses(result.losses)
     _refuse_losses(result.losses, strict)
     if out is not None:
         write_bytes(out, result.content)
@@ -145,17 +145,6 @@ def formats_command(as_json: bool) -> int:
         table.add_row(row.name, row.suffix, *directions, row.extra or "-", f"{row.title}: {row.holds}", settings)
     stdout.print(table)
     return 0
-
-
-def _show(losses: Iterable[Loss]) -> None:
-    """Print the losses on stderr; those with the same property and reason in one line, with the first places."""
-    together: dict[tuple[bool, str, str], list[str]] = {}
-    for loss in losses:
-        together.setdefault((loss.note, loss.what, loss.why), []).append(loss.place)
-    for (note, what, why), places in together.items():
-        more = f" and {len(places) - SHOWN_PLACES} more" if len(places) > SHOWN_PLACES else ""
-        label = "not converted" if note else "lost"
-        stderr.print(f"{label}: {what} ({', '.join(places[:SHOWN_PLACES])}{more}): {why}", soft_wrap=True, markup=False)
 
 
 def _refuse_losses(losses: tuple[Loss, ...], strict: bool) -> None:

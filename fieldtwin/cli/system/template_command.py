@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.system.template_aasx import from_aasx_command, to_aasx_command
 from fieldtwin.cli.template_question import ask_about, code_of
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
@@ -44,6 +45,10 @@ def command() -> None:
     A template has the system file, profiles, EDS files, control logic, recordings, the digital model, the version and hash of
     the control software, and documents. `fieldtwin run T.zip --prototype` needs no other file.
     """
+
+
+command.add_command(to_aasx_command)
+command.add_command(from_aasx_command)
 
 
 @command.command("pack")

@@ -13,6 +13,7 @@ from typing import Any
 
 from fieldtwin.descriptions.conversion import Loss
 from fieldtwin.descriptions.maps.rendering import Abilities, descriptions, exported, shorten, stated_endpoint
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.profile import INTEGER_RANGES, DeviceProfile, Table, Tag
 
@@ -48,7 +49,12 @@ def base_uri(profile: DeviceProfile, endpoint: str, losses: list[Loss]) -> str:
     found, _ = stated_endpoint(profile, endpoint, losses)
     if found.scheme != "tcp":
         raise UsageError(f"{endpoint} cannot be exported", expected="tcp: (the binding has Modbus TCP only)")
-    return f"modbus+tcp://{found.host}:{found.port}/{profile.form.factory.unit}/"
+    return unit_uri(found, profile.form.factory.unit)
+
+
+def unit_uri(endpoint: Endpoint, unit: int) -> str:
+    """Return the URI of a unit ID at an endpoint of Modbus TCP, with a slash at its end."""
+    return f"modbus+tcp://{endpoint.host}:{endpoint.port}/{unit}/"
 
 
 def properties(

@@ -19,8 +19,8 @@ from fieldtwin.gateway.core.files.profile_schema import ProfileForm, TagForm
 
 PROFILES = Path(__file__).parents[3] / "profiles" / "devices"
 FORMATS: list[tuple[str, dict[str, str]]] = [
-    ("telegraf", {"style": "request"}), ("telegraf", {"style": "register"}), ("home_assistant", {}), ("thingsboard", {}),
-    ("neuron", {}), ("wot", {}),
+    ("maps.telegraf", {"style": "request"}), ("maps.telegraf", {"style": "register"}), ("maps.home_assistant", {}),
+    ("maps.thingsboard", {}), ("maps.neuron", {}), ("maps.wot", {}), ("aas.aid", {}),
 ]  # fmt: skip
 SHIPPED = [
     path for path in sorted(PROFILES.glob("*.yaml")) if load_profile(path).protocol == "modbus"
@@ -36,7 +36,7 @@ LOST_WITH = {
 def exported_and_imported(
     name: str, options: dict[str, str], profile: DeviceProfile
 ) -> tuple[Exported, DeviceProfile | None]:
-    module = import_module(f"fieldtwin.descriptions.maps.{name}")
+    module = import_module(f"fieldtwin.descriptions.{name}")
     out = module.export_description(profile, options)
     if all(any(loss.place == f"tag {tag}" and loss.what == "the tag" for loss in out.losses) for tag in profile.tags):
         return out, None
@@ -167,7 +167,7 @@ def test_generated_profile_returns_from_each_format(name: str, options: dict[str
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_flow_of_node_red_requests_the_registers_of_the_profile(path: Path) -> None:
     profile = load_profile(path)
-    out, back = exported_and_imported("node_red", {}, profile)
+    out, back = exported_and_imported("maps.node_red", {}, profile)
     assert back is not None
     lost = {loss.place for loss in out.losses if loss.what == "the tag"}
     expected = {

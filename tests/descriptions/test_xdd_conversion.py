@@ -217,3 +217,39 @@ def test_every_text_can_be_written(name: str, remark: str) -> None:
     changed = replace(first, name=name, values=(replace(first.values[0], name=name, remark=remark),))
     again, _, _ = read_xdd(write_xdd(replace(node, objects=(changed,)), name, 0), Path("x.xdd"))
     assert [v.index for v in again.values()] == [first.index]
+
+
+ORDER = [
+    "label",
+    "description",
+    "type",
+    "denotation",
+    "actualValue",
+    "defaultValue",
+    "substituteValue",
+    "allowedValues",
+    "unit",
+]
+"""The elements of a parameter in the order of the schema (CiA 311 1.1, A.1.3), with `type` for the one of its data type."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exported_elements_have_the_order_of_the_schema(name: str) -> None:
+    root = read_xml(write_xdd(node_of(name), "x.xdd", 0, xdc=True), "x.xdc")
+    for parameter in root.all("parameter"):
+        places = [ORDER.index(each.name if each.name in ORDER else "type") for each in parameter.children]
+        assert places == sorted(places)
+        assert ORDER.index("type") in places
+    body = [each.name for each in next(root.all("ProfileBody")).children]
+    assert body in (["DeviceIdentity", "DeviceManager", "DeviceFunction"], [*body[:3], "ApplicationProcess"])
+
+
+def test_exported_file_has_the_elements_and_attributes_that_the_schema_requires() -> None:
+    node = replace(node_of("io-cia401"), bitrate_kbit=None)
+    root = read_xml(write_xdd(node, "x.xdc", 0, xdc=True), "x.xdc")
+    characteristic = next(root.all("characteristic"))
+    assert [each.name for each in characteristic.children] == ["characteristicName", "characteristicContent"]
+    commissioning = next(root.all("deviceCommissioning"))
+    required = {"nodeID", "nodeName", "actualBaudRate", "networkNumber", "networkName", "CANopenManager"}
+    assert set(commissioning.attributes) == required
+    assert read_xdd(write_xdd(node, "x.xdc", 0, xdc=True), Path("x.xdc"))[0].bitrate_kbit is None

@@ -112,12 +112,20 @@ def _device_profile(body: ET.Element, node: NodeDescription) -> None:
         },
     )
     ET.SubElement(body, "DeviceManager")
-    ET.SubElement(body, "DeviceFunction")
+    _capabilities(ET.SubElement(body, "DeviceFunction"), device.get("ProductName", ""))
     described = [value for value in node.values() if _has_parameter(value)]
     if described:
         listed = ET.SubElement(ET.SubElement(body, "ApplicationProcess"), "parameterList")
         for value in described:
             _parameter(listed, value)
+
+
+def _capabilities(function: ET.Element, product: str) -> None:
+    """Add the one characteristic that the schema of CiA 311 1.1 requires (A.1.3): the name of the product."""
+    listed = ET.SubElement(ET.SubElement(function, "capabilities"), "characteristicsList")
+    characteristic = ET.SubElement(listed, "characteristic")
+    _label(ET.SubElement(characteristic, "characteristicName"), "Product name")
+    _label(ET.SubElement(characteristic, "characteristicContent"), product)
 
 
 def _has_parameter(value: NodeValue) -> bool:
@@ -126,7 +134,10 @@ def _has_parameter(value: NodeValue) -> bool:
 
 
 def _parameter(listed: ET.Element, value: NodeValue) -> None:
-    """Add the parameter of a value: engineering value = raw value x multiplier + offset."""
+    """Add the parameter of a value: engineering value = raw value x multiplier + offset.
+
+    The order of its elements is that of the schema (CiA 311 1.1, A.1.3).
+    """
     attributes = {"uniqueID": _unique_id(value), "access": _ACCESS[value.access]}
     attributes |= {"multiplier": value.factor} if value.factor else {}
     attributes |= {"offset": value.offset} if value.offset else {}
@@ -135,14 +146,14 @@ def _parameter(listed: ET.Element, value: NodeValue) -> None:
     if value.remark:
         ET.SubElement(parameter, "description", {"lang": "en"}).text = printable_xml(value.remark)
     ET.SubElement(parameter, _TYPES[DataType(value.type_code)])
-    if value.unit:
-        _label(ET.SubElement(parameter, "unit", {"multiplier": "1"}), value.unit)
     if value.default:
         ET.SubElement(parameter, "defaultValue", {"value": printable_xml(value.default)})
     if value.names:
         allowed = ET.SubElement(parameter, "allowedValues")
         for number, name in value.names:
             _label(ET.SubElement(allowed, "value", {"value": str(number)}), name)
+    if value.unit:
+        _label(ET.SubElement(parameter, "unit", {"multiplier": "1"}), value.unit)
 
 
 def _label(parent: ET.Element, text: str) -> None:
@@ -179,10 +190,9 @@ def _network_profile(body: ET.Element, node: NodeDescription, *, xdc: bool) -> N
     master = node.device.get("SimpleBootUpMaster", "0") not in ("0", "")
     ET.SubElement(management, "CANopenMasterFeatures", {"bootUpMaster": _truth(master)})
     if xdc:
+        actual = "" if node.bitrate_kbit is None else f"{node.bitrate_kbit} Kbps"  # the attribute is required
         commissioning = {"nodeID": str(node.node_id or 1), "nodeName": printable_xml(node.node_name)}
-        if node.bitrate_kbit is not None:
-            commissioning["actualBaudRate"] = f"{node.bitrate_kbit} Kbps"
-        commissioning |= {"networkNumber": "1", "networkName": "", "CANopenManager": "false"}
+        commissioning |= {"actualBaudRate": actual, "networkNumber": "1", "networkName": "", "CANopenManager": "false"}
         ET.SubElement(management, "deviceCommissioning", commissioning)
 
 

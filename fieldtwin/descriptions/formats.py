@@ -53,9 +53,7 @@ _ONE_DEVICE = {
     "select": "the device, if the file has several: its name, unit ID, or NAME/UNIT",
 }
 _ENDPOINT = {"endpoint": "endpoint of the device, such as tcp://192.168.0.7 or rtu:/dev/ttyUSB0"}
-_NUMBERING = {
-    "numbering": "addresses without zeroBasedAddressing: sent, one (from 1) or printed (40001); default: by the addresses"
-}
+_NUMBERING = {"numbering": "addresses without zeroBasedAddressing: true: sent, one (from 1) or printed (40001)"}
 
 FORMATS: dict[str, Format] = {
     row.name: row

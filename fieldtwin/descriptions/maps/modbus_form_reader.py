@@ -1,9 +1,9 @@
 """Read properties and forms of the W3C's Modbus binding (`fieldtwin.descriptions.maps.modbus_forms`) as tags.
 
-Two things are often left unstated. Without ``modv:zeroBasedAddressing: true`` the binding counts from 1, while its examples
-have numbers with the digit of the table (40001), and Eclipse's node-wot sends each number unchanged. The setting
-``numbering`` decides, otherwise the addresses of the file do, and a loss states the result. With ``modv:mostSignificantByte:
-false`` alone, a value of several registers is little-endian (DCBA), as in the binding's example.
+Published files often leave two things unstated. Without ``modv:zeroBasedAddressing: true`` the binding counts from 1, while its
+examples have numbers with the digit of the table (40001), and Eclipse's node-wot sends each number unchanged: the setting
+``numbering`` decides. With ``modv:mostSignificantByte: false`` alone, a value of several registers is little-endian (DCBA), as in
+the binding's example.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def import_properties(
         for name in document.mapping(thing.get(kind) or {}, (*loc, kind), f"`{kind}`"):
             draft.lose(f"{kind[:-1]} {name}", "the interaction", f"a profile has no {kind}")
     forms = [form for form in forms if form.unit == units[index]]
-    numbering = _numbering(forms, settings.get("numbering", ""), draft)
+    numbering = _numbering(document, forms, settings.get("numbering", ""))
     for form in forms:
         _add(document, form, numbering, draft)
     return draft.imported()
@@ -177,23 +177,25 @@ def _access(schema: Mapping[str, Any], terms: Mapping[str, Any], states_access: 
     return reads or not writes, writes
 
 
-def _numbering(forms: Sequence[ModbusForm], stated: str, draft: Draft) -> str:
-    """Return how the forms without ``modv:zeroBasedAddressing: true`` write addresses: one of `NUMBERINGS`."""
+def _numbering(document: Document, forms: Sequence[ModbusForm], stated: str) -> str:
+    """Return how the forms without ``modv:zeroBasedAddressing: true`` write addresses: one of `NUMBERINGS`.
+
+    Raises `UsageError` if neither the file nor the user states it. A guess would read other registers: the binding counts from 1,
+    and Eclipse's elevator, a published test thing, answers to 40001 on the wire.
+    """
     if stated:
         if stated not in NUMBERINGS:
             raise UsageError(f"cannot use --set numbering={stated}", expected=", ".join(NUMBERINGS))
         return stated
-    open_forms = [form for form in forms if form.terms.get("zeroBasedAddressing") is not True]
-    if not open_forms:
+    unstated = [form for form in forms if form.terms.get("zeroBasedAddressing") is not True]
+    if not unstated or any(form.number == 0 for form in unstated):
         return "sent"
-    if any(form.number == 0 for form in open_forms):
-        found, why = "sent", "one of them is 0, so they were taken as sent"
-    elif all(_printed(form) is not None for form in open_forms):
-        found, why = "printed", "all begin with the digit of their table, which was removed"
-    else:
-        found, why = "one", "they were taken as numbers from 1, the binding's default"
-    draft.lose("the forms", "certainty of the addresses", f"`modv:zeroBasedAddressing` is not true; {why}")
-    return found
+    raise UsageError(
+        f"{document.path}: the forms do not state `modv:zeroBasedAddressing: true`",
+        expected="--set numbering=sent (the numbers are sent, as by node-wot), one (they count from 1, the binding's default) "
+        "or printed (40001 is the first holding register)",
+        got=f"the address {unstated[0].number} of {unstated[0].name!r}",
+    )
 
 
 def _printed(form: ModbusForm) -> int | None:

@@ -101,25 +101,31 @@ def test_export_to_another_transport_than_modbus_tcp_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("numbers", "setting", "addresses", "reason"),
+    ("numbers", "setting", "addresses"),
     [
-        (("0", "7"), "", (0, 7), "one of them is 0"),
-        (("1", "7"), "", (0, 6), "numbers from 1"),
-        (("40001", "40008"), "", (0, 7), "the digit of their table"),
-        (("400001", "465536"), "", (0, 65535), "the digit of their table"),
-        (("40001", "7"), "", (40000, 6), "numbers from 1"),
-        (("40001", "40008"), "one", (40000, 40007), ""),
-        (("40001", "40008"), "sent", (40001, 40008), ""),
+        (("0", "7"), {}, (0, 7)),
+        (("1", "7"), {"numbering": "one"}, (0, 6)),
+        (("40001", "40008"), {"numbering": "printed"}, (0, 7)),
+        (("400001", "465536"), {"numbering": "printed"}, (0, 65535)),
+        (("40001", "40008"), {"numbering": "one"}, (40000, 40007)),
+        (("40001", "40008"), {"numbering": "sent"}, (40001, 40008)),
     ],
 )
 def test_addresses_without_zero_based_addressing(
-    numbers: tuple[str, str], setting: str, addresses: tuple[int, int], reason: str
+    numbers: tuple[str, str], setting: dict[str, str], addresses: tuple[int, int]
 ) -> None:
     thing = of(*({"href": number, "modv:entity": "HoldingRegister"} for number in numbers), type="integer")
-    found = imported(thing, **({"numbering": setting} if setting else {}))
+    found = imported(thing, **setting)
     assert [each.at for each in found.profile.tags.values()] == [f"holding:{address}" for address in addresses]
-    why = [loss.why for loss in found.losses if loss.what == "certainty of the addresses"]
-    assert (reason in why[0]) if reason else not why
+
+
+@pytest.mark.parametrize("number", ["1", "40001"])
+def test_addresses_whose_numbering_is_not_stated_are_not_guessed(number: str) -> None:
+    thing = of({"href": number, "modv:entity": "HoldingRegister"}, type="integer")
+    with pytest.raises(UsageError, match="--set numbering=sent"):
+        imported(thing)
+    with pytest.raises(UsageError, match="expected sent, one, printed"):
+        imported(thing, numbering="zero")
 
 
 @pytest.mark.parametrize(
@@ -191,7 +197,7 @@ def test_forms_for_reading_and_for_writing_are_one_tag() -> None:
         {"href": "/1/2", "op": "writeproperty", "modv:function": "writeSingleCoil"},
         {"href": "https://192.0.2.7/run"},
     )
-    found = imported(of(*forms, type="boolean"))
+    found = imported(of(*forms, type="boolean"), numbering="sent")
     assert {name: each.access for name, each in found.profile.tags.items()} == {"x": "rw"}
     assert ("property x", "https is not Modbus") in {(loss.place, loss.why) for loss in found.losses}
 
@@ -218,7 +224,7 @@ def test_unit_is_selected_if_the_thing_has_several() -> None:
     thing = of({"href": "/1/2", "modv:entity": "Coil"}, {"href": "/7/2", "modv:entity": "Coil"}, type="boolean")
     with pytest.raises(UsageError, match="acme/1, acme/7"):
         imported(thing)
-    assert imported(thing, select="7").profile.factory.unit == 7
+    assert imported(thing, select="7", numbering="sent").profile.factory.unit == 7
 
 
 @pytest.mark.parametrize(

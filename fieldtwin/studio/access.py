@@ -33,7 +33,8 @@ FORGET_FAILURES_S = 60.0
 MOST_ADDRESSES = 1_000
 
 NO_TOKEN = (
-    "a token is required: in the header `Authorization: Bearer TOKEN`, or in the address that `fieldtwin studio` prints"
+    "a token is required, in the header `Authorization: Bearer TOKEN`; a browser gets it with the address that "
+    "`fieldtwin studio` prints"
 )
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; connect-src 'self'; "

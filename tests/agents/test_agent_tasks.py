@@ -95,10 +95,12 @@ async def reproduces_a_bad_value_and_finds_its_cause(one: Agent) -> None:
 
 
 async def sees_the_fault_in_the_history(one: Agent) -> None:
-    history = await one.data("get_history", instance="agent-shed", tag=TAG)
-    qualities = [change[2] for change in history["changes"]]
-    assert "bad" in qualities
-    assert qualities[-1] == "good"
+    async def is_complete() -> bool:
+        changes = (await one.data("get_history", instance="agent-shed", tag=TAG))["changes"]
+        qualities = [quality for _, _, quality, _ in changes]
+        return "bad" in qualities and qualities[-1] == "good"
+
+    await until(is_complete)
 
 
 async def sets_a_value_in_a_simulated_device(one: Agent) -> None:

@@ -11,6 +11,7 @@ from selenium import webdriver
 from selenium.common.exceptions import (
     ElementClickInterceptedException,
     ElementNotInteractableException,
+    JavascriptException,
     NoSuchElementException,
     StaleElementReferenceException,
 )
@@ -28,6 +29,7 @@ WIDE, TABLET = (1280, 720), (800, 1100)
 _REDRAWN = (
     ElementClickInterceptedException,
     ElementNotInteractableException,
+    JavascriptException,  # the page was left meanwhile
     NoSuchElementException,
     StaleElementReferenceException,
 )
@@ -37,6 +39,11 @@ _VISIBLE = """
 const visible = (css) => [...document.querySelectorAll(css)].filter(
   (e) => e.getClientRects().length && e.checkVisibility({opacityProperty: true, visibilityProperty: true}));
 const text = (e) => (e.innerText ?? e.textContent).trim();
+"""
+_STEADY = """
+const [element, answer] = arguments, place = () => { const r = element.getBoundingClientRect(); return `${r.x} ${r.y}`; };
+const before = place(), frame = requestAnimationFrame;
+frame(() => frame(() => answer(!element.disabled && place() === before)));
 """
 T = TypeVar("T")
 
@@ -54,6 +61,14 @@ class Window:
         """Return the visible elements whose text contains `text`."""
         source = _VISIBLE + "return visible(arguments[0]).filter(e => text(e).includes(arguments[1]))"
         return list(self.script(source, css, text))
+
+    def usable(self, css: str, text: str) -> WebElement | None:
+        """Return the first of these elements if it is enabled and stays at its place for two frames of the display.
+
+        The browser ignores a click on a disabled button, and a click where a moving element was reaches another element.
+        """
+        found = self.elements(css, text)
+        return found[0] if found and self.driver.execute_async_script(_STEADY, found[0]) else None
 
     def text(self, css: str) -> str:
         """Return the visible text of all elements that match. Without such an element the text is empty."""
@@ -104,9 +119,9 @@ class Window:
     def _act(self, css: str, text: str, action: Callable[[WebElement], Any]) -> None:
         def attempt() -> bool:
             try:
-                found = self.elements(css, text)
+                found = self.usable(css, text)
                 if found:
-                    action(found[0])
+                    action(found)
             except _REDRAWN:
                 return False
             return bool(found)

@@ -21,6 +21,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
 
 ROWS = [row for row in load() if row.answers_only]
+ONE_OF_EACH_CASE = list({row.id.split()[0] if row.id.startswith("CO-") else row.id: row for row in ROWS}.values())
+"""The rows for the kernel. It only carries frames, and all rows run on the bus in virtual time."""
 VCAN0 = Endpoint.parse("can:socketcan/vcan0")
 
 
@@ -98,8 +100,17 @@ def test_rows_on_the_software_bus_over_tcp() -> None:
     run(main(), timeout_s=50)
 
 
+def test_the_rows_for_the_kernel_have_every_kind_of_frame() -> None:
+    def kinds(rows: list[Row]) -> set[tuple[bool, bool, int]]:
+        frames = [parse_frame(text) for row in rows for _, text in row.hear + row.say if not text.startswith("!")]
+        return {(frame.extended, frame.remote, frame.dlc) for frame in frames}
+
+    assert kinds(ONE_OF_EACH_CASE) == kinds(ROWS)
+    assert len(kinds(ROWS)) > 8, "lengths 0 to 8, and remote frames"
+
+
 @pytest.mark.socketcan
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.id)
+@pytest.mark.parametrize("row", ONE_OF_EACH_CASE, ids=lambda row: row.id)
 def test_rows_on_a_kernel_can_interface(row: Row) -> None:
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()

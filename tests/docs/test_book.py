@@ -39,19 +39,16 @@ def test_links_are_those_of_the_book():
     assert beside == {"docs/pictures/picture.svg": "pictures/picture.svg"}
 
 
-def test_every_page_is_in_one_table_of_contents(tmp_path):
-    book.stage(tmp_path)
+def test_every_page_is_in_one_table_of_contents(staged):
     listed = []
-    for page in tmp_path.rglob("*.md"):
+    for page in staged.rglob("*.md"):
         for entries in re.findall(
             r"^```{toctree}\n(?::[^\n]*\n)*\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
         ):
             listed += [
-                (page.parent / f"{entry}.md").resolve().relative_to(tmp_path.resolve()) for entry in entries.split()
+                (page.parent / f"{entry}.md").resolve().relative_to(staged.resolve()) for entry in entries.split()
             ]
-    pages = [
-        page.relative_to(tmp_path) for page in tmp_path.rglob("*.md") if "files" not in page.relative_to(tmp_path).parts
-    ]
+    pages = [page.relative_to(staged) for page in staged.rglob("*.md") if "files" not in page.relative_to(staged).parts]
     assert sorted(listed) == sorted(page for page in pages if page.as_posix() != "index.md")
 
 
@@ -85,18 +82,16 @@ def test_a_class_that_there_is_not_is_named():
         )
 
 
-def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(tmp_path):
-    book.stage(tmp_path / "source")
+def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(staged):
     assert set(form_pages.KINDS) == set(SCHEMAS)
-    commands = (tmp_path / "source/reference/cli.md").read_text("utf-8")
+    commands = (staged / "reference/cli.md").read_text("utf-8")
     assert all(f"## fieldtwin {name}\n" in commands for name in COMMANDS)
-    faults = (tmp_path / "source/reference/faults.md").read_text("utf-8")
+    faults = (staged / "reference/faults.md").read_text("utf-8")
     assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
 
 
-def test_every_explanation_has_an_anchor_of_its_own(tmp_path):
-    book.stage(tmp_path / "source")
-    page = (tmp_path / "source/reference/explanations.md").read_text("utf-8")
+def test_every_explanation_has_an_anchor_of_its_own(staged):
+    page = (staged / "reference/explanations.md").read_text("utf-8")
     anchors = re.findall(r"^\((.+)\)=$", page, re.MULTILINE)
     assert len(anchors) == len(set(anchors)) == len(explain_page.described())
     assert {

@@ -16,7 +16,6 @@ from page_runner import ROOT
 sys.path.insert(0, str(ROOT / "docs" / "book"))
 
 import league
-import stage as book
 
 from fieldtwin.book import case_page, case_url
 from fieldtwin.cli.main import cli
@@ -29,13 +28,6 @@ from fieldtwin.results.model import Report
 
 IDS = sorted({case.id for _, _, cases in LISTS for case in cases})
 LOCK = tomllib.loads((ROOT / "scripts/league.toml").read_text("utf-8"))
-
-
-@pytest.fixture(scope="module")
-def staged(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("book") / "source"
-    book.stage(folder)
-    return folder
 
 
 def test_every_case_has_a_page_with_its_anchor_and_a_row_in_the_index(staged: Path):

@@ -301,7 +301,18 @@ def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) 
         known = re.findall(r"'([^']*)'", str(error["ctx"]["expected"]))
         hint = did_you_mean(str(error["input"]), known)
         return file.error(loc, name, expected=" or ".join(known), got=got, hint=hint)
+    if error["type"] == "string_pattern_mismatch" and (example := _example_of_text(model, error["loc"])):
+        return file.error(loc, f"{name} does not have the required form", expected=f"text such as {example}", got=got)
     return file.error(loc, f"{name}: {error['msg'].removeprefix('Value error, ')}", got=got)
+
+
+def _example_of_text(model: type[BaseModel], loc: tuple[int | str, ...]) -> str:
+    """Return the first example of a text, or of a text in a list of texts; an empty text if its form states none."""
+    at = len(loc) - 1 - isinstance(loc[-1], int)
+    info = _model_at(model, loc[:at]).model_fields.get(str(loc[at]))
+    example = (info.examples or [""])[0] if info is not None else ""
+    example = example[0] if isinstance(example, list) else example
+    return example if isinstance(example, str) else ""
 
 
 def _inside(loc: tuple[Key, ...]) -> str:

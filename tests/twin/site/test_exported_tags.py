@@ -107,3 +107,11 @@ def test_a_tag_that_becomes_secret_needs_a_restart(tmp_path: Path) -> None:
     assert [(c.what, c.live) for c in changes if not c.live] == [("metrics", False)]
     changes = compare(before, loaded(tmp_path, '["tank.level"]'))
     assert [c.live for c in changes] == [False]
+
+
+def test_a_text_without_a_device_names_the_form(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid) as error:
+        loaded(tmp_path, "[level]")
+    assert "metrics.tags.0 does not have the required form; expected text such as meter.*; got 'level'" in str(
+        error.value
+    )

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import click
 
+from fieldtwin.cli.default_group import DefaultGroup
 from fieldtwin.cli.main import COMMANDS, cli
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.site.compose.service import WrongWord
@@ -25,11 +26,15 @@ def wrong_words(words: Sequence[str]) -> Iterator[WrongWord]:
     at = 0
     while isinstance(command, click.Group) and at < len(words) and not words[at].startswith("-"):
         inner = command.get_command(context, words[at])
+        if inner is None and isinstance(command, DefaultGroup):
+            break
         if inner is None:
             known = command.list_commands(context)
             yield WrongWord(at, f"no command {words[at]!r}", hint=did_you_mean(words[at], known))
             return
         command, context, at = inner, click.Context(inner, info_name=words[at], parent=context), at + 1
+    if isinstance(command, DefaultGroup):
+        command = command.default
     yield from _wrong_arguments(command, context, words, at)
 
 
@@ -75,6 +80,8 @@ def _index_of(words: Sequence[str], at: int, error: click.UsageError, value: str
 def variables_of(command: str) -> list[str]:
     """Return the environment variables of a command's options; an unknown command has none."""
     inner = cli.get_command(click.Context(cli), command) if command in COMMANDS else None
+    if isinstance(inner, DefaultGroup):
+        inner = inner.default
     if inner is None:
         return []
     return [f"FIELDTWIN_{command}_{param.name}".upper().replace("-", "_") for param in inner.params]

@@ -91,7 +91,10 @@ COMMANDS = {
     ),
     "compare": ("fieldtwin.cli.recordings.compare_command", "Compare a device, or a recording, with a recording."),
     "import": ("fieldtwin.cli.recordings.import_command", "Convert files of other programs to recordings."),
-    "export": ("fieldtwin.cli.recordings.export_command", "Convert recordings to CSV, Parquet, candump logs or pcap."),
+    "export": (
+        "fieldtwin.cli.recordings.export_group",
+        "Convert recordings to CSV, Parquet, candump logs or pcap; pack a prototype as an FMU.",
+    ),
     "what-if": (
         "fieldtwin.cli.twin.what_if_command",
         "Simulate the effect of a plan from the present state.",

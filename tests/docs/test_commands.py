@@ -13,6 +13,7 @@ import pytest
 import yaml
 from page_runner import ROOT
 
+from fieldtwin.cli.default_group import DefaultGroup
 from fieldtwin.cli.main import COMMANDS, cli
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
@@ -64,9 +65,13 @@ def unknown(words: list[str]) -> str:
         name = words.pop(0)
         choices = name.split("|") if "|" in name else [name.rstrip(",.")]
         below = [command.get_command(context, choice) for choice in choices]
+        if None in below and isinstance(command, DefaultGroup):
+            below = [command.default]
         if None in below:
             return f"no command {name!r}"
         command = below[0]
+    if isinstance(command, DefaultGroup):
+        command = command.default
     options = {
         option
         for parameter in command.get_params(context)

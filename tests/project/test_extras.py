@@ -25,7 +25,9 @@ from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
 from fieldtwin.northbound.process_config import require_packages
+from fieldtwin.run.fmu_export.packing import ExportOptions, export_fmu
 from fieldtwin.run.processes import event_loop as loops
+from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import twin_carrier
@@ -69,6 +71,12 @@ def use_fmi(folder: Path) -> None:
     describe(folder / "tank.fmu")
 
 
+def use_fmi_export(folder: Path) -> None:
+    system = load_system(str(CHECKOUT / "examples/tank-fmu/tank.yaml"))
+    prototype = load_prototype(system, CHECKOUT / "examples/tank-fmu/drive.prototype.yaml")
+    export_fmu(system, prototype, folder / "x.fmu", ExportOptions())
+
+
 def use_dbc(folder: Path) -> None:
     export_description(load_profile(CHECKOUT / "profiles/devices/io-cia401.yaml"), {})
 
@@ -78,28 +86,30 @@ def use_aas(folder: Path) -> None:
 
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
-    "opcua": ("asyncua", use_opcua, ""),
-    "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
+    "aiomqtt": ("mqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
+    "asyncua": ("opcua", use_opcua, ""),
+    "asyncpg": ("postgres", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "mcp": ("mcp", use_mcp, "fieldtwin.agents.mcp_server"),
-    "plot": ("matplotlib", use_plot, ""),
-    "fmi": ("fmpy", use_fmi, ""),
-    "parquet": ("pyarrow", use_parquet, ""),
+    "matplotlib": ("plot", use_plot, ""),
+    "fmpy": ("fmi", use_fmi, ""),
+    "pythonfmu": ("fmi", use_fmi_export, ""),
+    "pyarrow": ("parquet", use_parquet, ""),
     "mcap": ("mcap", use_mcap, ""),
-    "dbc": ("cantools", use_dbc, ""),
-    "aas": ("basyx", use_aas, ""),
+    "cantools": ("dbc", use_dbc, ""),
+    "basyx": ("aas", use_aas, ""),
 }
 
 DISTRIBUTIONS = {"basyx": "basyx-python-sdk"}
 """The distribution of each package whose name differs."""
 
 
-@pytest.mark.parametrize("extra", list(USES))
+@pytest.mark.parametrize("package", list(USES))
 def test_a_missing_extra_is_reported_with_its_package(
-    extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package, use, ours = USES[extra]
-    assert [re.split("[ ><=]", wanted)[0] for wanted in EXTRAS[extra]] == [DISTRIBUTIONS.get(package, package)]
+    extra, use, ours = USES[package]
+    wanted = [re.split("[ ><=]", one)[0] for one in EXTRAS[extra]]
+    assert wanted == [DISTRIBUTIONS.get(one, one) for one, (of, _, _) in USES.items() if of == extra]
     if ours:
         monkeypatch.delitem(sys.modules, ours, raising=False)
         parent, _, name = ours.rpartition(".")
@@ -130,4 +140,4 @@ def test_every_extra_is_on_the_page_and_the_rest_is_there_without() -> None:
     table = page[page.index("| extra |") :]
     assert re.findall(r"^\| `([a-z]+)` \|", table.split("\n\n")[0], re.M) == sorted(EXTRAS, key=table.index)
     named = {re.split("[ ><=;]", wanted)[0] for wanted in PROJECT["dependencies"]}
-    assert named.isdisjoint(package for package, _, _ in USES.values())
+    assert named.isdisjoint(USES)

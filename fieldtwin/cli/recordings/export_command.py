@@ -1,4 +1,4 @@
-"""`fieldtwin export`: convert recordings for other programs."""
+"""`fieldtwin export recording`, the default of `fieldtwin export`: convert recordings for other programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fieldtwin.twin.site.data_files import find
 _UNITS = {".pcap": "packets", ".pcapng": "packets", ".mcap": "messages"}
 
 
-@click.command("export")
+@click.command("recording", context_settings={"auto_envvar_prefix": "FIELDTWIN_EXPORT"})
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(

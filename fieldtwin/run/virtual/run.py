@@ -201,8 +201,12 @@ class VirtualRun:
             await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
             self.elapsed_s = bench.now_s()
             judge()
-            loop.stop()  # interrupt the loop to report progress
-            await asyncio.sleep(0)
+            await self.pause(loop)
+
+    async def pause(self, loop: VirtualLoop) -> None:
+        """Interrupt the loop, so that `progress` is called."""
+        loop.stop()
+        await asyncio.sleep(0)
 
     def _ended(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
         error = None if main.cancelled() else main.exception()

@@ -162,6 +162,12 @@ class NetworkBench:
             found += [replace(one, on=f"{member}.{one.on}") for one in await part.bench.struck()]
         return found
 
+    async def failures(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for member, part in self.parts.items():
+            found |= {f"{member}.{device}": why for device, why in (await part.bench.failures()).items()}
+        return found
+
     async def clear(self, id: str) -> None:
         where = self._where.pop(id, None)
         if where is None:

@@ -162,6 +162,10 @@ class Bench(Protocol):
         """Inject a fault, which is described as in a fault file: `id`, `name`, its target and its parameters."""
         ...
 
+    async def failures(self) -> dict[str, str]:
+        """Return the emulated devices that fell silent because their simulation has failed, with the error."""
+        ...
+
     async def clear(self, id: str) -> None:
         """End the fault with this id."""
         ...

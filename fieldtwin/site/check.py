@@ -202,7 +202,9 @@ class _Site:
         before = len(self._errors.errors)
         prototype = load_prototype(system, path, self._errors)
         if len(self._errors.errors) == before:
-            simulations = Simulations(prototype.file, prototype.form, system, 0)
+            simulations = Simulations(
+                prototype.file, prototype.form, system, 0, lambda name, error: None
+            )  # takes no step
             for device in prototype.devices.values():
                 if device.form.simulation is not None:
                     simulations.signals_of(device.name, device.form, device.profile)

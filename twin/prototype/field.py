@@ -6,6 +6,7 @@ of that bus. This module connects the emulators to the system file; it does not 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -120,6 +121,9 @@ class FieldSimulator:
         self.signals: dict[str, Signals] = {}
         """The signals that give devices their values, by device name."""
         self.faults = FieldFaults(system, prototype.seed, clock)
+        self.failures: dict[str, str] = {}
+        """The devices that fell silent because their simulation has failed, with the error."""
+        self._is_open = False
         self._run_dir = run_dir
         self._clock = clock
         self._ports = ports or OsPorts()
@@ -136,13 +140,20 @@ class FieldSimulator:
         """
         try:
             self._simulations = Simulations(
-                self.prototype.file, self.prototype.form, self.system, self._clock.monotonic_ns()
+                self.prototype.file,
+                self.prototype.form,
+                self.system,
+                self._clock.monotonic_ns(),
+                self._simulation_failed,
             )
             self._to_close.callback(self._simulations.close)
             for bus in self.prototype.buses.values():
                 if bus.listen is not None:
                     await self._open_bus(bus, bus.listen)
             self._simulations.connect({name: device.journal for name, device in self.devices.items()})
+            for name in self.failures:  # of a simulation that has failed while devices were being made
+                self.faults.silence(name)
+            self._is_open = True
             for device in self.devices.values():
                 device.journal.keep(share_of(len(self.devices)))
         except BaseException:
@@ -166,6 +177,15 @@ class FieldSimulator:
     def end_simulations(self) -> None:
         """End the processes of simulations, of devices that are not served any more."""
         self._to_close.close()
+
+    def _simulation_failed(self, simulation: str, error: FileInvalid) -> None:
+        """Make the devices of a failed simulation silent. Its last values must not be read as current ones."""
+        forms = self.prototype.form.devices
+        for name in [name for name in self.system.devices if name in forms and forms[name].simulation == simulation]:
+            self.failures[name] = str(error)
+            if self._is_open:
+                self.faults.silence(name)
+            print(f"{name} is silent from now on: {error}", file=sys.stderr, flush=True)
 
     async def join(self, bus: str, name: str) -> CanConnection:
         """Join an emulated CAN bus as a passive listener. The caller closes the connection."""
@@ -367,6 +387,7 @@ class FieldSimulator:
             },
             buses=self._host.can_stats(),
             set=self.faults.values_set(),
+            failures=dict(self.failures),
         )
 
     def held_since(self, numbers: dict[str, int]) -> dict[str, list[tuple[int, str, str, int]]]:

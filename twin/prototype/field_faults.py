@@ -110,6 +110,11 @@ class FieldFaults:
         self.history.add(active, spec.aim.device or at.bus)
         return spec.id
 
+    def silence(self, device: str) -> None:
+        """Let no frame from or to `device` pass, from now on and including a reply that is being made."""
+        on_can = self._system.buses[self._system.devices[device].bus].endpoint.is_can
+        self.inject({"name": "lost-frame" if on_can else "drop", "device": device, "id": f"failed {device}"})
+
     def _put(self, spec: FaultSpec, active: Active, bus: str) -> None:
         if isinstance(active.fault, ValueFault):
             found = self._distortions.get(spec.aim.device)

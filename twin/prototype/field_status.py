@@ -102,3 +102,5 @@ class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     set: dict[str, float] = {}
     """The values that were set by hand or by a test, by DEVICE.TAG."""
     lease: LeaseStatus = LeaseStatus()
+    failures: dict[str, str] = {}
+    """The devices that fell silent because their simulation has failed, with the error."""

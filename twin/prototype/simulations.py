@@ -18,7 +18,7 @@ from fieldtwin.emulators.simulation.python_model import PythonModel
 from fieldtwin.emulators.simulation.signals import SimulatedSignals
 from fieldtwin.emulators.simulation.simulation import Simulation, Step, by_formulas, by_model
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
@@ -147,11 +147,20 @@ def _python(file: YamlFile, text: str) -> tuple[Path, str]:
 class Simulations:
     """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that fails.
 
-    An FMU runs from the first step until `close`.
+    An FMU runs from the first step until `close`, or until it fails: then `on_failure` is called once with the name of the
+    simulation and the error, and the simulation keeps the values of the step before.
     """
 
-    def __init__(self, file: YamlFile, form: PrototypeForm, system: System, start_ns: int) -> None:
+    def __init__(
+        self,
+        file: YamlFile,
+        form: PrototypeForm,
+        system: System,
+        start_ns: int,
+        on_failure: Callable[[str, FileInvalid], None],
+    ) -> None:
         self._file, self._form, self._system = file, form, system
+        self._on_failure = on_failure
         self._fmus: list[FmuProcess] = []
         self._made = {name: self._make(name, simulation, start_ns) for name, simulation in form.simulations.items()}
 
@@ -162,13 +171,33 @@ class Simulations:
             binding = bind_fmu(self._file, form, name)
             fmu = fmu_process(name, form, binding)
             self._fmus.append(fmu)
-            step, start = fmu.step, dict.fromkeys(binding.outputs, math.nan)  # the first step reads the outputs
+            step = self._until_failure(name, fmu)
+            start = dict.fromkeys(binding.outputs, math.nan)  # the first step reads the outputs
         elif form.python is not None:
             step, start = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
         else:
             step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
         of_time = any(uses_time(text) for text in form.formulas.values())
         return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS), of_time)
+
+    def _until_failure(self, name: str, fmu: FmuProcess) -> Step:
+        """Return the step of an FMU, which changes nothing from its first failure on.
+
+        A failed initialization is raised: the devices would have no values.
+        """
+
+        def step(t_s: float, dt_s: float, values: Mapping[str, float]) -> Mapping[str, float]:
+            if fmu.failure is not None and t_s > 0:
+                return {}
+            try:
+                return fmu.step(t_s, dt_s, values)
+            except FileInvalid as e:
+                if dt_s <= 0:
+                    raise
+                self._on_failure(name, e)
+                return {}
+
+        return step
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
         """Return the signals that give `device` its values: those that its entry names, else every value of the simulation that

@@ -9,13 +9,10 @@ from __future__ import annotations
 import math
 import os
 import select
-import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import msgspec
 
@@ -28,6 +25,7 @@ from fieldtwin.emulators.simulation.fmu.messages import (
     receive,
     send,
 )
+from fieldtwin.emulators.simulation.fmu.unpacked_folder import UnpackedFolder
 from fieldtwin.emulators.virtual.seal import unsealed
 from fieldtwin.gateway.core.errors import FileInvalid
 
@@ -62,14 +60,15 @@ class FmuProcess:
         self._limit_ms = limit_ms
         self._launch = launch
         self._process: subprocess.Popen[bytes] | None = None
-        self._folder = ""
+        self._folder: UnpackedFolder | None = None
         self._to = self._from = -1
-        self._failure: FileInvalid | None = None
+        self.failure: FileInvalid | None = None
+        """The error after which the FMU does no further step."""
 
     def step(self, t_s: float, dt_s: float, values: Mapping[str, float]) -> dict[str, float]:
         """Return the outputs at `t_s`, `dt_s` after the previous step. Raises `FileInvalid`, then at every further step."""
-        if self._failure is not None:
-            raise self._failure
+        if self.failure is not None:
+            raise self.failure
         try:
             if self._process is None:
                 self._start()
@@ -77,7 +76,7 @@ class FmuProcess:
             found = self._ask(FmuStep(t_s - dt_s, dt_s, inputs), self._limit_ms, f"the step to {t_s:g} s")
             return self._checked(t_s, found)
         except FileInvalid as e:
-            self._failure = e
+            self.failure = e
             self.close()
             raise
 
@@ -91,17 +90,17 @@ class FmuProcess:
                 if end >= 0:
                     os.close(end)
             self._to = self._from = -1
-            if self._folder:
-                shutil.rmtree(self._folder, ignore_errors=True)
-                self._folder = ""
-            if self._failure is None:
-                self._failure = FileInvalid("the simulation has ended", path=str(self._binding.fmu.path))
+            if self._folder is not None:
+                self._folder.remove()
+                self._folder = None
+            if self.failure is None:
+                self.failure = FileInvalid("the simulation has ended", path=str(self._binding.fmu.path))
 
     def _start(self) -> None:
         fmu, variables = self._binding.fmu, self._binding.fmu.variables
         with unsealed():
-            self._folder = tempfile.mkdtemp(prefix="fieldtwin-fmu-")
-            unpack(fmu.path, Path(self._folder))
+            self._folder = UnpackedFolder()
+            unpack(fmu.path, self._folder.path)
             theirs_read, self._to = os.pipe()
             self._from, theirs_write = os.pipe()
             try:
@@ -119,7 +118,7 @@ class FmuProcess:
                 os.close(theirs_read)
                 os.close(theirs_write)
         load = FmuLoad(
-            folder=self._folder,
+            folder=str(self._folder.path),
             fmi=fmu.fmi,
             identifier=fmu.identifier,
             token=fmu.token,

@@ -351,6 +351,11 @@ class ControlBench(AsyncResource):
         told = msgspec.convert((await self._to_field("get"))["struck"], list[StruckStatus])
         return [struck_of(one) for one in told if one.number in self._fault_numbers]
 
+    async def failures(self) -> dict[str, str]:
+        if self._field is None:
+            return {}
+        return msgspec.convert((await self._to_field("get")).get("failures", {}), dict[str, str])
+
     async def clear(self, id: str) -> None:
         await self._to_field("clear", id=id)
         self._note(TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})

@@ -258,6 +258,9 @@ class VirtualBench(AsyncResource):
     async def struck(self) -> list[Struck]:
         return [struck_of(one) for one in self.run.field.faults.history.struck()]
 
+    async def failures(self) -> dict[str, str]:
+        return dict(self.run.field.failures)
+
     async def clear(self, id: str) -> None:
         self.run.field.faults.clear(id)
         self.note(TraceKind.FAULT, id, {"name": "", "on": False, "target": ""})

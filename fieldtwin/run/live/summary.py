@@ -89,7 +89,10 @@ def summarise(run: RunFacts) -> dict[str, Any]:
     if gateway is not None:
         checks += _refusal_checks(gateway.refusals, run.may_refuse, disturbed=disturbed)
     seen = msgspec.to_builtins(gateway) if gateway is not None else {}
-    errors = [*run.errors, *run.invariant_errors, *checks]
+    failures = (
+        dict.fromkeys(field.failures.values()) if field is not None else ()
+    )  # one simulation may have many devices
+    errors = [*run.errors, *failures, *run.invariant_errors, *checks]
     return {
         "fieldtwin": __version__,
         "system": run.system.name,

@@ -169,13 +169,24 @@ class ScenarioRunner:
             return Verdict.ERROR, str(e)
 
     async def _count_faults(self, verdict: Verdict, reason: str) -> tuple[Verdict, str]:
-        """Count the effects of each fault. A scenario that passed although a fault never took effect is INCONCLUSIVE."""
+        """Count the effects of each fault. A scenario that passed although a fault never took effect is INCONCLUSIVE.
+
+        A scenario in which a simulation of devices has failed is an ERROR: a test of a lost device would pass although the
+        plant model is broken.
+        """
         try:
+            failures = await self.bench.failures()
             struck = await self.bench.struck()
             self.faults = [one for one in struck if not one.is_set]
         except FieldtwinError as e:
             self.results.append(gone(e, self._now_ns()))
             return (Verdict.ERROR, str(e)) if verdict is Verdict.PASSED else (verdict, reason)
+        for device, why in failures.items():
+            text = f"the simulation of {device} runs"
+            now_ns = self._now_ns()
+            self.results.append(CheckResult(f"simulation {device}", text, Verdict.ERROR, now_ns, now_ns, text, why))
+        if failures:
+            return Verdict.ERROR, next(iter(failures.values()))
         for result, why in without_effect(self.scenario, struck, self._now_ns()):
             self.results.append(result)
             if verdict is Verdict.PASSED and self._by_chance is None:

@@ -134,7 +134,9 @@ def ticks(process: int) -> int:
     return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11])
 
 
-def test_it_ends_with_its_parent_in_the_middle_of_an_endless_step(tmp_path: Path) -> None:
+def test_it_ends_with_its_parent_in_the_middle_of_an_endless_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = build_fmu(tmp_path / "tank.fmu", fails="endless")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)}
     parent = subprocess.Popen(
@@ -154,3 +156,14 @@ def test_it_ends_with_its_parent_in_the_middle_of_an_endless_step(tmp_path: Path
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(ended, signal.SIGKILL)
         os.close(ended)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    [left] = tmp_path.glob("fieldtwin-fmu-*")
+    running, next_one = started(path), started(path)
+    running.step(0.0, 0.0, {})
+    assert not left.exists(), "the folder of the killed process is removed"
+    [of_running] = tmp_path.glob("fieldtwin-fmu-*")
+    next_one.step(0.0, 0.0, {})
+    assert of_running.exists(), "the folder of a running process is not removed"
+    running.close()
+    next_one.close()
+    assert not list(tmp_path.glob("fieldtwin-fmu-*"))

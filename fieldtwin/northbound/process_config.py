@@ -13,9 +13,17 @@ from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 from fieldtwin.twin.site.serving import SeparateServer
 from fieldtwin.twin.site.system import System
 
-PACKAGES = {"opcua": ("opcua", ("asyncua",)), "http": ("studio", ("starlette", "uvicorn", "websockets"))}
+PACKAGES = {
+    "opcua": ("opcua", ("asyncua",)),
+    "http": ("studio", ("starlette", "uvicorn", "websockets")),
+    "mqtt": ("mqtt", ("aiomqtt",)),
+}
 """By kind of server: the extra that it needs, and the packages of the extra."""
-MODULES = {"opcua": "fieldtwin.northbound.opcua.process", "http": "fieldtwin.studio.run_api.process"}
+MODULES = {
+    "opcua": "fieldtwin.northbound.opcua.process",
+    "http": "fieldtwin.studio.run_api.process",
+    "mqtt": "fieldtwin.northbound.mqtt.process",
+}
 """By kind of server: the module of its process."""
 
 
@@ -24,12 +32,14 @@ class ServerProcessConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
     `resolved` is the system as the run has read it (`fieldtwin.twin.site.resolved`), `server` the name of the server in its
     `serve` section. With `free_port` (a prototype) the operating system chooses the port.
+    `prototype` says that the run is a prototype, whose messages must not be taken for those of the plant.
     """
 
     resolved: str
     run_dir: str
     server: str
     free_port: bool
+    prototype: bool = False
 
 
 def server_of(system: System, config: ServerProcessConfig) -> SeparateServer:

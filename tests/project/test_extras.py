@@ -86,7 +86,7 @@ def use_aas(folder: Path) -> None:
 
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "aiomqtt": ("mqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
+    "aiomqtt": ("mqtt", use_mqtt, "fieldtwin.twin.thread.mqtt.session"),
     "asyncua": ("opcua", use_opcua, ""),
     "asyncpg": ("postgres", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "mcp": ("mcp", use_mcp, "fieldtwin.agents.mcp_server"),

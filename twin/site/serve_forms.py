@@ -12,7 +12,7 @@ from pydantic import Discriminator, Field, Tag
 
 from fieldtwin.twin.site.base_forms import Address, SiteModel, TagName
 
-KINDS = ("modbus", "opcua", "http")
+KINDS = ("modbus", "opcua", "http", "mqtt")
 """The kinds of servers. The first one is that of a server without `kind`."""
 
 
@@ -105,6 +105,45 @@ class HttpServeForm(SiteModel):
     clients: int = Field(default=32, ge=1, le=1000)
 
 
+class SparkplugForm(SiteModel):
+    """An edge node of Sparkplug B 3.0. The devices of the system are its devices."""
+
+    group: str = Field(min_length=1, max_length=200)
+    node: str | None = Field(default=None, min_length=1, max_length=200, description="default: the name of the system")
+    host: str | None = Field(
+        default=None, min_length=1, max_length=200,
+        description="the primary host application; nothing is published while it is offline",
+    )  # fmt: skip
+    writes: bool = Field(
+        default=False, description="pass commands (DCMD) for `writable` tags on to the gateway; default: refuse them"
+    )
+
+
+class JsonTopicsForm(SiteModel):
+    """A message in JSON for each tag, on topics by template."""
+
+    topic: str = Field(default="fieldtwin/{system}/{device}/{tag}", max_length=1000)
+    status: str = Field(default="fieldtwin/{system}/status", max_length=1000, description="`online` or `offline`")
+    retain: bool = Field(default=True, description="the broker keeps the latest message of each topic")
+    qos: Literal[0, 1, 2] = 1
+    publish: Literal["change", "interval"] = "change"
+    history: bool = Field(default=False, description="publish values of the time without a connection later")
+
+
+class MqttServeForm(SiteModel):
+    """Every tag as a message to an MQTT broker: Sparkplug B, or JSON on topics by template."""
+
+    kind: Literal["mqtt"]
+    url: str = Field(examples=["mqtt://127.0.0.1:1883"])
+    sparkplug: SparkplugForm | None = None
+    json_topics: JsonTopicsForm | None = Field(default=None, alias="json")
+    every_ms: int = Field(
+        default=1000, ge=10, le=3_600_000, description="interval at which the process image is read, ms"
+    )
+    buffer_samples: int = Field(default=10_000, ge=100, le=1_000_000, description="samples kept without a connection")
+    buffer_kb: int = Field(default=4096, ge=64, le=1_048_576, description="memory for these samples, KiB")
+
+
 def kind_of(section: Any) -> Any:
     """Return the kind that a server of the file states; that of a server without `kind` is `modbus`."""
     return section.get("kind", KINDS[0]) if isinstance(section, dict) else getattr(section, "kind", KINDS[0])
@@ -113,7 +152,8 @@ def kind_of(section: Any) -> Any:
 ServeForm = Annotated[
     Annotated[ModbusServeForm, Tag("modbus")]
     | Annotated[OpcuaServeForm, Tag("opcua")]
-    | Annotated[HttpServeForm, Tag("http")],
+    | Annotated[HttpServeForm, Tag("http")]
+    | Annotated[MqttServeForm, Tag("mqtt")],
     Discriminator(kind_of),
 ]
 """One server of the `serve` section."""

@@ -24,15 +24,25 @@ from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, 
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import AllowForm, BridgeForm
-from fieldtwin.twin.site.serve_forms import HttpServeForm, ModbusServeForm, OpcuaServeForm, ServedTagForm, ServeForm
+from fieldtwin.twin.site.serve_forms import (
+    HttpServeForm,
+    ModbusServeForm,
+    MqttServeForm,
+    OpcuaServeForm,
+    ServedTagForm,
+    ServeForm,
+)
 from fieldtwin.twin.site.servers.serving_http import HttpServeConfig, resolve_http
+from fieldtwin.twin.site.servers.serving_mqtt import MqttServeConfig, resolve_mqtt
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, resolve_opcua
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000
 WORDS = {"read": READ_FUNCTIONS, "write": WRITE_FUNCTIONS}
 
-SeparateServer = OpcuaServeConfig | HttpServeConfig
+ListeningServer = OpcuaServeConfig | HttpServeConfig
+"""A server that runs in a separate process and listens at an address of this computer."""
+SeparateServer = ListeningServer | MqttServeConfig
 """A server that runs in a separate process."""
 
 
@@ -47,10 +57,17 @@ class Serving:
     """The servers of kind `opcua`, each of which runs in a separate process."""
     http: tuple[HttpServeConfig, ...] = ()
     """The servers of kind `http`, each of which runs in a separate process."""
+    mqtt: tuple[MqttServeConfig, ...] = ()
+    """The servers of kind `mqtt`, each of which runs in a separate process."""
 
     @property
     def separate(self) -> tuple[SeparateServer, ...]:
         """Return the servers that run in separate processes."""
+        return *self.listening, *self.mqtt
+
+    @property
+    def listening(self) -> tuple[ListeningServer, ...]:
+        """Return the servers that listen in separate processes."""
         return *self.opcua, *self.http
 
     def for_run(self, *, allow_writes: bool, free_ports: bool, read_only: Collection[str] = ()) -> Serving:
@@ -64,12 +81,13 @@ class Serving:
             for b in self.bridges
         ]
         if not free_ports:
-            return Serving(self.serve, tuple(bridges), self.opcua, self.http)
+            return Serving(self.serve, tuple(bridges), self.opcua, self.http, self.mqtt)
         return Serving(
             tuple(replace(s, listen=_free(s.listen)) for s in self.serve),
             tuple(replace(b, listen=_free(b.listen)) for b in bridges),
             tuple(o.on_free_port() for o in self.opcua),
             tuple(h.on_free_port() for h in self.http),
+            self.mqtt,
         )
 
 
@@ -91,12 +109,15 @@ def resolve_serving(
     servers: list[ServeConfig] = []
     opcua: list[OpcuaServeConfig] = []
     http: list[HttpServeConfig] = []
+    mqtt: list[MqttServeConfig] = []
     for name, form in serve.items():
         with errors.collect():
             if isinstance(form, OpcuaServeForm):
                 opcua.append(resolve_opcua(file, name, form))
             elif isinstance(form, HttpServeForm):
                 http.append(resolve_http(file, name, form))
+            elif isinstance(form, MqttServeForm):
+                mqtt.append(resolve_mqtt(file, name, form))
             else:
                 servers.append(_server(file, name, form, devices, outputs, errors))
     bridges: list[BridgeConfig] = []
@@ -115,13 +136,13 @@ def resolve_serving(
         taken[str(listen)] = f"{section} {name!r}"
     fronts = [*(s.listen for s in servers), *(b.listen for b in bridges)]
     places = {(listen.host, listen.port): taken[str(listen)] for listen in fronts if str(listen) in taken}
-    separate: list[SeparateServer] = [*opcua, *http]
+    separate: list[ListeningServer] = [*opcua, *http]
     for server in separate:
         place = (server.host, server.port)
         if server.port and place in places:
             errors.add(file.error(("serve", server.name, "url"), f"{server.url} is taken by {places[place]}"))
         places[place] = f"serve {server.name!r}"
-    return Serving(tuple(servers), tuple(bridges), tuple(opcua), tuple(http))
+    return Serving(tuple(servers), tuple(bridges), tuple(opcua), tuple(http), tuple(mqtt))
 
 
 # -- serve ---------------------------------------------------------------------------------------------------------------

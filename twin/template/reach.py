@@ -36,8 +36,11 @@ def _reach(system: System, prototype: Prototype) -> Iterator[str]:
     for section, servers in (("serve", system.serving.serve), ("bridge", system.serving.bridges)):
         for server in servers:
             yield from _listening(server.listen, f"{section} {server.name}")
-    for separate in system.serving.separate:
+    for separate in system.serving.listening:
         yield from _reachable(separate.host, f"serve {separate.name}")
+    for mqtt in system.serving.mqtt:
+        if not _is_loopback(mqtt.broker.host):
+            yield f"it publishes the values of all tags at {mqtt.url} (serve {mqtt.name})"
 
 
 def _listening(at: Endpoint, what: str) -> Iterator[str]:

@@ -17,21 +17,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import Desync
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.store.event import Event, Value
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.frames import Ask, Data, Frame, FrameCodec, Hello, Schema
+from fieldtwin.twin.thread.mqtt.message import MqttMessage
 from fieldtwin.twin.thread.sparkplug_payloads import (
     BAD_QUALITY,
     GOOD_QUALITY,
     Metric,
     MetricType,
     Payload,
+    Property,
     decode_payload,
     encode_payload,
+    host_state,
     state_topic,
     topic,
     type_of,
@@ -59,22 +61,12 @@ def types_of(system: System) -> dict[str, MetricType]:
     return {f"{d.name}.{t.name}": kind(t) for d in system.devices.values() for t in d.profile.tags.values()}
 
 
-@dataclass(frozen=True, slots=True)
-class MqttMessage:
-    """A message to publish: `retain` for the state of a host, `qos` as Sparkplug requires."""
-
-    topic: str
-    payload: bytes
-    qos: int = 0
-    retain: bool = False
-
-
 def metric_of(event: Event, now_ms: int, types: Mapping[str, MetricType], aliases: Mapping[str, int]) -> Metric:
     """Return an event as a metric. The metric contains its type only if it differs from the announced one."""
     announced = types.get(event.name, MetricType.DOUBLE)
     needed = announced if event.value is None else type_of(event.value)
     alias = aliases.get(event.name)
-    properties: tuple[tuple[str, int], ...] = ()
+    properties: tuple[tuple[str, Property], ...] = ()
     judged = event.kind << 16 | event.quality << 8 | event.reason
     if judged:
         properties = (("Quality", BAD_QUALITY if event.quality else GOOD_QUALITY), (JUDGED, judged))
@@ -94,20 +86,12 @@ def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Map
     name = metric.name or names.get(-1 if metric.alias is None else metric.alias, "")
     if not name:
         raise Desync("a metric without a name", expected="an alias of the last birth", got=str(metric.alias))
-    judged = dict(metric.properties).get(JUDGED, 0)
+    held = dict(metric.properties).get(JUDGED, 0)
+    judged = held if isinstance(held, int) else 0
     value = metric.value
     if (metric.datatype or types.get(name)) in (MetricType.FLOAT, MetricType.DOUBLE) and isinstance(value, int):
         value = float(value)
     return Event(sequence, metric.t_ms, judged >> 16 & 7, name, value, judged >> 8 & 7, judged & 31)
-
-
-def _is_online(data: bytes) -> bool:
-    """Return whether a host reports that it is online. A payload that is not a Sparkplug 3 state counts as offline."""
-    try:
-        state = json.loads(data)
-    except ValueError:  # neither JSON nor UTF-8
-        return False
-    return isinstance(state, dict) and state.get("online") is True
 
 
 class _Side:
@@ -232,8 +216,8 @@ class EdgeNode(_Side):
         online. Raises `Desync`.
         """
         if where == self._state:
-            there = _is_online(data)
-            return Ask(self._tag) if there and self._tag else None
+            there = host_state(data)
+            return Ask(self._tag) if there is not None and there.online and self._tag else None
         metrics = decode_payload(data).metrics
         if any(m.name == REBIRTH and m.value for m in metrics):
             return Ask(self._tag) if self._tag else None

@@ -6,6 +6,7 @@ fields are skipped. This module uses no MQTT client and no clock.
 
 from __future__ import annotations
 
+import json
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
@@ -17,12 +18,13 @@ from fieldtwin.twin.thread.frames import Reader, varint
 NAMESPACE = "spBv1.0"
 MAX_PAYLOAD = 1 << 20
 MAX_METRICS = 10_000
-GOOD_QUALITY, BAD_QUALITY = 192, 0
+GOOD_QUALITY, BAD_QUALITY, STALE_QUALITY = 192, 0, 500
 """Values of the property `Quality` (6.4.18)."""
+Property = int | float | str
 
 
 class MetricType(IntEnum):
-    """Types of metrics (6.4.16) that a thread sends; it also reads the other integer types."""
+    """Types of metrics and properties (6.4.16)."""
 
     INT8, INT16, INT32, INT64 = 1, 2, 3, 4
     UINT8, UINT16, UINT32, UINT64 = 5, 6, 7, 8
@@ -31,13 +33,17 @@ class MetricType(IntEnum):
 
 
 _SIGNED = {MetricType.INT8: 32, MetricType.INT16: 32, MetricType.INT32: 32, MetricType.INT64: 64}
+_SHORT = frozenset(
+    (MetricType.INT8, MetricType.INT16, MetricType.INT32, MetricType.UINT8, MetricType.UINT16, MetricType.UINT32)
+)
+"""The types whose values are in `int_value`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
     """A metric. In data it has a name or an alias; `datatype` 0 means the type of the birth.
 
-    `properties` are integers by name.
+    With `typed` False the message does not contain the `datatype`, which only determines how the value is encoded.
     """
 
     name: str = ""
@@ -46,7 +52,8 @@ class Metric:
     datatype: int = 0
     value: Value = None
     historical: bool = False
-    properties: tuple[tuple[str, int], ...] = ()
+    properties: tuple[tuple[str, Property], ...] = ()
+    typed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +65,42 @@ class Payload:
     seq: int | None = None
 
 
-def topic(group: str, message: str, node: str) -> str:
-    """Return the topic of a message, such as ``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT would read
-    as a pattern."""
-    for part in (group, node):
+@dataclass(frozen=True, slots=True)
+class HostState:
+    """A state that a host application has published, with the time at which its session began (UTC, ms)."""
+
+    online: bool
+    t_ms: int
+
+
+def topic(group: str, message: str, node: str, device: str = "") -> str:
+    """Return the topic of a message, such as ``spBv1.0/GROUP/NDATA/NODE`` or, with a device, ``spBv1.0/GROUP/DDATA/NODE/DEVICE``.
+
+    Raises `UsageError` for a name that MQTT would read as a pattern.
+    """
+    names = (group, node, device) if device else (group, node)
+    for part in names:
         if not part or any(c in part for c in "+#/") or not part.isprintable():
             raise UsageError("a name in Sparkplug", expected="a word without + # /", got=repr(part))
-    return f"{NAMESPACE}/{group}/{message}/{node}"
+    return "/".join((NAMESPACE, group, message, *names[1:]))
 
 
 def state_topic(host: str) -> str:
     """Return the topic on which a host application reports whether it is online."""
     topic(host, "STATE", host)
     return f"{NAMESPACE}/STATE/{host}"
+
+
+def host_state(data: bytes) -> HostState | None:
+    """Return the state in a message of a host application, or None if the message is not a state of Sparkplug 3."""
+    try:
+        state = json.loads(data)
+    except (ValueError, RecursionError):  # neither JSON nor UTF-8
+        return None
+    if not isinstance(state, dict) or not isinstance(state.get("online"), bool):
+        return None
+    t_ms = state.get("timestamp")
+    return HostState(state["online"], t_ms) if isinstance(t_ms, int) and not isinstance(t_ms, bool) else None
 
 
 def type_of(value: Value) -> MetricType:
@@ -93,21 +123,35 @@ def _bytes(field: int, value: bytes) -> bytes:
     return varint(field << 3 | 2) + varint(len(value)) + value
 
 
-def _value(value: Value) -> bytes:
+def _value(value: Value, datatype: int) -> bytes:
+    """Encode the value of a metric in the field that belongs to its type, or to the type of the value if that is not known."""
     if value is None:
         return _number(7, 1)
+    if datatype == MetricType.BOOLEAN:
+        return _number(14, int(bool(value)))
     if isinstance(value, int):
-        return _number(11, value & 0xFFFF_FFFF_FFFF_FFFF)
+        return _number(10, value & 0xFFFF_FFFF) if datatype in _SHORT else _number(11, value & 0xFFFF_FFFF_FFFF_FFFF)
     if isinstance(value, float):
+        if datatype == MetricType.FLOAT:
+            return varint(12 << 3 | 5) + struct.pack("<f", value)
         return varint(13 << 3 | 1) + struct.pack("<d", value)
     return _bytes(16, value) if isinstance(value, bytes) else _bytes(15, value.encode())
 
 
-def _properties(properties: tuple[tuple[str, int], ...]) -> bytes:
+def _property(value: Property) -> bytes:
+    """Encode the value of a property: a 32-bit integer, a double or a text."""
+    if isinstance(value, int):
+        return _number(1, MetricType.INT32) + _number(3, value)
+    if isinstance(value, float):
+        return _number(1, MetricType.DOUBLE) + varint(6 << 3 | 1) + struct.pack("<d", value)
+    return _number(1, MetricType.STRING) + _bytes(8, value.encode())
+
+
+def _properties(properties: tuple[tuple[str, Property], ...]) -> bytes:
     if not properties:
         return b""
     keys = b"".join(_bytes(1, name.encode()) for name, _ in properties)
-    values = b"".join(_bytes(2, _number(1, MetricType.INT32) + _number(3, value)) for _, value in properties)
+    values = b"".join(_bytes(2, _property(value)) for _, value in properties)
     return _bytes(9, keys + values)
 
 
@@ -117,13 +161,11 @@ def encode_metric(metric: Metric) -> bytes:
     if metric.alias is not None:
         out += _number(2, metric.alias)
     out += _number(3, metric.t_ms)
-    if metric.datatype:
+    if metric.datatype and metric.typed:
         out += _number(4, metric.datatype)
     if metric.historical:
         out += _number(5, 1)
-    if metric.datatype == MetricType.BOOLEAN and metric.value is not None:
-        return out + _properties(metric.properties) + _number(14, int(bool(metric.value)))
-    return out + _properties(metric.properties) + _value(metric.value)
+    return out + _properties(metric.properties) + _value(metric.value, metric.datatype)
 
 
 def encode_payload(payload: Payload) -> bytes:
@@ -183,23 +225,32 @@ def _text(value: int | bytes) -> str:
         raise Desync("a text in a Sparkplug payload", expected="UTF-8") from e
 
 
-def _decode_properties(data: bytes) -> tuple[tuple[str, int], ...]:
+def _decode_properties(data: bytes) -> tuple[tuple[str, Property], ...]:
     keys: list[str] = []
-    values: list[int] = []
+    values: list[Property] = []
     for number, content in _fields(data):
         if number == 1:
             keys.append(_text(content))
         elif number == 2:
-            inner = dict(_fields(_raw(content)))
-            held = inner.get(3, inner.get(4, 0))
-            values.append(held if isinstance(held, int) else 0)
+            values.append(_decode_property(_raw(content)))
     return tuple(zip(keys, values, strict=False))
+
+
+def _decode_property(data: bytes) -> Property:
+    """Decode the value of a property. A property of a type that is not read here has the value 0."""
+    inner = dict(_fields(data))
+    if 6 in inner and len(_raw(inner[6])) == 8:
+        return float(struct.unpack("<d", _raw(inner[6]))[0])
+    if 8 in inner:
+        return _text(inner[8])
+    held = inner.get(3, inner.get(4, 0))
+    return held if isinstance(held, int) else 0
 
 
 def _decode_metric(data: bytes) -> Metric:
     name, alias, t_ms, datatype, historical, null = "", None, 0, 0, False, False
     value: Value = None
-    properties: tuple[tuple[str, int], ...] = ()
+    properties: tuple[tuple[str, Property], ...] = ()
     for number, content in _fields(data):
         if number == 1:
             name = _text(content)

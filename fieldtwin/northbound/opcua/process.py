@@ -17,10 +17,10 @@ from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreacha
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
 from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.northbound.opcua.samples import ImageSamples, TextSamples
 from fieldtwin.northbound.opcua.server import OpcuaServer
 from fieldtwin.northbound.opcua.write_channels import WriteChannels
 from fieldtwin.northbound.process_config import ServerProcessConfig, server_of
+from fieldtwin.northbound.samples import ImageSamples, TextSamples
 from fieldtwin.northbound.status_report import report_status
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main

@@ -20,7 +20,7 @@ from asyncua import ua
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, os_reason
-from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
 from fieldtwin.northbound.opcua.access.channels import checked_server
 from fieldtwin.northbound.opcua.access.trust import load_identity
@@ -28,10 +28,10 @@ from fieldtwin.northbound.opcua.access.users import Account
 from fieldtwin.northbound.opcua.address_space import Variables, build
 from fieldtwin.northbound.opcua.data_types import fitted
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
-from fieldtwin.northbound.opcua.samples import Sample
-from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode
+from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode, status_code
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
 from fieldtwin.northbound.opcua.writes import Call, TagWrites
+from fieldtwin.northbound.samples import Sample
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, application_uri, url_of
 from fieldtwin.twin.site.system import System
 
@@ -104,7 +104,7 @@ class OpcuaServer:
         self._nodes, self.variables = await build(server, self._system)
         self.writes = TagWrites(self._config.name, self._call, self.variables.data_types, self.variables.inputs)
         server.iserver.write_value = self._write_for_client
-        waiting = Sample(None, BAD_CODES[Reason.NEVER_READ], 0)
+        waiting = Sample(None, Quality.BAD, Reason.NEVER_READ, 0)
         for name in self.variables.data_types:
             await self._write(name, waiting)
 
@@ -183,7 +183,7 @@ class OpcuaServer:
     async def _write(self, name: str, sample: Sample) -> None:
         kind = self.variables.data_types[name]
         value = None if sample.value is None else fitted(sample.value, kind)
-        status = sample.status
+        status = status_code(sample.quality, sample.reason)
         if value is None and status.number < 0x8000_0000:  # the data type cannot hold the value
             status = BAD_CODES[Reason.OUT_OF_RANGE]
         await self._set(name, value, kind, status, sample.source_ns)

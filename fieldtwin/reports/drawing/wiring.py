@@ -155,6 +155,8 @@ def _servers(system: System, *, free_ports: bool) -> Iterator[Server]:
         yield Server(opcua.name, opcua.url, "every tag as a variable")
     for http in serving.http:
         yield Server(http.name, http.url, "the REST and WebSocket interface")
+    for mqtt in serving.mqtt:
+        yield Server(mqtt.name, mqtt.url, mqtt.place)
     for bridge in serving.bridges:
         reached = ", ".join(bus for bus in system.buses if bus in bridge.buses)
         yield Server(bridge.name, str(bridge.listen), f"units of {reached}")

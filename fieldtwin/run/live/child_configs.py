@@ -113,7 +113,9 @@ def gateway_config(
 def server_config(o: RunOptions, run_dir: Path, server: SeparateServer, resolved: str) -> ServerProcessConfig:
     """Return the configuration of the process of a server of tags."""
     free_port = o.prototype and not o.fixed_ports
-    return ServerProcessConfig(resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=free_port)
+    return ServerProcessConfig(
+        resolved=resolved, run_dir=str(run_dir), server=server.name, free_port=free_port, prototype=o.prototype
+    )
 
 
 def thread_config(

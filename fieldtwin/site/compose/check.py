@@ -169,7 +169,7 @@ class ComposeCheck:
         if service.words[0] == "run" and "--plant" in words:
             endpoints = [one.listen for one in system.serving.serve] + [one.listen for one in system.serving.bridges]
             listening |= {one.port for one in endpoints if not one.is_serial and one.host not in _INSIDE}
-            listening |= {one.port for one in system.serving.separate if one.host not in _INSIDE}
+            listening |= {one.port for one in system.serving.listening if one.host not in _INSIDE}
         elif service.words[0] == "emulate":
             listening |= self._ports_of_prototype(service, system, words)
         for port, text in service.ports.items():

@@ -12,8 +12,8 @@ from asyncua import Client, ua
 from fieldtwin.gateway.core.image.image import INPUTS, Image
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.northbound.opcua.samples import ImageSamples
 from fieldtwin.northbound.opcua.server import OpcuaServer
+from fieldtwin.northbound.samples import ImageSamples
 from fieldtwin.twin.plant.physical import attached, image_layout, make_image
 from fieldtwin.twin.site.system import System, load_system
 

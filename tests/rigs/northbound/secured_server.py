@@ -18,13 +18,13 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
 from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.northbound.opcua.access.files import create_certificate
 from fieldtwin.northbound.opcua.access.passwords import hash_of
 from fieldtwin.northbound.opcua.access.users import UserForm, Users
-from fieldtwin.northbound.opcua.samples import Sample
 from fieldtwin.northbound.opcua.server import OpcuaServer
-from fieldtwin.northbound.opcua.status_codes import GOOD
+from fieldtwin.northbound.samples import Sample
 from fieldtwin.twin.site.servers.serving_opcua import application_uri
 from fieldtwin.twin.site.system import load_system
 
@@ -102,7 +102,7 @@ def secured_server(folder: Path) -> Iterator[str]:
         server = OpcuaServer(replace(config, port=0), system, clock, _no_gateway, folder / "rejected")
         try:
             await server.build()
-            good = Sample(50.0, GOOD, clock.monotonic_ns())
+            good = Sample(50.0, Quality.GOOD, Reason.NONE, clock.monotonic_ns())
             await server.publish(server.variables.inputs, [("meter.frequency", good)])
             await server.listen()
             urls[0] = server.status().listening or ""

@@ -43,7 +43,7 @@ def test_every_loopback_address_is_accepted(tmp_path: Path, host: str) -> None:
 @pytest.mark.parametrize(
     ("server", "place", "text"),
     [
-        ('{kind: opcau, url: "opc.tcp://127.0.0.1:4840"}', "7:11", r"expected modbus or opcua or http; got 'opcau'"),
+        ('{kind: opcau, url: "opc.tcp://127.0.0.1:4840"}', "7:11", r"expected modbus or opcua or http or mqtt; got 'opcau'"),
         ("{kind: opcua}", "7:3", "the key 'url' is missing"),
         ('{kind: opcua, url: "opc.tcp://127.0.0.1:4840", tags: {}}', "7:57", "unknown key 'tags'"),
         ('{kind: opcua, url: "opc.tcp://127.0.0.1:1", every_ms: 5}', "7:54", "at least 10"),

@@ -13,7 +13,8 @@ from fieldtwin.gateway.core.errors import Desync, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind, Value
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from fieldtwin.twin.thread.sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, MqttMessage
+from fieldtwin.twin.thread.mqtt.message import MqttMessage
+from fieldtwin.twin.thread.sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication
 from fieldtwin.twin.thread.sparkplug_payloads import (
     Metric,
     MetricType,

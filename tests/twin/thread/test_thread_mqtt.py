@@ -15,7 +15,8 @@ from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.thread.link import Carrier, Unwelcome
-from fieldtwin.twin.thread.mqtt import Broker, MqttCarrier
+from fieldtwin.twin.thread.mqtt.session import Broker
+from fieldtwin.twin.thread.mqtt_carrier import MqttCarrier
 from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication
 from fieldtwin.twin.thread.sparkplug_payloads import decode_payload
 

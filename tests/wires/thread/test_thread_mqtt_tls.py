@@ -17,9 +17,9 @@ from thread_rig import Twin, equal, value
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.twin.thread import mqtt as thread_mqtt
 from fieldtwin.twin.thread.end import ThreadEnd
 from fieldtwin.twin.thread.link import Carrier, Unwelcome
+from fieldtwin.twin.thread.mqtt import session as mqtt_session
 from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 from fieldtwin.twin.thread.thread import schema_of
 
@@ -116,7 +116,7 @@ def test_a_client_that_the_broker_refuses_gets_the_reason(
             trusting_others = url(here, pki, "plant").replace(pki.ca, stranger.ca)
             assert "the broker's certificate is refused: " in await refused(trusting_others, "plant-word")
             # TLS 1.3: the client may send CONNECT before the broker refuses
-            monkeypatch.setattr(thread_mqtt, "TIMEOUT_S", 0.5)
+            monkeypatch.setattr(mqtt_session, "TIMEOUT_S", 0.5)
             with pytest.raises(Unreachable, match="the broker ends the connection: tlsv13 alert certificate required"):
                 await (await plant(url(here, pki, "plant", certificate=False))).open()
             with pytest.raises(Unreachable, match="it may require mqtts://"):
@@ -175,7 +175,7 @@ def test_a_forbidden_topic_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         server = await asyncio.start_server(denies, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         carrier = await plant(f"mqtt://127.0.0.1:{port}/sea/obs")
-        monkeypatch.setattr(thread_mqtt, "GOODBYE_S", 0.1)
+        monkeypatch.setattr(mqtt_session, "GOODBYE_S", 0.1)
         with pytest.raises(Unwelcome, match=r"denies the subscription to spBv1\.0/sea/NCMD/obs"):
             await carrier.open()
         server.close()

@@ -1,8 +1,8 @@
-"""The samples of the process image that an OPC UA client gets: value, status code and source time of each tag.
+"""The samples of the process image that a client gets: value, quality, reason and source time of each tag.
 
 The source time of a good value is the time at which the device's reply with it was complete. If a value turns bad or uncertain
-without a new reply, it is the time of the publication with which the gateway reported that (OPC 10000-4, 7.11.3), so that an
-archive of a client does not overwrite the last good value. All times are monotonic nanoseconds, as in the image.
+without a new reply, it is the time of the publication with which the gateway reported that (as in OPC 10000-4, 7.11.3), so that
+an archive of a client does not overwrite the last good value. All times are monotonic nanoseconds, as in the image.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from typing import Any, NamedTuple
 
 from fieldtwin.gateway.core.image.snapshot import Snapshot
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar
-from fieldtwin.northbound.opcua.status_codes import StatusCode, status_code
 
-_CODES = {(int(q), int(r)): status_code(q, r) for q in Quality for r in Reason}
 _GOOD, _BAD = int(Quality.GOOD), int(Quality.BAD)
+_MEANINGS = {(int(quality), int(reason)): (quality, reason) for quality in Quality for reason in Reason}
 _QUALITIES = {str(quality): int(quality) for quality in Quality}
 _REASONS = {str(reason): int(reason) for reason in Reason}
 
 
 class Sample(NamedTuple):
-    """A value of a tag. The value is None if its status is bad."""
+    """A value of a tag. The value is None if its quality is bad."""
 
     value: Scalar | None
-    status: StatusCode
+    quality: Quality
+    reason: Reason
     source_ns: int
 
 
@@ -45,15 +45,15 @@ class _TagState:
             return None
         value, quality, reason, t_ns = columns
         before, self.columns = self.columns, columns
-        status, last = _CODES[quality, reason], self.sample
+        meaning, last = _MEANINGS[quality, reason], self.sample
         if quality == _GOOD:
             source_ns = t_ns
-        elif last is None or status != last.status:
+        elif last is None or meaning != (last.quality, last.reason):
             is_new = before is not None and t_ns > before[3]
             source_ns = t_ns if is_new and quality != _BAD else max(noticed_ns, t_ns)
         else:
             source_ns = max(last.source_ns, t_ns)
-        sample = Sample(None if quality == _BAD else value, status, source_ns)
+        sample = Sample(None if quality == _BAD else value, *meaning, source_ns)
         if sample == last:
             return None
         self.sample = sample

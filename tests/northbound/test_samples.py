@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.image.image import Image, ImageLayout, RegionFlag, RegionLayout, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.northbound.opcua.samples import ImageSamples, Sample, TextSamples
-from fieldtwin.northbound.opcua.status_codes import GOOD, status_code
+from fieldtwin.northbound.samples import ImageSamples, Sample, TextSamples
 
 MS = 1_000_000
 LOST_NS = 1000 * MS
+GOOD = (Quality.GOOD, Reason.NONE)
 Publish = Callable[..., None]
 
 
@@ -57,38 +57,40 @@ def test_nothing_is_known_before_the_first_publication(image: Image) -> None:
 
 def test_a_good_value_has_the_time_of_its_reply(image: Image) -> None:
     setup = Setup(image)
-    assert setup.after(good(1.5, 90 * MS), 100 * MS) == [Sample(1.5, GOOD, 90 * MS)]
+    assert setup.after(good(1.5, 90 * MS), 100 * MS) == [Sample(1.5, *GOOD, 90 * MS)]
     assert setup.after(good(1.5, 90 * MS), 110 * MS) == []
-    assert setup.after(good(1.5, 190 * MS), 200 * MS) == [Sample(1.5, GOOD, 190 * MS)]
+    assert setup.after(good(1.5, 190 * MS), 200 * MS) == [Sample(1.5, *GOOD, 190 * MS)]
 
 
 def test_a_value_that_turns_bad_has_the_time_at_which_that_was_published(image: Image) -> None:
     setup = Setup(image)
     setup.after(good(1.5, 90 * MS), 100 * MS)
-    timeout = status_code(Quality.BAD, Reason.TIMEOUT)
-    assert setup.after(bad(1.5, Reason.TIMEOUT, 90 * MS), 300 * MS) == [Sample(None, timeout, 300 * MS)]
+    assert setup.after(bad(1.5, Reason.TIMEOUT, 90 * MS), 300 * MS) == [
+        Sample(None, Quality.BAD, Reason.TIMEOUT, 300 * MS)
+    ]
     assert setup.after(bad(1.5, Reason.TIMEOUT, 90 * MS), 310 * MS) == []
-    refused = status_code(Quality.BAD, Reason.REFUSED)
-    assert setup.after(bad(1.5, Reason.REFUSED, 90 * MS), 400 * MS) == [Sample(None, refused, 400 * MS)]
-    assert setup.after(good(2.5, 490 * MS), 500 * MS) == [Sample(2.5, GOOD, 490 * MS)]
+    assert setup.after(bad(1.5, Reason.REFUSED, 90 * MS), 400 * MS) == [
+        Sample(None, Quality.BAD, Reason.REFUSED, 400 * MS)
+    ]
+    assert setup.after(good(2.5, 490 * MS), 500 * MS) == [Sample(2.5, *GOOD, 490 * MS)]
 
 
 def test_values_are_bad_when_the_writer_dies_and_good_when_it_is_back(image: Image) -> None:
     setup = Setup(image)
     setup.after(good(1.5, 90 * MS), 100 * MS)
     assert setup.at(100 * MS + LOST_NS) == []
-    dead = status_code(Quality.BAD, Reason.GATEWAY_DEAD)
-    assert setup.at(101 * MS + LOST_NS) == [Sample(None, dead, 100 * MS + LOST_NS)]
+    assert setup.at(101 * MS + LOST_NS) == [Sample(None, Quality.BAD, Reason.GATEWAY_DEAD, 100 * MS + LOST_NS)]
     assert setup.at(500 * MS + LOST_NS) == []
     back = 600 * MS + LOST_NS
-    assert setup.after(good(1.5, back), back) == [Sample(1.5, GOOD, back)]
+    assert setup.after(good(1.5, back), back) == [Sample(1.5, *GOOD, back)]
 
 
 def test_values_are_out_of_service_while_the_writer_has_stopped_intentionally(image: Image) -> None:
     setup = Setup(image)
     setup.after(good(1.5, 90 * MS), 100 * MS)
-    stopped = status_code(Quality.BAD, Reason.NOT_OPERATIONAL)
-    assert setup.after(good(1.5, 90 * MS), 200 * MS, RegionFlag.STOPPED) == [Sample(None, stopped, 200 * MS)]
+    assert setup.after(good(1.5, 90 * MS), 200 * MS, RegionFlag.STOPPED) == [
+        Sample(None, Quality.BAD, Reason.NOT_OPERATIONAL, 200 * MS)
+    ]
 
 
 VALUES = st.builds(
@@ -116,11 +118,11 @@ def test_the_latest_sample_always_equals_the_image_and_times_of_bad_values_never
             now_ns = 100 + n
             latest = (setup.after(value, now_ns) or [latest])[-1]
             assert latest is not None
-            assert latest.status == status_code(value.quality, value.reason)
+            assert (latest.quality, latest.reason) == (value.quality, value.reason)
             assert latest.value == (None if value.quality is Quality.BAD else value.value)
             if value.quality is Quality.GOOD:
                 assert latest.source_ns == value.t_ns
-            elif before is not None and before.status == latest.status:
+            elif before is not None and before[1:3] == latest[1:3]:
                 assert latest.source_ns >= before.source_ns
             elif value.quality is Quality.BAD:
                 assert latest.source_ns == now_ns
@@ -129,9 +131,14 @@ def test_the_latest_sample_always_equals_the_image_and_times_of_bad_values_never
 def test_texts_follow_the_gateways_answers_and_are_bad_without_it() -> None:
     texts = TextSamples(["a.name", "a.raw"], ["a.raw"])
     answer: dict[str, Any] = {"a.name": ["SN-1", "good", "none", 5], "a.raw": ["00ff", "good", "none", 6]}
-    assert dict(texts.changes(answer, 9)) == {"a.name": Sample("SN-1", GOOD, 5), "a.raw": Sample(b"\x00\xff", GOOD, 6)}
+    assert dict(texts.changes(answer, 9)) == {
+        "a.name": Sample("SN-1", *GOOD, 5),
+        "a.raw": Sample(b"\x00\xff", *GOOD, 6),
+    }
     assert dict(texts.changes(answer, 19)) == {}
-    dead = status_code(Quality.BAD, Reason.GATEWAY_DEAD)
-    assert dict(texts.lost(29)) == {"a.name": Sample(None, dead, 29), "a.raw": Sample(None, dead, 29)}
+    assert dict(texts.lost(29)) == {
+        "a.name": Sample(None, Quality.BAD, Reason.GATEWAY_DEAD, 29),
+        "a.raw": Sample(None, Quality.BAD, Reason.GATEWAY_DEAD, 29),
+    }
     assert dict(texts.lost(39)) == {}
-    assert dict(texts.changes(answer, 49))["a.name"] == Sample("SN-1", GOOD, 5)
+    assert dict(texts.changes(answer, 49))["a.name"] == Sample("SN-1", *GOOD, 5)

@@ -1,0 +1,1 @@
+"""MQTT: the session with a broker and its messages (the extra `mqtt`)."""

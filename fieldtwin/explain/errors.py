@@ -11,6 +11,8 @@ _TODO: dict[type[e.FieldtwinError], str] = {
     e.UsageError: "Correct the command line. The text names what was expected, and often the nearest known word.",
     e.NotAllowed: "Decide whether it should be permitted: `writable:` and `limits:` in the system file, `--allow-writes` for a "
     "plant, `--allow` for tests.",
+    e.OutOfLimits: "Write a value inside the limits that the message names, or correct `limits:` or the type of the tag "
+    "in its profile.",
     e.FileInvalid: "Correct the file at the line and column that the message names. Each further error has its own line.",
     e.CommandListMismatch: "Use the profile that fits the device's firmware, so that both sides know the same commands.",
     e.Bug: "Please report it with the file that the message names: the fault is in fieldtwin.",

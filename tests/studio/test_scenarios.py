@@ -99,6 +99,14 @@ def lasted(server: Studio, tag: str, wanted: str, seconds: float) -> bool:
     )
 
 
+def held(server: Studio, tag: str, value: float, seconds: float) -> bool:
+    """Return whether a tag has had a value for so long: a recording samples four times a second."""
+    with server.client(VIEW) as client:
+        found = client.get(f"{NAME}/tags/{tag}/history").json()
+    since = points_since(found["points"], found["now_ns"] - int(seconds * 1e9))
+    return bool(since) and all(point[1] == value for point in since)
+
+
 def points_since(points: list[list[Any]], from_ns: int) -> list[list[Any]]:
     """Return the point that was valid at an instant, and the later ones."""
     before = [point for point in points if point[0] <= from_ns]

@@ -13,6 +13,7 @@ from fieldtwin.gateway.core.errors import (
     EndpointBusy,
     FieldtwinError,
     NotAllowed,
+    OutOfLimits,
     Unreachable,
     UsageError,
     WireError,
@@ -31,6 +32,7 @@ STATUS: tuple[tuple[type[FieldtwinError], int], ...] = (
     (NoTrace, 404),
     (CheckFailed, 409),
     (NotAllowed, 403),
+    (OutOfLimits, 403),  # named, because the error of another process has only its class's name
     (UsageError, 400),
     (EndpointBusy, 503),
     (Unreachable, 503),

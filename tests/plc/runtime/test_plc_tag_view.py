@@ -72,7 +72,8 @@ def test_every_tag_has_the_details_for_an_engineer(tmp_path: Path) -> None:
     rows = rig.rows(later_ms=2)
     assert rows["tank.level"] == {
         "tag": "tank.level", "side": "input", "kind": "real", "value": 1.5, "quality": "good", "reason": "none", "age_s": 0.008,
-        "time": "2023-11-14T22:13:19.992+00:00", "unit": "m", "words": {}, "limits": [0.0, 4.0], "forced": None, "seen": {},
+        "time": "2023-11-14T22:13:19.992+00:00", "unit": "m", "words": {}, "value_names": {}, "limits": [0.0, 4.0],
+        "forced": None, "seen": {},
     }  # fmt: skip
     pump = rows["pump.speed"]
     assert (pump["side"], pump["value"], pump["quality"], pump["age_s"]) == ("output", 900, "good", 0.002)

@@ -81,8 +81,15 @@ class ImageLayout:
 
     @property
     def digest(self) -> bytes:
-        """Return 32 bytes that differ between layouts, even if only names or units differ."""
-        text = json.dumps([FORMAT, self.describe()], sort_keys=True, separators=(",", ":"))
+        """Return 32 bytes that differ between layouts, even if only names of tags or units differ.
+
+        The names of values do not count: a reload changes them while both processes keep the image.
+        """
+        layout = self.describe()
+        for region in layout["regions"]:
+            for tag in region["tags"]:
+                tag.pop("value_names", None)
+        text = json.dumps([FORMAT, layout], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).digest()
 
     def describe(self) -> dict[str, Any]:

@@ -272,3 +272,15 @@ def test_released_memory_can_be_closed(readers: int, count: int) -> None:
     image.release()
     memory.release()
     backing.append(0)  # BufferError while any view exists
+
+
+def test_names_of_values_do_not_change_the_layout_because_a_reload_changes_them_while_the_image_stays() -> None:
+    """Defect: after a reload with new names, a gateway that was started again refused the image."""
+
+    def layout(unit: str, name: str) -> ImageLayout:
+        mode = TagSpec("p.mode", TagKind.INT, unit, value_names=((1, name),))
+        return ImageLayout((RegionLayout("inputs", (mode,)),))
+
+    assert layout("", "idle").digest == layout("", "ready").digest
+    assert layout("", "idle").digest != layout("m", "idle").digest
+    assert layout("", "idle").describe() != layout("", "ready").describe()

@@ -10,32 +10,31 @@ import asyncio
 import sys
 from pathlib import Path
 
-from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
-from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
 from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.following import Changes, ImageFollower, follow_texts
 from fieldtwin.northbound.mqtt.publication import WriteRequest
 from fieldtwin.northbound.mqtt.publications import publication_of
 from fieldtwin.northbound.mqtt.publisher import Publisher
 from fieldtwin.northbound.mqtt.served_tags import served_tags
 from fieldtwin.northbound.mqtt.session_numbers import SessionNumbers
 from fieldtwin.northbound.process_config import ServerProcessConfig, server_of
-from fieldtwin.northbound.samples import ImageSamples, Sample, TextSamples
+from fieldtwin.northbound.samples import Sample, TextSamples
 from fieldtwin.northbound.status_report import report_status
 from fieldtwin.northbound.utc_times import UtcTimes
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
-from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
+from fieldtwin.twin.plant.physical import attached, image_layout
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.servers.serving_mqtt import MqttServeConfig
 from fieldtwin.twin.site.system import System
 
-TEXTS_EVERY_NS = NS_PER_S // 2
 NOT_WRITABLE = RefusalCause.NOT_WRITABLE.value
 
 
@@ -74,7 +73,7 @@ class MqttProcess:
                     nursery.start(
                         report_status(self._run_dir, self._config.name, self.status, self._clock), "status reports"
                     ),
-                    nursery.start(self._follow_image(image.reader(INPUTS), image.reader(OUTPUTS)), "process image"),
+                    nursery.start(self._follow_image(image), "process image"),
                     nursery.start(self._follow_texts(), "texts"),
                     nursery.start(self._publisher.run(), "publisher"),
                 ]
@@ -106,41 +105,32 @@ class MqttProcess:
             kind="mqtt",
         )
 
-    async def _follow_image(self, inputs: RegionReader, outputs: RegionReader) -> None:
+    async def _follow_image(self, image: Image) -> None:
         of_devices = {tag.source: tag.name for tag in self._tags if tag.device and not tag.is_text}
         of_programs = {tag.source: tag.name for tag in self._tags if not tag.device}
-        tags = ImageSamples(of_devices, gateway_lost_ms(self._system) * NS_PER_MS, Reason.GATEWAY_DEAD)
-        plc = ImageSamples(of_programs, plc_lost_ms(self._system) * NS_PER_MS, Reason.HEARTBEAT_LOST)
-        every_ns = self._config.every_ms * NS_PER_MS
-        next_ns = self._clock.monotonic_ns()
-        while True:
+
+        async def publish(tags: Changes, variables: Changes, now_ns: int) -> None:
             self._times.follow()
-            now_ns = self._clock.monotonic_ns()
-            for source, sample in tags.changes(inputs.snapshot(), now_ns):
+            for source, sample in tags:
                 self._note(of_devices[source], sample, now_ns)
-            for source, sample in plc.changes(outputs.snapshot(), now_ns):
+            for source, sample in variables:
                 self._note(of_programs[source], sample, now_ns)
             self._publication.end_look()
             self._publisher.wake()
-            next_ns = max(next_ns + every_ns, now_ns)
-            await self._clock.sleep_until_ns(next_ns)
+
+        follower = ImageFollower(self._system, of_devices, of_programs, self._config.every_ms)
+        await follower.run(image, self._clock, publish)
 
     async def _follow_texts(self) -> None:
-        """Ask the gateway for all texts twice a second. They are bad while it does not answer."""
         names = {tag.source: tag.data_type for tag in self._tags if tag.is_text}
         texts = TextSamples(names, [name for name, kind in names.items() if kind == "ByteString"])
-        while names:
-            now_ns = self._clock.monotonic_ns()
-            try:
-                answer = await self._gateway.call("watch", since=None, names=texts.names)
-            except FieldtwinError:
-                changes = texts.lost(now_ns)
-            else:
-                changes = texts.changes(answer["tags"], answer["now_ns"])
+
+        async def publish(changes: Changes, now_ns: int) -> None:
             for name, sample in changes:
                 self._note(name, sample, now_ns)
             self._publisher.wake()
-            await self._clock.sleep_until_ns(now_ns + TEXTS_EVERY_NS)
+
+        await follow_texts(self._gateway, texts, self._clock, publish)
 
     def _note(self, name: str, sample: Sample, now_ns: int) -> None:
         self._publication.note(name, sample, self._times.ms(sample.source_ns or now_ns))

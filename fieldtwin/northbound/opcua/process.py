@@ -10,26 +10,25 @@ import asyncio
 import sys
 from pathlib import Path
 
-from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable
-from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader
-from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.following import Changes, ImageFollower, follow_texts
 from fieldtwin.northbound.opcua.server import OpcuaServer
 from fieldtwin.northbound.opcua.write_channels import WriteChannels
 from fieldtwin.northbound.process_config import ServerProcessConfig, server_of
-from fieldtwin.northbound.samples import ImageSamples, TextSamples
+from fieldtwin.northbound.samples import TextSamples
 from fieldtwin.northbound.status_report import report_status
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
-from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
+from fieldtwin.twin.plant.physical import attached, image_layout
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
 
-TEXTS_EVERY_NS = NS_PER_S // 2
 PERMISSIONS_EVERY_NS = NS_PER_S
 LISTEN_EVERY_S = 1.0
 """Pause in seconds before the server tries again to listen at an address that is taken."""
@@ -62,7 +61,7 @@ class OpcuaProcess:
                 nursery.start(
                     report_status(self._run_dir, self._config.name, self._server.status, self._clock), "status reports"
                 )
-                serving = nursery.start(self._serve(image.reader(INPUTS), image.reader(OUTPUTS)), "server")
+                serving = nursery.start(self._serve(image), "server")
                 stopping = asyncio.ensure_future(stop.wait())
                 await asyncio.wait([serving, stopping], return_when=asyncio.FIRST_COMPLETED)
                 stopping.cancel()
@@ -78,12 +77,13 @@ class OpcuaProcess:
         await self._writes.aclose()
         return 0
 
-    async def _serve(self, inputs: RegionReader, outputs: RegionReader) -> None:
+    async def _serve(self, image: Image) -> None:
         await self._server.build()
+        variables = self._server.variables
+        follower = ImageFollower(self._system, variables.inputs, variables.outputs, self._config.every_ms)
         async with Nursery() as nursery:
-            nursery.start(self._follow_image(inputs, outputs), "process image")
-            if self._server.variables.texts:
-                nursery.start(self._follow_texts(), "texts")
+            nursery.start(follower.run(image, self._clock, self._publish), "process image")
+            nursery.start(self._follow_texts(), "texts")
             if self._config.security is not None:
                 nursery.start(self._follow_permissions(), "tags that clients may write")
             nursery.start(self._listen(), "listener")
@@ -97,33 +97,15 @@ class OpcuaProcess:
                 self._server.error = str(e)
             await asyncio.sleep(LISTEN_EVERY_S)
 
-    async def _follow_image(self, inputs: RegionReader, outputs: RegionReader) -> None:
-        variables, server = self._server.variables, self._server
-        every_ns = self._config.every_ms * NS_PER_MS
-        tags = ImageSamples(variables.inputs, gateway_lost_ms(self._system) * NS_PER_MS, Reason.GATEWAY_DEAD)
-        plc = ImageSamples(variables.outputs, plc_lost_ms(self._system) * NS_PER_MS, Reason.HEARTBEAT_LOST)
-        next_ns = self._clock.monotonic_ns()
-        while True:
-            now_ns = self._clock.monotonic_ns()
-            await server.publish(variables.inputs, tags.changes(inputs.snapshot(), now_ns))
-            await server.publish(variables.outputs, plc.changes(outputs.snapshot(), now_ns))
-            next_ns = max(next_ns + every_ns, now_ns)
-            await self._clock.sleep_until_ns(next_ns)
+    async def _publish(self, tags: Changes, variables: Changes, now_ns: int) -> None:
+        await self._server.publish(self._server.variables.inputs, tags)
+        await self._server.publish(self._server.variables.outputs, variables)
 
     async def _follow_texts(self) -> None:
-        """Ask the gateway for all texts twice a second. They are bad while it does not answer."""
         server, names = self._server, {name: name for name in self._server.variables.texts}
         binary = [name for name in names if server.variables.data_types[name] == "ByteString"]
         texts = TextSamples(names, binary)
-        while True:
-            now_ns = self._clock.monotonic_ns()
-            try:
-                answer = await self._gateway.call("watch", since=None, names=texts.names)
-            except FieldtwinError:
-                await server.publish(names, texts.lost(now_ns))
-            else:
-                await server.publish(names, texts.changes(answer["tags"], answer["now_ns"]))
-            await self._clock.sleep_until_ns(now_ns + TEXTS_EVERY_NS)
+        await follow_texts(self._gateway, texts, self._clock, lambda changes, now_ns: server.publish(names, changes))
 
     async def _follow_permissions(self) -> None:
         """Ask the gateway once a second which tags clients may write, because a reload may change that."""

@@ -6,6 +6,7 @@ import json
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import paho.mqtt.client as paho
@@ -160,3 +161,52 @@ def test_the_end_of_the_run_is_the_death_of_the_node(hall: tuple[Fieldtwin, Mosq
     finally:
         client.disconnect()
         client.loop_stop()
+
+
+NUMBERS = {
+    "tank.yaml": """\
+device: mysite/tank
+source: "made for this test: numbers only"
+protocol: modbus
+tags:
+  level: {at: 30001, type: float32, unit: m, poll: fast}
+""",
+    "pump.yaml": """\
+fieldtwin: 1
+system: pump
+buses: {lan: {url: "tcp://192.0.2.1:502"}}
+devices: {tank: {profile: ./tank.yaml, bus: lan, unit: 1, poll: {fast: {every_ms: 100}}}}
+serve:
+  scada: {kind: mqtt, url: "mqtt://127.0.0.1:%(port)d", every_ms: 50, sparkplug: {group: plant}}
+""",
+    "pump.prototype.yaml": """\
+prototype_of: pump.yaml
+buses: {lan: {listen: "tcp://127.0.0.1:0"}}
+devices: {tank: {model: profile, values: {level: 1.5}}}
+""",
+}
+
+
+def test_a_system_without_texts_stays_connected(tmp_path: Path) -> None:
+    """Defect: the task for texts ended at once, and with it the process; the run started it again and again."""
+    with broker(tmp_path) as mosquitto, host(mosquitto.port, node="pump-prototype") as watching:
+        for name, text in NUMBERS.items():
+            (tmp_path / name).write_text(text.replace("%(port)d", str(mosquitto.port)), encoding="utf-8")
+        with fieldtwin(tmp_path, "run", str(tmp_path / "pump.yaml"), "--prototype") as run:
+            watching.until(lambda: watching.of("DBIRTH", "tank"), "the birth of the tank", WITHIN_S)
+            alias = births(watching, "tank")["level"].alias
+            field = run.control("pump", "field")
+            for level in (2.5, 3.5):
+                field("set", device="tank", tag="level", value=level)
+                watching.until(
+                    lambda level=level: [
+                        m
+                        for data in watching.of("DDATA", "tank")
+                        for m in data.payload.metrics
+                        if m.alias == alias and value_of(m) == level
+                    ],
+                    f"a level of {level} m",
+                    WITHIN_S,
+                )
+            assert (len(watching.of("NBIRTH")), watching.of("NDEATH")) == (1, [])
+    no_tracebacks(tmp_path)

@@ -17,9 +17,8 @@ from fieldtwin.agents.library import PROJECT, SCHEME
 from fieldtwin.agents.tool import Tool
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal, stop_signal
-from fieldtwin.studio.access import LOOPBACK, Access, AccessMiddleware, allowed_hosts
+from fieldtwin.studio.access import Access, AccessMiddleware, allowed_hosts
 from fieldtwin.studio.web_server import WebServer, listening_socket
-from fieldtwin.twin.site.servers.loopback import is_loopback
 
 INSTRUCTIONS = (
     "fieldtwin runs the control software of a plant (Modbus and CANopen devices, a gateway and a PLC) with emulated devices. "
@@ -103,8 +102,7 @@ async def serve_http(calls: Calls, place: HttpPlace, clock: Clock, ready: Callab
     """
     listener = listening_socket(place.host, place.port)
     port = listener.getsockname()[1]
-    names = {place.host, *place.names} | (set(LOOPBACK) if is_loopback(place.host) else set())
-    access = Access(allowed_hosts(names, port), operate=place.token)
+    access = Access(allowed_hosts(place.host, place.names, port), operate=place.token)
     app = agent_server(calls).streamable_http_app(
         streamable_http_path=PATH, max_request_body_size=MOST_BODY_BYTES, max_sessions=MOST_CONNECTIONS, host=""
     )  # without its own check of hosts, because `AccessMiddleware` checks host, origin and token

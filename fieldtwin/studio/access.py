@@ -22,6 +22,7 @@ from starlette.responses import JSONResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fieldtwin.northbound.token_file import LONGEST_TOKEN
+from fieldtwin.twin.site.servers.loopback import is_loopback
 
 COOKIE = "fieldtwin_studio"
 VIEW, OPERATE = "view", "operate"
@@ -148,10 +149,13 @@ class AccessMiddleware:
             self._failures.popitem(last=False)
 
 
-def allowed_hosts(names: Iterable[str], port: int) -> frozenset[str]:
-    """Return the ``Host`` headers of a server that is known under these names."""
+def allowed_hosts(host: str, names: Iterable[str], port: int) -> frozenset[str]:
+    """Return the ``Host`` headers of a server that listens at `host` and is known under `names` as well.
+
+    A server on loopback is known under all names of the loopback interface.
+    """
     found = set()
-    for name in names:
+    for name in {host, *names, *(LOOPBACK if is_loopback(host) else ())}:
         shown = f"[{name}]" if ":" in name else name.lower()
         found |= {f"{shown}:{port}"} | ({shown} if port in (80, 443) else set())
     return frozenset(found)

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.studio.access import LOOPBACK, Access, allowed_hosts, new_token
+from fieldtwin.studio.access import Access, allowed_hosts, new_token
 from fieldtwin.studio.app import STATIC, application
 from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.web_server import WebServer, listening_socket
@@ -94,9 +94,8 @@ async def serve(options: StudioOptions, on_ready: Callable[[Serving], None]) -> 
     options.check()
     listener = listening_socket(options.host, options.port, "--listen HOST:0 selects a free port")
     port = listener.getsockname()[1]
-    names = {options.host, *options.names} | (set(LOOPBACK) if options.is_loopback else set())
     operate = "" if options.no_token else options.operate_token or new_token()
-    access = Access(allowed_hosts(names, port), operate, options.view_token)
+    access = Access(allowed_hosts(options.host, options.names, port), operate, options.view_token)
     traces = Traces(Path.cwd(), () if options.trace is None else (options.trace,), options.trace_system)
     app = application(access, WallClock(), Path.cwd(), traces)
     server = WebServer(app, listener, MOST_CONNECTIONS, options.certificate, options.key)

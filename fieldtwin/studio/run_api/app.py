@@ -9,12 +9,11 @@ from starlette.applications import Starlette
 
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.northbound.http_tokens import tokens_of
-from fieldtwin.studio.access import LOOPBACK, VIEW, Access, allowed_hosts
+from fieldtwin.studio.access import VIEW, Access, allowed_hosts
 from fieldtwin.studio.api import faults, frames, instances, plc, tags
 from fieldtwin.studio.api_application import api_application
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.scenarios.recordings import Recordings
-from fieldtwin.twin.site.servers.loopback import is_loopback
 from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 
 OPERATIONS = (
@@ -33,8 +32,7 @@ def access_to(server: HttpServeConfig, port: int) -> Access:
     Without a token every client has the role view: other users of this computer can connect to a loopback address as well.
     """
     view, operate = tokens_of(server)
-    names = {server.host, *server.names} | (set(LOOPBACK) if is_loopback(server.host) else set())
-    return Access(allowed_hosts(names, port), operate, view, open_role=VIEW)
+    return Access(allowed_hosts(server.host, server.names, port), operate, view, open_role=VIEW)
 
 
 def run_application(access: Access, clock: Clock, instance: str, server: str) -> Starlette:

@@ -21,6 +21,10 @@ class UtcTimes:
         if abs(offset_ns - self._offset_ns) > CLOCK_STEP_NS:
             self._offset_ns = offset_ns
 
+    def ns(self, monotonic_ns: int) -> int:
+        """Return a monotonic time in nanoseconds since 1970-01-01 UTC."""
+        return monotonic_ns + self._offset_ns
+
     def ms(self, monotonic_ns: int) -> int:
         """Return a monotonic time in milliseconds since 1970-01-01 UTC."""
-        return (monotonic_ns + self._offset_ns) // NS_PER_MS
+        return self.ns(monotonic_ns) // NS_PER_MS

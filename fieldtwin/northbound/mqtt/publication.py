@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.northbound.data_types import fitted
 from fieldtwin.northbound.mqtt.backlog import Backlog, Entry
 from fieldtwin.northbound.mqtt.served_tags import ServedTag
-from fieldtwin.northbound.opcua.data_types import fitted
 from fieldtwin.northbound.samples import Sample
 from fieldtwin.twin.thread.mqtt.message import MqttMessage
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.errors import Bug
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.image.layout import TagKind
-from fieldtwin.northbound.opcua.data_types import OF_KIND, data_type
+from fieldtwin.northbound.data_types import OF_KIND, data_type
 from fieldtwin.twin.plant.physical import bound_programs
 from fieldtwin.twin.site.system import System
 

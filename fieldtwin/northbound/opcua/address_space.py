@@ -18,8 +18,8 @@ from fieldtwin.gateway.core.errors import Bug
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.image.layout import TagKind
 from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.northbound.data_types import OF_KIND, data_type
 from fieldtwin.northbound.opcua import standard_types as types
-from fieldtwin.northbound.opcua.data_types import OF_KIND, data_type
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.tag_nodes import add_tag
 from fieldtwin.plc.binding import BoundProgram

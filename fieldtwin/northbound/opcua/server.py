@@ -18,20 +18,21 @@ from typing import Any, NamedTuple
 from asyncua import ua
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, os_reason
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.northbound.data_types import fitted
 from fieldtwin.northbound.opcua.access.channels import checked_server
 from fieldtwin.northbound.opcua.access.trust import load_identity
 from fieldtwin.northbound.opcua.access.users import Account
 from fieldtwin.northbound.opcua.address_space import Variables, build
-from fieldtwin.northbound.opcua.data_types import fitted
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode, status_code
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
 from fieldtwin.northbound.opcua.writes import Call, TagWrites
 from fieldtwin.northbound.samples import Sample
+from fieldtwin.northbound.utc_times import UtcTimes
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig, application_uri, url_of
 from fieldtwin.twin.site.system import System
 
@@ -40,8 +41,6 @@ MAX_QUEUE = 1000
 """The largest number of values that wait for a client for each monitored item; the oldest ones are dropped first."""
 MAX_LOGGED = 1000
 """The largest number of messages of the library in the log of a run."""
-CLOCK_STEP_NS = 10 * NS_PER_MS
-"""If UTC differs by more than this from the expected time, the host's clock was set, and later source times follow it."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -70,7 +69,7 @@ class OpcuaServer:
         self._writable: set[str] = set()
         self.writes = TagWrites(config.name, call, {}, ())
         self._listening = ""
-        self._utc_offset_ns = clock.utc_ns() - clock.monotonic_ns()
+        self._times = UtcTimes(clock)
         self._server_time: datetime | None = None
         """The time of the present look at the image, which is the ServerTimestamp of its samples."""
         self._ids: dict[str, ua.NodeId] = {}
@@ -149,7 +148,7 @@ class OpcuaServer:
 
     async def publish(self, names: dict[str, str], changes: Iterable[tuple[str, Sample]]) -> None:
         """Write samples to variables. `names` gives the variable of each tag."""
-        self._follow_utc()
+        self._times.follow()
         self._server_time = self._utc(self._clock.monotonic_ns())
         for tag, sample in changes:
             await self._write(names[tag], sample)
@@ -174,11 +173,6 @@ class OpcuaServer:
         is_own = self._nodes is not None and item.NodeId.NamespaceIndex == self._nodes.own
         name = str(item.NodeId.Identifier) if is_own else item.NodeId.to_string()
         return await self.writes.write(item, name, account, address)
-
-    def _follow_utc(self) -> None:
-        offset_ns = self._clock.utc_ns() - self._clock.monotonic_ns()
-        if abs(offset_ns - self._utc_offset_ns) > CLOCK_STEP_NS:
-            self._utc_offset_ns = offset_ns
 
     async def _write(self, name: str, sample: Sample) -> None:
         kind = self.variables.data_types[name]
@@ -230,7 +224,7 @@ class OpcuaServer:
         """Return a monotonic time as UTC, to the microsecond; None for 0, which stands for no time."""
         if not monotonic_ns:
             return None
-        return _EPOCH + timedelta(microseconds=(monotonic_ns + self._utc_offset_ns) // 1000)
+        return _EPOCH + timedelta(microseconds=self._times.ns(monotonic_ns) // 1000)
 
 
 @dataclass

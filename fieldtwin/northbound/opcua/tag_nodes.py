@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from asyncua import ua
 
-from fieldtwin.northbound.opcua.data_types import INTEGERS
+from fieldtwin.northbound.data_types import INTEGERS
 from fieldtwin.northbound.opcua.node_writer import HAS_COMPONENT, NodeWriter
 from fieldtwin.northbound.opcua.units import UNECE_URI, unit_id
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.files.profile_file import load_profile
-from fieldtwin.northbound.opcua.data_types import INTEGERS, data_type, fitted
+from fieldtwin.northbound.data_types import INTEGERS, data_type, fitted
 from fieldtwin.northbound.opcua.units import CODES, unit_id
 
 PROFILE = """\

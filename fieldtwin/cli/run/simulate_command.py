@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fieldtwin.cli.campaign_options import FaultChoice, SeedOptions
+from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
@@ -22,7 +23,7 @@ from fieldtwin.run.template import system_file
 if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
-OF_A_GROUP = "--for, --seed, --seeds, --shard, --jobs, --ledger, --commands, --faults, --trace, --json"
+OF_A_GROUP = "--for, --seed, --seeds, --shard, --jobs, --ledger, --junit, --html, --commands, --faults, --trace, --json"
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class ManyRuns(SeedOptions):
     ),
     json_option,
 )
+@group("Output", reports=CampaignReports)
 def command(
     system: str,
     duration_s: float,
@@ -85,6 +87,7 @@ def command(
     sources: TemplateSearchOptions,
     trace: Path | None,
     compare: Path | None,
+    reports: CampaignReports,
     as_json: bool,
 ) -> int:
     """Simulate SYSTEM in virtual time, as fast as possible: its prototype, with gateway and PLC, in one process.
@@ -95,7 +98,7 @@ def command(
     \b
     fieldtwin simulate observatory --for 24h --seed 7
     fieldtwin simulate observatory --for 2h --faults random \\
-        --seeds 1..50 --jobs 2 --ledger hours.jsonl
+        --seeds 1..50 --jobs 2 --ledger hours.jsonl --html hours.html
 
     Exit code 0 if the run, or each of the runs, passed; else 1.
     """
@@ -127,9 +130,9 @@ def command(
             raise UsageError(
                 "--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run"
             )
-        return run_many(options, runs.chosen(), runs.jobs, as_json, runs.ledger)
-    if runs.ledger is not None or runs.shard:
-        option_name = "--shard" if runs.shard else "--ledger"
+        return run_many(options, runs.chosen(), runs.jobs, as_json, runs.ledger, reports)
+    if runs.ledger is not None or runs.shard or reports.given:
+        option_name = "--shard" if runs.shard else "--ledger" if runs.ledger is not None else reports.given
         raise UsageError(f"{option_name} needs --seeds", expected="--seeds 1..200")
     return run_one(options, as_json) if compare is None else _run_against(options, compare, as_json)
 

@@ -12,17 +12,22 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from fieldtwin.__about__ import __version__
+from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.output_files import write_text
+from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
+    from fieldtwin.reports.campaign.model import CampaignResult
+    from fieldtwin.run.campaigns.ledger import LedgerEntry
     from fieldtwin.run.campaigns.many_seeds import SeedResult
     from fieldtwin.run.virtual.run import VirtualOptions
 
 
-OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--ledger")
+OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--ledger", "--junit", "--junit-flavour", "--html")
 """Options that the command line of a single run does not have."""
 
 
@@ -75,29 +80,32 @@ def run_many(
     seeds: range,
     jobs: int,
     as_json: bool,
-    ledger_path: Path | None = None,
+    ledger_path: Path | None,
+    reports: CampaignReports,
 ) -> int:
     """Run once for each seed and return the exit status: 0 if all passed.
 
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
-    with their recorded result.
+    with their recorded result, also in `reports`.
     """
-    from fieldtwin.run.campaigns.ledger import Ledger
+    from fieldtwin.run.campaigns.ledger import Ledger, entry_of
     from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
 
     began_ns = WallClock().monotonic_ns()
     ledger = Ledger(ledger_path) if ledger_path is not None else None
-    what = what_runs(options)
-    left = [seed for seed in seeds if ledger is None or seed not in ledger.done(what)]
-    count = 0
-    with progress_bar(float(len(left)), "seeds") as at:
+    what, system = what_runs(options), Path(options.system).stem
+    done = ledger.done(what) if ledger is not None else set()
+    left = [seed for seed in seeds if seed not in done]
+    hours = options.duration_s / 3600
+    entries: list[LedgerEntry] = []
+    with CampaignView(system, len(left)) as view:
 
         def ended(result: SeedResult) -> None:
-            nonlocal count
-            count += 1
-            at(float(count))
+            entry = entry_of(what, hours, result, system, again(result.seed))
             if ledger is not None:
-                ledger.add(what, options.duration_s / 3600, result)
+                ledger.record(entry)
+            entries.append(entry)
+            view.ended(result.seed, hours, None if result.ok else "; ".join(result.errors[:1]) or "failed")
 
         results = run_seeds(options, left, jobs, ended)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
@@ -108,6 +116,9 @@ def run_many(
         and bool(results)
         and not any(struck for r in results for _, _, struck in r.faults)
     )
+    if reports.given:
+        recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
+        reports.write([_result(what, recorded, seeds, ledger_path, untested=untested and len(left) == len(seeds))])
     if as_json:
         json.dump(
             {"results": [_plain(r) for r in results], "failed": sorted([*before, *(r.seed for r in failed)])},
@@ -145,6 +156,22 @@ def run_many(
         return 1
     stdout.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
     return 1 if failed or before else 0
+
+
+def _result(
+    what: str, entries: Sequence[LedgerEntry], seeds: range, ledger_path: Path | None, *, untested: bool
+) -> CampaignResult:
+    """Return the campaign for its reports."""
+    from fieldtwin.run.campaigns.merging import Runs
+    from fieldtwin.run.campaigns.reporting import campaign_of
+
+    return campaign_of(
+        Runs(what, __version__, tuple(entries)),
+        frozenset(seeds),
+        [ledger_path.name] if ledger_path is not None else [],
+        shlex.join(["fieldtwin", *sys.argv[1:]]),
+        untested=untested,
+    )
 
 
 def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
@@ -204,7 +231,8 @@ def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, oth
 
 
 def _plain(result: SeedResult) -> dict[str, Any]:
-    return {name: getattr(result, name) for name in result.__slots__}
+    """Return the result as plain data, without the time and place of the run, so that the same campaign gives the same text."""
+    return {name: getattr(result, name) for name in result.__slots__ if name != "made"}
 
 
 def shown_time(seconds: float) -> str:

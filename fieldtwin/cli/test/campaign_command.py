@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.table import Table
 
+from fieldtwin.cli.campaign_reports import CampaignReports
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.output_files import replacing
 from fieldtwin.cli.run.virtual_view import shown_time
@@ -25,19 +27,28 @@ def command() -> None:
     """Campaigns of many seeds: join the results of several computers."""
 
 
-@command.command("merge")
+@command.command("merge", cls=GroupedCommand)
 @click.argument("ledgers", nargs=-1, required=True, type=click.Path(dir_okay=False, path_type=Path))
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Write the joined ledger to this file, which may be one of LEDGERS.",
+@group(
+    "Runs",
+    click.option(
+        "--seeds", default="", metavar="1..200", help="The seeds of the whole campaign: a missing one is an error."
+    ),
 )
-@click.option(
-    "--seeds", default="", metavar="1..200", help="The seeds of the whole campaign: a missing one is an error."
+@group(
+    "Output",
+    click.option(
+        "-o",
+        "--out",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Write the joined ledger to this file, which may be one of LEDGERS.",
+    ),
+    json_option,
 )
-@json_option
-def merge_command(ledgers: tuple[Path, ...], out: Path | None, seeds: str, as_json: bool) -> int:
+@group("Output", reports=CampaignReports)
+def merge_command(
+    ledgers: tuple[Path, ...], seeds: str, out: Path | None, reports: CampaignReports, as_json: bool
+) -> int:
     """Join LEDGERS, which `fieldtwin simulate --seeds ... --ledger FILE` wrote.
 
     The order of the files has no effect, and a run that several files contain counts once.
@@ -45,7 +56,8 @@ def merge_command(ledgers: tuple[Path, ...], out: Path | None, seeds: str, as_js
     \b
     fieldtwin simulate tank.yaml --for 8h --faults random \\
         --seeds 1..1000 --shard 3/16 --ledger shard-3.jsonl
-    fieldtwin campaign merge shard-*.jsonl --seeds 1..1000 -o all.jsonl
+    fieldtwin campaign merge shard-*.jsonl --seeds 1..1000 \\
+        -o all.jsonl --html campaign.html --junit campaign.xml
 
     Exit code 0 if every run passed; 1 if one failed, if a seed has two different results, or if one of --seeds is missing.
     """
@@ -65,6 +77,11 @@ def merge_command(ledgers: tuple[Path, ...], out: Path | None, seeds: str, as_js
     if out is not None:
         with replacing(out) as part:
             write_entries(part, joined)
+    if reports.given:
+        from fieldtwin.run.campaigns.reporting import campaign_of
+
+        names = [path.name for path in ledgers]
+        reports.write([campaign_of(runs, expected, names) for runs in groups])
     if as_json:
         click.echo(json.dumps([_plain(runs, expected) for runs in groups]))
     else:

@@ -9,7 +9,8 @@ from rich.markup import escape
 
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.run.virtual_view import progress_bar, shrunk_texts
+from fieldtwin.cli.run.campaign_progress import CampaignView
+from fieldtwin.cli.run.virtual_view import shrunk_texts
 from fieldtwin.console import stderr, stdout
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
@@ -31,13 +32,12 @@ def run_scenario_campaign(
     """
     seeds = options.chosen()
     campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
-    with progress_bar(float(len(seeds)), "seeds") as at:
-        count = 0
+    with CampaignView(case_of(path), len(seeds)) as view:
 
         def ended(result: ScenarioResult) -> None:
-            nonlocal count
-            count += 1
-            at(float(count))
+            assert result.seed is not None
+            passed = result.verdict is Verdict.PASSED
+            view.ended(result.seed, result.simulated_s / 3600, None if passed else result.why or result.verdict.value)
 
         results = run_campaign(campaign, seeds, options.jobs, ended)
     shard = ("--shard", options.shard) if options.shard else ()

@@ -1,7 +1,4 @@
-"""The options that all commands of `fieldtwin check` have, for devices and for masters, and the use of their values.
-
-`fieldtwin test` shares those for JUnit.
-"""
+"""The options that all commands of `fieldtwin check` have, for devices and for masters, and the use of their values."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import option
 from fieldtwin.cli.options import JSON, Duration
 from fieldtwin.gateway.core.errors import UsageError
@@ -83,20 +81,6 @@ class CaseOptions:
         from fieldtwin.conformance.core.case import Basis
 
         return frozenset(list(Basis)[: FAIL_ON[self.fail_on]])
-
-
-@dataclass(frozen=True)
-class JunitOptions:
-    """The JUnit file of a test, None for none, and its flavour (`fieldtwin.reports.junit.Flavour`)."""
-
-    junit: Path | None = option("--junit", type=_FILE, help="Write the verdicts as JUnit XML.")
-    junit_flavour: str = option(
-        "--junit-flavour",
-        type=click.Choice(["common", "jenkins"]),
-        default="common",
-        show_default=True,
-        help="With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
-    )
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from rich.table import Table
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
+from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
-from fieldtwin.cli.test.check_options import JunitOptions
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
 from fieldtwin.conformance.core.case import Impact

@@ -18,9 +18,12 @@ from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.run.campaigns.many_seeds import SeedResult
 
 
-class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One finished run. `what` is the fingerprint that `many_seeds.what_runs` returns; `wrong` of the `checked` values were
     never held by their device. `sha256` is the hash of the trace: the same seed has the same hash on every computer.
+
+    `system`: the name of the system. `reproduce`: for a failed run, the command that repeats it. For `ended_s`, `took_s` and
+    `worker` see `many_seeds.Made`. Ledgers of older versions lack these five.
     """
 
     what: str
@@ -32,6 +35,39 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wrong: int
     sha256: str
     errors: tuple[str, ...] = ()
+    system: str = ""
+    reproduce: str = ""
+    ended_s: float = 0.0
+    took_s: float = 0.0
+    worker: str = ""
+
+    @property
+    def result(self) -> tuple[object, ...]:
+        """Return what every computer must get for the same run; when and where the run was made is left out."""
+        return (
+            *(self.what, self.version, self.seed, self.hours, self.ok),
+            *(self.checked, self.wrong, self.sha256, self.errors),
+        )
+
+
+def entry_of(what: str, hours: float, result: SeedResult, system: str = "", reproduce: str = "") -> LedgerEntry:
+    """Return the entry of a run by this version; `reproduce` is kept for a failed run only."""
+    return LedgerEntry(
+        what,
+        __version__,
+        result.seed,
+        hours,
+        result.ok,
+        result.checked,
+        result.wrong,
+        result.sha256,
+        result.errors,
+        system,
+        "" if result.ok else reproduce,
+        round(result.made.ended_s, 3),
+        round(result.made.took_s, 3),
+        result.made.worker,
+    )
 
 
 MAX_BYTES = 256 * 1024 * 1024
@@ -72,19 +108,12 @@ class Ledger:
         """Return the seeds with which this version has run `what`."""
         return {e.seed for e in self.entries if e.what == what and e.version == __version__}
 
-    def add(self, what: str, hours: float, result: SeedResult) -> None:
+    def add(self, what: str, hours: float, result: SeedResult, system: str = "", reproduce: str = "") -> None:
         """Add a result and write it to disk."""
-        entry = LedgerEntry(
-            what,
-            __version__,
-            result.seed,
-            hours,
-            result.ok,
-            result.checked,
-            result.wrong,
-            result.sha256,
-            result.errors,
-        )
+        self.record(entry_of(what, hours, result, system, reproduce))
+
+    def record(self, entry: LedgerEntry) -> None:
+        """Add an entry and write it to disk."""
         try:
             with self.path.open("ab") as file:
                 file.write(msgspec.json.encode(entry) + b"\n")
@@ -94,9 +123,13 @@ class Ledger:
             raise Unreachable(f"cannot write the ledger: {e.strerror}", where=str(self.path)) from e
         self.entries.append(entry)
 
+    def entries_of(self, what: str, seeds: range) -> list[LedgerEntry]:
+        """Return the runs of these seeds that this version made with this fingerprint."""
+        return [e for e in self.entries if e.what == what and e.version == __version__ and e.seed in seeds]
+
     def failed_of(self, what: str, seeds: range) -> set[int]:
         """Return which of these seeds failed when this version ran them with this fingerprint."""
-        return {e.seed for e in self.failed if e.what == what and e.version == __version__ and e.seed in seeds}
+        return {e.seed for e in self.entries_of(what, seeds) if not e.ok}
 
     @property
     def hours(self) -> float:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import platform
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
 from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.processes.workers import each
@@ -16,9 +19,22 @@ _ERRORS_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
+class Made:
+    """When and where a run was made: its end in seconds since 1970 (UTC), its wall time in seconds, and its worker as HOST:PID.
+
+    The values are 0 and empty if they are not known, as in a ledger of an older version.
+    """
+
+    ended_s: float = 0.0
+    took_s: float = 0.0
+    worker: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class SeedResult:
     """The result of one seed's run. `checked` is the number of published values that were compared with the devices' values;
-    `wrong` of them were never held by the device.
+    `wrong` of them were never held by the device. `made` is not compared, because the same seed gives the same result on every
+    worker.
     """
 
     seed: int
@@ -30,6 +46,7 @@ class SeedResult:
     sha256: str
     faults: tuple[tuple[str, int, int], ...] = ()
     """For each name of a fault: how many were injected, and how often they took effect."""
+    made: Made = field(default=Made(), compare=False)
 
 
 def fingerprint(*parts: str) -> str:
@@ -51,6 +68,8 @@ def what_runs(options: VirtualOptions) -> str:
 
 def run_seed(options: VirtualOptions) -> SeedResult:
     """Make one complete run with the seed in `options`."""
+    clock = WallClock()
+    began_ns = clock.monotonic_ns()
     run = VirtualRun(options)
     run.run()
     summary = run.summary()
@@ -66,6 +85,7 @@ def run_seed(options: VirtualOptions) -> SeedResult:
         summary["trace"]["events"],
         summary["trace"]["sha256"],
         _by_name([one for part in [summary, *systems.values()] for one in part.get("faults", ())]),
+        Made(clock.utc_ns() / 1e9, (clock.monotonic_ns() - began_ns) / 1e9, f"{platform.node()}:{os.getpid()}"),
     )
 
 

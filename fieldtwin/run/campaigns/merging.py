@@ -1,6 +1,7 @@
 """Join ledgers of virtual hours that several computers wrote, for example one for each shard of a campaign.
 
-Joining is commutative and idempotent: the order of the ledgers has no effect, and a run that several of them contain counts once.
+Joining is commutative and idempotent: the order of the ledgers has no effect, and a run that several of them contain counts once,
+also if several computers made it.
 """
 
 from __future__ import annotations
@@ -42,9 +43,13 @@ class Runs:
 
 
 def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:
-    """Return each different entry of all ledgers once, in an order that depends on the entries only."""
-    unique = {entry for ledger in ledgers for entry in ledger}
-    return sorted(unique, key=lambda entry: (entry.what, entry.version, entry.seed, repr(entry)))
+    """Return each different result of all ledgers once, in an order that depends on the entries only."""
+    found = {entry for ledger in ledgers for entry in ledger}
+    ordered = sorted(found, key=lambda entry: (entry.what, entry.version, entry.seed, repr(entry)))
+    unique: dict[tuple[object, ...], LedgerEntry] = {}
+    for entry in ordered:
+        unique.setdefault(entry.result, entry)
+    return list(unique.values())
 
 
 def by_fingerprint(entries: Iterable[LedgerEntry]) -> list[Runs]:

@@ -67,6 +67,12 @@ def test_a_seed_with_two_results_is_reported_and_its_hours_count_once() -> None:
     assert (runs.different, runs.hours, runs.seeds) == ([7], 2.0, {7})
 
 
+def test_a_run_that_two_computers_made_counts_once() -> None:
+    one = LedgerEntry("w", "1", 7, 2.0, True, 1, 0, "aa", ended_s=10.0, took_s=1.0, worker="a:1")
+    other = LedgerEntry("w", "1", 7, 2.0, True, 1, 0, "aa", ended_s=20.0, took_s=2.0, worker="b:1")
+    assert merged([[one], [other]]) == merged([[other], [one]]) == [one]
+
+
 def invoke(*words: object) -> Result:
     return CliRunner().invoke(cli, ["campaign", "merge", *map(str, words)])
 

@@ -1,0 +1,80 @@
+"""What a report of a campaign shows. The ledgers from which it is made are read in `fieldtwin.run.campaigns`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fieldtwin.results.model import Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignRun:
+    """One run. `hours` are virtual; `ended_s` is its end in seconds since 1970 (UTC), 0 if it is not known; `took_s` is its wall
+    time in seconds.
+    """
+
+    seed: int
+    ok: bool
+    hours: float
+    errors: tuple[str, ...] = ()
+    reproduce: str = ""
+    sha256: str = ""
+    checked: int = 0
+    wrong: int = 0
+    ended_s: float = 0.0
+    took_s: float = 0.0
+    worker: str = ""
+
+    @property
+    def cause(self) -> str:
+        """Return the first error of a failed run."""
+        return self.errors[0] if self.errors else "no reason is recorded"
+
+
+@dataclass(frozen=True, slots=True)
+class FailureGroup:
+    """Failed runs with the same cause. `cause` is that of the first of `runs`, which are ordered by seed."""
+
+    cause: str
+    runs: Sequence[CampaignRun]
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignResult:
+    """The runs of one campaign, ordered by seed, each seed once. `what` is the fingerprint of files and options.
+
+    `missing`: seeds of the campaign without a run. `different`: seeds with several results. `untested`: faults were chosen, and
+    none took effect. `reproduce`: the command of the campaign, empty if it is not known.
+    """
+
+    system: str
+    what: str
+    version: str
+    runs: Sequence[CampaignRun]
+    groups: Sequence[FailureGroup] = ()
+    missing: Sequence[int] = ()
+    different: Sequence[int] = ()
+    untested: bool = False
+    ledgers: Sequence[str] = ()
+    reproduce: str = ""
+
+    @property
+    def failed(self) -> list[CampaignRun]:
+        return [run for run in self.runs if not run.ok]
+
+    @property
+    def hours(self) -> float:
+        """Return the sum of the virtual hours."""
+        return sum(run.hours for run in self.runs)
+
+    @property
+    def title(self) -> str:
+        return self.system or f"campaign {self.what}"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return FAILED if a run failed or was not reproduced, INCONCLUSIVE if something was not tested, else PASSED."""
+        if self.failed or self.different:
+            return Verdict.FAILED
+        return Verdict.INCONCLUSIVE if self.missing or self.untested or not self.runs else Verdict.PASSED

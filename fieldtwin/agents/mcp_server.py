@@ -24,7 +24,8 @@ INSTRUCTIONS = (
     "fieldtwin runs the control software of a plant (Modbus and CANopen devices, a gateway and a PLC) with emulated devices. "
     "Find out why a value is bad with `why`; reproduce a failure in a prototype with `start_prototype` and `inject_fault`; "
     "keep it as a test with `check_scenario`, `save_scenario` and `run_scenario`. A value is valid only while its quality is "
-    "good. Plants are read-only: no tool writes to one. Tell the user what to do there."
+    "good. Plants are read-only: no tool writes to one. `propose_write` asks the user, who confirms or refuses the write with "
+    "`fieldtwin approve` in a terminal."
 )
 MOST_CONNECTIONS = 16
 MOST_BODY_BYTES = 1 << 20

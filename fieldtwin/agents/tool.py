@@ -21,7 +21,8 @@ class NoArguments(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Tool:
-    """A tool. `changes` names what it can change: "" for nothing, "prototype", or "project" for new files in the project.
+    """A tool. `changes` names what it can change: "" for nothing, "prototype", "project" for new files in the project, or
+    "proposal" for the list of writes that wait for the user.
 
     `handler` returns data for JSON. A call ends after `within_s` seconds.
     """

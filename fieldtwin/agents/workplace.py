@@ -6,10 +6,12 @@ import asyncio
 from collections.abc import Collection
 from pathlib import Path
 
+from fieldtwin.agents.plant_writes import PlantWrites
 from fieldtwin.agents.project import Project
 from fieldtwin.agents.results import Results
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.live.gallery import Gallery
@@ -25,13 +27,14 @@ OWN = "agent-"
 
 
 class Workplace(AsyncResource):
-    """The project, the prototypes of the agent, and the running systems `plants` that it may read.
+    """The project, the prototypes of the agent, the running systems `plants` that it may read, and the `writes` that it proposes.
 
     Leaving the block ``async with`` stops all prototypes and the scenario that is running.
     """
 
-    def __init__(self, folder: Path, plants: Collection[str], clock: Clock) -> None:
+    def __init__(self, folder: Path, plants: Collection[str], writes: PlantWrites, clock: Clock) -> None:
         super().__init__()
+        self.writes = writes
         self.project = Project(folder)
         self.plants = frozenset(plants)
         self.runner = ScenarioRunner()
@@ -44,6 +47,8 @@ class Workplace(AsyncResource):
         await self._stack.enter_async_context(self._launcher)
         await self._stack.enter_async_context(self._gallery)
         await self._stack.enter_async_context(self.runner)
+        nursery = await self._stack.enter_async_context(Nursery())
+        nursery.start(self.writes.expire(), "expiry of proposals")
 
     async def instances(self) -> list[FoundInstance]:
         """Return the prototypes of the agent, and the running systems that it may read."""
@@ -99,7 +104,7 @@ class Workplace(AsyncResource):
             raise NotAllowed(
                 f"the agent has not started the prototype {instance[:60]!r}, so it cannot operate it",
                 expected="the result of start_prototype",
-                hint="a plant is read-only for agents; a user operates it in the terminal or in Studio",
+                hint="a plant is read-only for agents; propose_write asks the user for a write",
             )
 
 

@@ -28,6 +28,10 @@ COMMANDS = {
     ),
     "studio": ("fieldtwin.cli.run.studio_command", "See and operate running systems in the browser."),
     "mcp": ("fieldtwin.cli.run.mcp_command", "Serve tools to a language-model agent; plants are read-only."),
+    "approve": (
+        "fieldtwin.cli.run.approve_command",
+        "Confirm or refuse a write that a language-model agent has proposed.",
+    ),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
@@ -133,7 +137,7 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("new", "run", "simulate", "studio", "mcp", "reload", "emulate", "with"),
+        *("new", "run", "simulate", "studio", "mcp", "approve", "reload", "emulate", "with"),
         *("plc", "topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (

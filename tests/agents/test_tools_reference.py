@@ -37,7 +37,7 @@ def test_names_are_unique_and_schemas_are_valid() -> None:
         assert schema["additionalProperties"] is False
 
 
-def test_tools_that_change_something_are_those_of_prototypes_and_new_scenarios() -> None:
+def test_tools_that_change_something_are_those_of_prototypes_new_scenarios_and_proposals() -> None:
     assert {tool.name: tool.changes for tool in TOOLS if tool.changes} == {
         "start_prototype": "prototype",
         "stop_prototype": "prototype",
@@ -45,6 +45,8 @@ def test_tools_that_change_something_are_those_of_prototypes_and_new_scenarios()
         "clear_faults": "prototype",
         "set_value": "prototype",
         "save_scenario": "project",
+        "propose_write": "proposal",
+        "withdraw_proposal": "proposal",
     }
 
 

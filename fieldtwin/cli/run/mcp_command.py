@@ -56,7 +56,15 @@ class HttpOptions:
     "plants",
     multiple=True,
     metavar="INSTANCE",
-    help="Let the agent read this running system. It cannot write to it.",
+    help="Let the agent read this running system.",
+)
+@click.option(
+    "--allow-proposals",
+    "proposals",
+    multiple=True,
+    metavar="INSTANCE",
+    allow_from_autoenv=False,
+    help="Let the agent read this running system, and propose writes to it. A user confirms each with `fieldtwin approve`.",
 )
 @click.option(
     "--audit",
@@ -65,12 +73,14 @@ class HttpOptions:
     help=f"Append each call to this file; default: {AUDIT} in the folder of the run directories.",
 )
 @group("HTTP", http=HttpOptions)
-def command(project: Path, plants: tuple[str, ...], audit: Path | None, http: HttpOptions) -> int:
+def command(
+    project: Path, plants: tuple[str, ...], proposals: tuple[str, ...], audit: Path | None, http: HttpOptions
+) -> int:
     """Serve tools to a language-model agent over the Model Context Protocol (MCP), on stdin and stdout or over HTTP.
 
     The agent reads the files in the folder PROJECT, explanations and documentation; starts prototypes and injects faults into
-    them; checks, saves and runs scenarios. It reads a running plant only if --plant names it, and no tool writes to a plant.
-    The audit log has every call.
+    them; checks, saves and runs scenarios. It reads a running plant only if --plant names it, and no tool writes to a plant:
+    a write that the agent proposes (--allow-proposals) waits until a user confirms it. The audit log has every call.
     """
     try:
         from fieldtwin.agents.mcp_server import serve_http, serve_stdio
@@ -79,6 +89,7 @@ def command(project: Path, plants: tuple[str, ...], audit: Path | None, http: Ht
     from fieldtwin.agents.calls import Calls
     from fieldtwin.agents.http_place import HttpPlace, parsed_address
     from fieldtwin.agents.library import Library
+    from fieldtwin.agents.plant_writes import PlantWrites
     from fieldtwin.agents.tools.all_tools import TOOLS
     from fieldtwin.agents.workplace import Workplace
 
@@ -89,11 +100,13 @@ def command(project: Path, plants: tuple[str, ...], audit: Path | None, http: Ht
     root = runtime_root()
     if audit is None:
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
-    log = AuditLog(audit or root / AUDIT, clock)
+    audit = audit or root / AUDIT
+    log = AuditLog(audit, clock)
+    by = "agent over stdio" if place is None else "agent over HTTP"
+    writes = PlantWrites(proposals, clock, by, audit)
 
     async def serve() -> None:
-        async with Workplace(project, plants, clock) as workplace:
-            by = "agent over stdio" if place is None else "agent over HTTP"
+        async with Workplace(project, (*plants, *proposals), writes, clock) as workplace:
             calls = Calls(TOOLS, Library(workplace), workplace, log, by)
             if place is None:
                 await serve_stdio(calls)

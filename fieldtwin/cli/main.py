@@ -27,9 +27,9 @@ COMMANDS = {
         "Simulate a system in virtual time, with seeds and random faults.",
     ),
     "studio": ("fieldtwin.cli.run.studio_command", "See and operate running systems in the browser."),
-    "mcp": ("fieldtwin.cli.run.mcp_command", "Serve tools to a language-model agent; plants are read-only."),
+    "mcp": ("fieldtwin.cli.agents.mcp_command", "Serve tools to a language-model agent; plants are read-only."),
     "approve": (
-        "fieldtwin.cli.run.approve_command",
+        "fieldtwin.cli.agents.approve_command",
         "Confirm or refuse a write that a language-model agent has proposed.",
     ),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),

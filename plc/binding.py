@@ -22,8 +22,10 @@ from fieldtwin.plc.program import Program, Role, Variable
 if TYPE_CHECKING:
     from fieldtwin.plc.st.program import StProgram
 
-_SOURCES = "python: module:Class, or FILE.st, or FILE.xml, followed by :PROGRAM if it has several"
-_ST_SUFFIXES = (".st", ".xml")
+_SOURCES = (
+    "python: module:Class, or FILE.st, FILE.xml or a folder of such files, followed by :PROGRAM if there are several"
+)
+_ST_SUFFIXES = (".st", ".iecst", ".xml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +68,8 @@ def load_program(source: str, python_path: Sequence[str] = (), together: dict[An
     All programs of one PLC are created with the same dictionary `together`, which is empty at first. Through it, the programs
     of one Structured Text file share their VAR_GLOBAL.
 
-    `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export
-    (``plant.xml``), followed by ``:NAME`` if it holds several programs.
+    `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``), a PLCopen export (``plant.xml``) or a
+    folder of such files (``plc``), followed by ``:NAME`` if there are several programs.
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
@@ -103,12 +105,13 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
 
 def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
     name, _, program = source.strip().partition(":")
-    if not name.lower().endswith(_ST_SUFFIXES):
-        raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
-    from fieldtwin.plc.st.program import load_file  # load the compiler only if there is something to compile
-
     places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
-    return load_file(next((p for p in places if p.exists()), places[0]), program.strip())
+    found = next((p for p in places if p.exists()), places[0])
+    if not (name.lower().endswith(_ST_SUFFIXES) or (name and found.is_dir())):
+        raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
+    from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
+
+    return load_source(found, program.strip())
 
 
 def image_for(

@@ -243,7 +243,9 @@ class Program(ABC):
     """By output: the instruction that last assigned it. It is not a variable, because variables are the program's state."""
     variables: ClassVar[dict[str, Variable]] = {}
     source_path: ClassVar[str] = ""
-    """The file from which the program was compiled, if it is not the file of its module."""
+    """The file in which the program is declared, if it is not the file of its module."""
+    source_files: ClassVar[tuple[str, ...]] = ()
+    """All files from which the program was compiled, that one first; empty for a Python program."""
     _lookup: Callable[[str], TagValue] | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -143,7 +143,7 @@ class Network(SystemGroup):
 def _renamed(program: ProgramForm, member: AcousticMember) -> ProgramForm:
     beside = member.system.path.parent / program.source
     return ProgramForm.model_construct(
-        source=str(beside.resolve()) if beside.is_file() else program.source,
+        source=str(beside.resolve()) if beside.exists() else program.source,
         task=None,
         inputs={
             n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad)

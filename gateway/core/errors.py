@@ -121,6 +121,18 @@ class FileInvalid(FieldtwinError):
             where += f":{line}" + (f":{column}" if column else "")
         super().__init__(message, expected=expected, got=got, where=where, hint=hint)
 
+    def as_data(self) -> dict[str, str | int]:
+        """Return the error as data for JSON, without `others`."""
+        return {
+            "path": self.path,
+            "line": self.line,
+            "column": self.column,
+            "message": self.message,
+            "expected": self.expected,
+            "got": self.got,
+            "hint": self.hint,
+        }
+
 
 class CommandListMismatch(FileInvalid):
     """The command lists of a driver and its device differ (the paper's Communication, paper.md, ruling 12)."""

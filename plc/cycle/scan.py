@@ -351,17 +351,17 @@ def _as_text(messages: tuple[Message, ...]) -> str | None:
 
 
 def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
-    """Return `error` as a `ProgramFailed` with program and line: the innermost line in the program's file, else of the
+    """Return `error` as a `ProgramFailed` with program and line: the innermost line in the program's files, else of the
     traceback.
     """
     made = type(bound.program)
-    own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
+    own = made.source_files or (getattr(sys.modules.get(made.__module__), "__file__", None),)
     path, line, inside = "", 0, False
     tb = error.__traceback__
     while tb is not None:
         here = tb.tb_frame.f_code.co_filename
-        if here == own or not inside:
-            path, line, inside = here, tb.tb_lineno, here == own
+        if here in own or not inside:
+            path, line, inside = here, tb.tb_lineno, here in own
         tb = tb.tb_next
     # the error is in the conversion of inputs or outputs, not in a line that the user wrote
     if made.source_path and not inside:

@@ -21,7 +21,7 @@ from fieldtwin.plc.binding import BoundProgram
 
 @dataclass(frozen=True, slots=True)
 class ProgramSource:
-    """The source file of one program, as the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
+    """A source file of a program, as the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
 
     program: str
     path: str
@@ -50,10 +50,12 @@ def sources(
     found = []
     for bound in programs:
         made = type(bound.program)
-        path = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None) or ""
-        digest = imported.get(path) or _digest(path)
-        found.append(ProgramSource(bound.name, path, digest, bool(made.source_path)))
-        if modules and path and not made.source_path:
+        found += [ProgramSource(bound.name, file, _digest(file), True) for file in made.source_files]
+        if made.source_files:
+            continue
+        path = getattr(sys.modules.get(made.__module__), "__file__", None) or ""
+        found.append(ProgramSource(bound.name, path, imported.get(path) or _digest(path), False))
+        if modules and path:
             found += [ProgramSource(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
     return found
 

@@ -9,24 +9,20 @@ their two's complement.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, Role, ScanInfo, SourceLine, Variable, message_input, message_output
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
-from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
+from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable
+from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
-from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 
-MAX_SOURCE_BYTES = 8 * 1024 * 1024
-"""A larger source file is assumed to be a mistake."""
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
 
@@ -158,9 +154,16 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             f"no PROGRAM {name}" if name else "which PROGRAM is meant",
             path=unit.path,
             expected=", ".join(names) or "a PROGRAM in the file",
-            hint="write FILE.st:NAME where a file has several" if len(names) > 1 else "",
+            hint="write SOURCE:NAME, because it has several" if len(names) > 1 else "",
         )
-    body: dict[str, Any] = {"st_unit": unit, "st_declared": found, "source_path": unit.path, "__module__": __name__}
+    files = tuple(sorted(unit.files, key=lambda file: (file != found.path, file)))
+    body: dict[str, Any] = {
+        "st_unit": unit,
+        "st_declared": found,
+        "source_path": found.path,
+        "source_files": files,
+        "__module__": __name__,
+    }
     for v in found.variables:
         kind = _tag_kind(v.kind)
         if isinstance(v.kind, ty.MessagesIn):
@@ -177,23 +180,9 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     return type(found.name, (StProgram,), body)
 
 
-def load_file(path: Path, name: str = "") -> type[StProgram]:
-    """Read and compile a file: Structured Text, or a PLCopen XML export. Raises `FileInvalid`."""
-    try:
-        text = read_input(path, MAX_SOURCE_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as e:
-        raise FileInvalid("not UTF-8 text", path=str(path), got=f"byte {e.start}: {e.object[e.start]:02x}h") from e
-    except OSError as e:
-        raise FileInvalid(f"cannot read: {e.strerror or e}", path=str(path)) from e
-    if is_plcopen(text):
-        text = to_st(text, str(path))
-    return program_class(_compiled(text, str(path)), name)
-
-
-@lru_cache(maxsize=32)
-def _compiled(text: str, path: str) -> CompiledUnit:
-    """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
-    return compile_text(text, path)
+def load_source(path: Path, name: str = "") -> type[StProgram]:
+    """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
+    return program_class(compile_source(path), name)
 
 
 def _attribute(variable: ProgramVariable) -> str:

@@ -63,7 +63,8 @@ class Resource:
     def __init__(self, unit: CompiledUnit) -> None:
         self.context = Context()
         self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
-        exec(unit.code, self.space)
+        for part in unit.code:
+            exec(part, self.space)
         self.globals: Any = self.space["_G"]
         self.absolute = ".scan_ns" in unit.python
         """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""

@@ -144,7 +144,8 @@ def bound_programs(system: System, errors: ErrorCollector) -> list[BoundProgram]
         try:
             bound.append(config.bind((str(system.path.parent),)))
         except FieldtwinError as e:
-            errors.add(system.file.error(("plc", "programs", config.name, "source"), str(e)))
+            for one in (e, *(e.others if isinstance(e, FileInvalid) else ())):
+                errors.add(system.file.error(("plc", "programs", config.name, "source"), str(one)))
     plant = plant_tags(system)
     for program in bound:
         _check_variables(system, program, errors)

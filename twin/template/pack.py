@@ -22,6 +22,7 @@ from pathlib import Path, PurePosixPath
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.plc.source_files import source_files
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.template.software import modules_hash, wheel_hash
@@ -165,7 +166,11 @@ def _program(got: Collected, system: Path, source: str) -> None:
         return
     name = source.strip().partition(":")[0]
     beside = system.parent / name
-    got.add(_place("systems", name, system), Item("program", beside if beside.is_file() else Path(name)))
+    found = beside if beside.exists() else Path(name)
+    for file in source_files(found):
+        below = file.relative_to(found).as_posix()
+        place = _place("systems", name, system) if below == "." else _place("systems", f"{name}/{below}", system)
+        got.add(place, Item("program", file))
 
 
 def _python(got: Collected, folder: Path, module: str) -> bool:

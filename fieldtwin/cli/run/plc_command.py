@@ -14,6 +14,7 @@ import msgspec
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
+from fieldtwin.cli.run.plc_check_command import check
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
@@ -47,11 +48,14 @@ yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
 
 @click.group("plc")
 def command() -> None:
-    """Inspect the soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs.
+    """Inspect the soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs; check programs.
 
     Forces, pauses and restarts change the behaviour of a plant. Each asks for confirmation and shows the present and the new
     value; without a terminal it needs --yes. Forces stay until they are removed, and every status lists them.
     """
+
+
+command.add_command(check)
 
 
 def _emit(value: Any) -> int:

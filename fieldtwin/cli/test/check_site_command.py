@@ -14,7 +14,6 @@ from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from fieldtwin.gateway.core.errors import FileInvalid
     from fieldtwin.site.check import SiteCheck
 
 
@@ -74,18 +73,6 @@ def _as_json(found: SiteCheck) -> dict[str, object]:
         "version": 1,
         "folder": str(found.folder),
         "files": [{"path": path, "kind": kind} for path, kind in found.files.items()],
-        "errors": [_error(error) for error in found.errors],
+        "errors": [error.as_data() for error in found.errors],
         "warnings": found.warnings,
-    }
-
-
-def _error(error: FileInvalid) -> dict[str, object]:
-    return {
-        "path": error.path,
-        "line": error.line,
-        "column": error.column,
-        "message": error.message,
-        "expected": error.expected,
-        "got": error.got,
-        "hint": error.hint,
     }

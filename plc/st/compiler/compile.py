@@ -1,7 +1,8 @@
 """Compiles a unit of Structured Text to Python, once: classes for structures and function blocks, functions, and a
 class for each PROGRAM.
 
-The Python code carries the line numbers of the source, so that an error in a scan names the line that the user wrote.
+The Python code carries the files and line numbers of the source, so that an error in a scan names the line that the user
+wrote. All errors are collected: an error in one statement or declaration does not hide those in others.
 The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs it in a separate namespace.
 """
 
@@ -20,7 +21,7 @@ from fieldtwin.plc.st.compiler.located import without_addresses
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.parse import parse
+from fieldtwin.plc.st.syntax.parse import parse_all
 
 MAX_CALLS = 64
 """The longest chain of POUs that call each other."""
@@ -41,37 +42,50 @@ class ProgramVariable:
 
 @dataclass(frozen=True, slots=True)
 class CompiledProgram:
+    """A PROGRAM, and the file in which it is declared."""
+
     name: str
+    path: str
     variables: tuple[ProgramVariable, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledUnit:
-    """A compiled unit. `code` defines the classes and functions of the unit when it is executed with the names ``_v``, ``_c``
-    and ``_blocks``; `python` is the text of `code`, for inspection.
+    """A unit, compiled from `files`: one file, or the files of the folder `path`.
+
+    Its `code`, executed in this order with the names ``_v``, ``_c`` and ``_blocks``, defines the classes and functions of the
+    unit; each part comes from one file. `python` is the text of `code`, for inspection.
     """
 
     path: str
-    code: CodeType
+    files: tuple[str, ...]
+    code: tuple[CodeType, ...]
     python: str
     programs: tuple[CompiledProgram, ...]
+    kinds: tuple[str, ...]
+    """What each declaration is: program, function, function block, type or global variable."""
 
 
 def compile_text(text: str, path: str = "") -> CompiledUnit:
-    """Compile a text. Raises `FileInvalid` with line and column for any error."""
-    return compile_unit(parse(text, path), path)
+    """Compile a text. Raises `FileInvalid` with line and column for the first error, and with the others."""
+    return compile_unit(parse_all(text, path), path, (path,))
 
 
-def compile_unit(unit: t.SourceUnit, path: str = "") -> CompiledUnit:
+def compile_unit(unit: t.SourceUnit, path: str, files: tuple[str, ...]) -> CompiledUnit:
+    """Compile the declarations of `files`: one file, or the files of the folder `path`.
+
+    Raises `FileInvalid` with line and column for the first error, and with the others.
+    """
     try:
-        return _Unit(without_addresses(unit), path).compiled()
+        return _Unit(without_addresses(unit), path, files).compiled()
     except RecursionError as e:
         raise FileInvalid("nested too deep", path=path) from e
 
 
 class _Unit:
-    def __init__(self, unit: t.SourceUnit, path: str) -> None:
-        self.env = Environment(path)
+    def __init__(self, unit: t.SourceUnit, path: str, files: tuple[str, ...]) -> None:
+        self.path, self.files = path, files
+        self.env = Environment()
         self.out = CodeWriter()
         self.unit = unit
         self._outputs: dict[str, frozenset[str]] = {}
@@ -83,51 +97,72 @@ class _Unit:
         self._declare_globals()
         for pou in unit.pous:
             if pou.kind == "FUNCTION":
-                with self.declarations.within(pou):
+                with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
                     self.env.functions[pou.name.lower()] = self._signature(pou)
 
     def compiled(self) -> CompiledUnit:
         programs = []
         for pou in self.unit.pous:
-            with self.declarations.within(pou):
+            self.env.faulty_here.clear()
+            with self.env.declaring(pou.name, self.env.faulty_here), self.declarations.within(pou):
                 if pou.kind == "FUNCTION":
                     self._write_function(pou)
                 elif pou.kind == "FUNCTION_BLOCK":
                     self._write_block(pou)
                 else:
                     programs.append(self._write_program(pou))
-        self._refuse_recursion()
+        with self.env.errors.collect():
+            self._refuse_recursion()
         self._write_globals()
+        self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
-        return CompiledUnit(self.env.path, self._code(text), text, tuple(programs))
+        return CompiledUnit(self.path, self.files, self._code(text), text, tuple(programs), self._kinds())
+
+    def _kinds(self) -> tuple[str, ...]:
+        pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous]
+        variables = sum(len(block.variables) for block in self.unit.globals)
+        return (*pous, *["type"] * len(self.unit.types), *["global variable"] * variables)
 
     def _check_names(self) -> None:
         seen: set[str] = set()
         for pou in self.unit.pous:
             if pou.name.lower() in seen or pou.name.upper() in ty.ELEMENTARY:
-                self.env.fail(pou.pos, f"{pou.name} is declared twice")
+                self.env.collected(self.env.error(pou.pos, f"{pou.name} is declared twice"))
             seen.add(pou.name.lower())
 
-    def _code(self, text: str) -> CodeType:
-        lines = [source for _, source in self.out.lines]
-        last = 1
-        for n, source in enumerate(lines):
-            last = lines[n] = source or last
+    def _code(self, text: str) -> tuple[CodeType, ...]:
+        places = self._places()
         try:
             tree = ast.parse(text)
-            for node in ast.walk(tree):
-                if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
-                    node.lineno = node.end_lineno = lines[min(node.lineno, len(lines)) - 1]
-                    node.col_offset = node.end_col_offset = 0
+            parts: list[tuple[str, list[ast.stmt]]] = []
             for statement in tree.body:
-                if isinstance(statement, ast.ClassDef) and statement.name in self._outputs:
-                    Assignments(self._outputs[statement.name]).visit(statement)
-            ast.fix_missing_locations(tree)
-            return compile(tree, self.env.path or "<st>", "exec")
+                path = places[statement.lineno - 1].path
+                if not parts or parts[-1][0] != path:
+                    parts.append((path, []))
+                parts[-1][1].append(self._at_source(statement, places))
+            return tuple(compile(ast.Module(body, []), path or "<st>", "exec") for path, body in parts)
         except (SyntaxError, MemoryError, RecursionError) as e:  # Python's limits; those of this compiler are narrower
             at = e.lineno if isinstance(e, SyntaxError) and e.lineno else 1
-            line = lines[min(at, len(lines)) - 1]
-            raise FileInvalid(f"too deep for the compiler: {e}", path=self.env.path, line=line, column=1) from e
+            place = places[min(at, len(places)) - 1]
+            raise FileInvalid(f"too deep for the compiler: {e}", path=place.path, line=place.line, column=1) from e
+
+    def _places(self) -> list[t.Pos]:
+        """Return the position in the source of each line of the Python code."""
+        last, places = t.Pos(1, 1, self.path), []
+        for _, pos in self.out.lines:
+            last = pos or last
+            places.append(last)
+        return places
+
+    def _at_source(self, statement: ast.stmt, places: list[t.Pos]) -> ast.stmt:
+        """Return a class or function of the Python code with the line numbers of the source."""
+        for node in ast.walk(statement):
+            if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
+                node.lineno = node.end_lineno = places[min(node.lineno, len(places)) - 1].line
+                node.col_offset = node.end_col_offset = 0
+        if isinstance(statement, ast.ClassDef) and statement.name in self._outputs:
+            Assignments(self._outputs[statement.name]).visit(statement)
+        return ast.fix_missing_locations(statement)
 
     # -- variables --------------------------------------------------------------------------------------------------------
 
@@ -136,20 +171,22 @@ class _Unit:
         for block in self.unit.globals:
             for v in block.variables if "CONSTANT" in block.qualifiers else ():
                 if isinstance(v.type, t.NamedType) and v.type.name.upper() in ty.ELEMENTARY:
-                    symbol = self.declarations.constant(v, f"_G.v_{v.name.lower()}")
-                    if symbol is not None:
-                        self.env.globals[v.name.lower()] = symbol
+                    with self.env.declaring(v.name, self.env.faulty):
+                        symbol = self.declarations.constant(v, f"_G.v_{v.name.lower()}")
+                        if symbol is not None:
+                            self.env.globals[v.name.lower()] = symbol
 
     def _declare_globals(self) -> None:
         seen: set[str] = set()
         for block in self.unit.globals:
             self._no_retain(block, "a VAR_GLOBAL")
             for v in block.variables:
-                self._no_address(v)
-                if v.name.lower() in seen:
-                    self.env.fail(v.pos, f"{v.name} is declared twice")
-                seen.add(v.name.lower())
-                self.env.globals[v.name.lower()] = self._symbol(v, block, f"_G.v_{v.name.lower()}")
+                with self.env.declaring(v.name, self.env.faulty):
+                    self._no_address(v)
+                    if v.name.lower() in seen:
+                        self.env.fail(v.pos, f"{v.name} is declared twice")
+                    seen.add(v.name.lower())
+                    self.env.globals[v.name.lower()] = self._symbol(v, block, f"_G.v_{v.name.lower()}")
         if seen:
             first = self.unit.globals[0].pos
             self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
@@ -160,13 +197,16 @@ class _Unit:
         self.out.line("_G = _Globals()")
         for block in self.unit.globals:
             for v in block.variables:
-                symbol = self.env.globals[v.name.lower()]
-                if symbol.constant is None:
-                    self.out.line(f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos)
+                symbol = self.env.globals.get(v.name.lower())
+                if symbol is not None and symbol.constant is None:
+                    with self.env.errors.collect():
+                        value = self.declarations.initial(symbol.type, v.initial, v.type)
+                        self.out.line(f"{symbol.code} = {value}", v.pos)
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
-            self.env.fail(block.pos, f"{what} cannot be RETAIN", hint="a PROGRAM's VAR RETAIN can, also a block in it")
+            hint = "a PROGRAM's VAR RETAIN can, also a block in it"
+            self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
 
     def _no_address(self, v: t.VarDecl) -> None:
         if v.location:
@@ -190,20 +230,29 @@ class _Unit:
             if pou.kind != "PROGRAM":
                 self._no_retain(block, f"a variable of a {pou.kind}")
             for v in block.variables:
-                key = v.name.lower()
-                self._no_address(v)
-                if key in symbols:
-                    self.env.fail(v.pos, f"{v.name} is declared twice")
-                if block.kind == "VAR_EXTERNAL":
-                    symbols[key] = self._external(v)
-                    continue
-                code = f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{key}"
-                symbols[key] = self._symbol(v, block, code)
-                if block.kind == "VAR_IN_OUT" and not by_reference(symbols[key].type):
-                    symbols[key] = replace(symbols[key], code=f"{code}.v", reference=code)
-        own = (symbols[v.name.lower()].type for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables)
+                with self.env.declaring(v.name, self.env.faulty_here):
+                    self._no_address(v)
+                    if v.name.lower() in symbols:
+                        self.env.fail(v.pos, f"{v.name} is declared twice")
+                    symbols[v.name.lower()] = self._variable(v, block, prefix)
+        own = (
+            symbols[v.name.lower()].type
+            for b in pou.blocks
+            if b.kind != "VAR_EXTERNAL"
+            for v in b.variables
+            if v.name.lower() in symbols
+        )
         self.declarations.bounded(pou.pos, own)
         return symbols
+
+    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str) -> Symbol:
+        if block.kind == "VAR_EXTERNAL":
+            return self._external(v)
+        code = f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{v.name.lower()}"
+        symbol = self._symbol(v, block, code)
+        if block.kind == "VAR_IN_OUT" and not by_reference(symbol.type):
+            return replace(symbol, code=f"{code}.v", reference=code)
+        return symbol
 
     def _external(self, v: t.VarDecl) -> Symbol:
         found = self.env.globals.get(v.name.lower())
@@ -215,13 +264,12 @@ class _Unit:
 
     def _initialise(self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...]) -> None:
         for block in pou.blocks:
-            if block.kind in kinds:
-                for v in block.variables:
-                    symbol = symbols[v.name.lower()]
-                    if symbol.constant is None:
-                        self.out.line(
-                            f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos
-                        )
+            for v in block.variables if block.kind in kinds else ():
+                symbol = symbols.get(v.name.lower())
+                if symbol is not None and symbol.constant is None:
+                    with self.env.errors.collect():
+                        value = self.declarations.initial(symbol.type, v.initial, v.type)
+                        self.out.line(f"{symbol.code} = {value}", v.pos)
 
     # -- functions --------------------------------------------------------------------------------------------------------
 
@@ -293,7 +341,7 @@ class _Unit:
                 )
             retain = bool(block.qualifiers & {"RETAIN", "PERSISTENT"})
             for v in block.variables if role else ():
-                if "CONSTANT" not in block.qualifiers:
+                if "CONSTANT" not in block.qualifiers and v.name.lower() in symbols:
                     kind = symbols[v.name.lower()].type
                     self._check_interface(v, kind, role or "")
                     if v.name in _API or v.name.startswith("st_"):
@@ -311,20 +359,21 @@ class _Unit:
                 body = Statements(self.env, symbols, self.out, pou.name.lower())
                 body.program_inputs = {v.name for v in variables if v.role == "input"}
                 body.body(pou.body)
-        return CompiledProgram(pou.name, tuple(variables))
+        return CompiledProgram(pou.name, pou.pos.path, tuple(variables))
 
     def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
         """Initialise all variables with their initial values; messages are passed in from outside."""
         for block in pou.blocks:
-            if block.kind in ("VAR", "VAR_INPUT", "VAR_OUTPUT"):
-                for v in block.variables:
-                    symbol = symbols[v.name.lower()]
-                    if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
-                        self.out.line(f"{symbol.code} = ()", v.pos)
-                    elif symbol.constant is None:
-                        self.out.line(
-                            f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos
-                        )
+            for v in block.variables if block.kind in ("VAR", "VAR_INPUT", "VAR_OUTPUT") else ():
+                symbol = symbols.get(v.name.lower())
+                if symbol is None:
+                    continue
+                if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
+                    self.out.line(f"{symbol.code} = ()", v.pos)
+                elif symbol.constant is None:
+                    with self.env.errors.collect():
+                        value = self.declarations.initial(symbol.type, v.initial, v.type)
+                        self.out.line(f"{symbol.code} = {value}", v.pos)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
         if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block):
@@ -336,8 +385,9 @@ class _Unit:
             )
 
     def _note_parts(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
-        for v in (v for b in pou.blocks for v in b.variables):
-            kind = symbols[v.name.lower()].type
+        for kind, v in (
+            (symbols[v.name.lower()].type, v) for b in pou.blocks for v in b.variables if v.name.lower() in symbols
+        ):
             if by_reference(kind) and isinstance(kind, ty.Block):
                 self.env.calls.setdefault(pou.name.lower(), {}).setdefault(kind.name.lower(), v.pos)
 

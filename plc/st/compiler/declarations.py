@@ -33,30 +33,34 @@ class Declarations:
         self._blocks = {p.name.lower(): p for p in unit.pous if p.kind == "FUNCTION_BLOCK"}
         self._open: list[str] = []
         for declared in unit.types:
-            if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
-                env.fail(declared.pos, f"type {declared.name} is declared twice")
-            self._types[declared.name.lower()] = declared
-            if isinstance(declared, t.EnumDecl):
-                self._declare_enum(declared)
+            with env.declaring(declared.name, env.faulty):
+                if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
+                    env.fail(declared.pos, f"type {declared.name} is declared twice")
+                self._types[declared.name.lower()] = declared
+                if isinstance(declared, t.EnumDecl):
+                    self._declare_enum(declared)
 
     def resolve(self) -> None:
         """Resolve all types, after the global constants are known, because limits may use them."""
         for declared in self._unit.types:
-            self.named(declared.name, declared.pos)
+            with self.env.declaring(declared.name, self.env.faulty):
+                self.named(declared.name, declared.pos)
 
     @contextmanager
     def within(self, pou: t.Pou) -> Iterator[None]:
         """Make the constants of `pou` available to limits and initial values."""
         before = self.scope
         self.scope = self._constants.setdefault(pou.name.lower(), {})
-        if not self.scope:
-            for block in pou.blocks:
-                for v in block.variables if "CONSTANT" in block.qualifiers else ():
-                    found = self.constant(v, f"v_{v.name.lower()}")
-                    if found is not None:
-                        self.scope[v.name.lower()] = found
-        yield
-        self.scope = before
+        try:
+            if not self.scope:
+                for block in pou.blocks:
+                    for v in block.variables if "CONSTANT" in block.qualifiers else ():
+                        found = self.constant(v, f"v_{v.name.lower()}")
+                        if found is not None:
+                            self.scope[v.name.lower()] = found
+            yield
+        finally:
+            self.scope = before
 
     def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
         """Return a CONSTANT with its value; None if the value is not elementary, or too long to be written at each use."""
@@ -108,8 +112,10 @@ class Declarations:
         if any(low > high for low, high in ranges):
             self.env.fail(spec.pos, "an empty range of indices")
         self._deep += 1
-        of = self.type_of(spec.of)
-        self._deep -= 1
+        try:
+            of = self.type_of(spec.of)
+        finally:
+            self._deep -= 1
         if isinstance(of, ty.MessagesIn | ty.MessagesOut):
             self.env.fail(spec.pos, "an array of MESSAGES")
         made = ty.Array(ranges, of)
@@ -155,18 +161,22 @@ class Declarations:
         if len(self._open) > ty.MAX_NESTED:
             self.env.fail(pos, "arrays, structures and blocks nested too deep", expected=f"at most {ty.MAX_NESTED}")
         self._open.append(key)
-        if key in self._types:
-            found = self._declared(self._types[key])
-        elif key in self._blocks:
-            found = self._block(self._blocks[key])
-        elif key in _STANDARD:
-            found = _STANDARD[key]
-        else:
-            known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
-            self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
-        self._open.pop()
+        try:
+            found = self._resolved(key, name, pos)
+        finally:
+            self._open.pop()
         self.env.types[key] = found
         return found
+
+    def _resolved(self, key: str, name: str, pos: t.Pos) -> ty.Type:
+        if key in self._types:
+            return self._declared(self._types[key])
+        if key in self._blocks:
+            return self._block(self._blocks[key])
+        if key in _STANDARD:
+            return _STANDARD[key]
+        known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
+        raise self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
 
     def _declared(self, declared: t.TypeDecl) -> ty.Type:
         if isinstance(declared, t.StructDecl):

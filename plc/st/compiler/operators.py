@@ -86,7 +86,7 @@ def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
 
 
 def _only_if_needed(
-    x: Compiling, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, int]]
+    x: Compiling, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, t.Pos | None]]
 ) -> tuple[Value, Value]:
     """Return both sides of AND or OR.
 

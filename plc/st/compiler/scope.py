@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.syntax.source import shortened
@@ -74,9 +75,13 @@ def by_reference(kind: ty.Type) -> bool:
 
 @dataclass
 class Environment:
-    """All declarations of a unit, by names in lower case."""
+    """All declarations of a unit, by names in lower case, and the errors that were found in it so far."""
 
-    path: str = ""
+    errors: ErrorCollector = field(default_factory=ErrorCollector)
+    faulty: set[str] = field(default_factory=set)
+    """The names of the unit whose declaration has an error, so that their use is not a second error."""
+    faulty_here: set[str] = field(default_factory=set)
+    """The same for the POU that is being compiled, and the names in it that are not declared at all."""
     types: dict[str, ty.Type] = field(default_factory=dict)
     type_initials: dict[str, str] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
@@ -87,13 +92,31 @@ class Environment:
 
     def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
         return FileInvalid(
-            message, path=self.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
+            message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
         )
+
+    @contextmanager
+    def declaring(self, name: str, faulty: set[str]) -> Iterator[None]:
+        """Collect the errors in the declaration of `name`, add the name to `faulty`, and continue after the block."""
+        try:
+            yield
+        except FileInvalid as e:
+            faulty.add(name.lower())
+            self.collected(e)
+
+    def collected(self, error: FileInvalid) -> None:
+        """Add an error to those that were found. Raises them all if they are more than one message shows."""
+        self.errors.add(error)
+        if len(self.errors.errors) > FileInvalid.MAX_OTHERS:
+            self.errors.raise_all()
 
     def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
         raise self.error(pos, message, expected=expected, got=got, hint=hint)
 
     def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
+        if name.lower() in self.faulty | self.faulty_here:
+            raise FollowingError(f"{name} is declared with an error", path=pos.path, line=pos.line, column=pos.column)
+        self.faulty_here.add(name.lower())
         self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known))
 
 
@@ -130,15 +153,15 @@ def wrapped(code: str, kind: ty.Elementary) -> str:
 
 
 class CodeWriter:
-    """The Python code being written: its lines, each with the line of the source."""
+    """The Python code being written: its lines, each with its position in the source (None: that of the line before)."""
 
     def __init__(self) -> None:
-        self.lines: list[tuple[str, int]] = []
+        self.lines: list[tuple[str, Pos | None]] = []
         self._depth = 0
         self._temporaries = 0
 
     def line(self, code: str, pos: Pos | None = None) -> None:
-        self.lines.append(("    " * self._depth + code, pos.line if pos else 0))
+        self.lines.append(("    " * self._depth + code, pos))
 
     @contextmanager
     def block(self, head: str, pos: Pos | None = None) -> Iterator[None]:
@@ -146,10 +169,12 @@ class CodeWriter:
         self.line(head, pos)
         self._depth += 1
         before = len(self.lines)
-        yield
-        if len(self.lines) == before:
-            self.line("pass", pos)
-        self._depth -= 1
+        try:
+            yield
+            if len(self.lines) == before:
+                self.line("pass", pos)
+        finally:
+            self._depth -= 1
 
     def step(self, pos: Pos | None = None) -> None:
         """Count one loop iteration or call against the limit of the scan (`fieldtwin.plc.st.resource.MAX_STEPS`)."""
@@ -161,15 +186,15 @@ class CodeWriter:
         """Return the number of blocks that enclose the next line."""
         return self._depth
 
-    def since(self, mark: int) -> list[tuple[str, int]]:
+    def since(self, mark: int) -> list[tuple[str, Pos | None]]:
         """Remove and return the lines after the first `mark` lines, without their present indentation."""
-        taken = [(code[4 * self._depth :], line) for code, line in self.lines[mark:]]
+        taken = [(code[4 * self._depth :], pos) for code, pos in self.lines[mark:]]
         del self.lines[mark:]
         return taken
 
-    def again(self, lines: list[tuple[str, int]]) -> None:
+    def again(self, lines: list[tuple[str, Pos | None]]) -> None:
         """Write lines that `since` returned, with the present indentation."""
-        self.lines += [("    " * self._depth + code, line) for code, line in lines]
+        self.lines += [("    " * self._depth + code, pos) for code, pos in lines]
 
     def temporary(self) -> str:
         self._temporaries += 1

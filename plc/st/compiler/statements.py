@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.expressions import Expressions
@@ -38,7 +39,13 @@ class Statements(Expressions):
             self.env.fail(statements[0].pos, "statements nested too deep", expected=f"at most {MAX_DEEP} levels")
         self._inside += 1
         for statement in statements:
-            getattr(self, f"_{type(statement).__name__.lower()}")(statement)
+            loops, controls, inside = len(self._loops), len(self.controls), self._inside
+            try:
+                getattr(self, f"_{type(statement).__name__.lower()}")(statement)
+            except FileInvalid as e:  # the next statement may have an error too
+                self.env.collected(e)
+                del self._loops[loops:], self.controls[controls:]
+                self._inside = inside
         self._inside -= 1
 
     # -- assignment and calls -----------------------------------------------------------------------------------------

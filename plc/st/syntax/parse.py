@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -14,11 +15,38 @@ from lark.tree import Meta
 from lark.visitors import Transformer_NonRecursive
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.source import MAX_NAME, blanked, shortened
 
 MAX_EXPECTED = 8
 """How many of the expected tokens an error names."""
+
+_UNSUPPORTED = {
+    word: construct
+    for construct, words in {
+        "classes and methods": (
+            "METHOD END_METHOD CLASS END_CLASS EXTENDS THIS SUPER ABSTRACT FINAL PUBLIC PRIVATE PROTECTED INTERNAL VAR_INST"
+        ),
+        "interfaces": "INTERFACE END_INTERFACE IMPLEMENTS",
+        "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
+        "namespaces": "NAMESPACE END_NAMESPACE USING",
+        "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
+        "steps, transitions and actions of SFC": (
+            "STEP INITIAL_STEP END_STEP TRANSITION END_TRANSITION ACTION END_ACTION"
+        ),
+        "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
+        "R_EDGE and F_EDGE": "R_EDGE F_EDGE",
+        "labels and jumps": "JMP",
+    }.items()
+    for word in words.split()
+}
+"""The words of constructs that other compilers know, by which an error names the construct."""
+_ENDS = re.compile(
+    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"|\b(?P<end>END_(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|TYPE|CONFIGURATION))\b|\S\s*\Z""",
+    re.IGNORECASE,
+)
+"""The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped."""
 
 _READABLE = {
     "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
@@ -34,13 +62,43 @@ def parse(text: str, path: str = "") -> t.SourceUnit:
     """Return the tree of `text`. Raises `FileInvalid` with line and column."""
     text = blanked(text, path)
     try:
-        return _Build().transform(_parser().parse(text))  # type: ignore[no-any-return]
+        return _Build(path).transform(_parser().parse(text))  # type: ignore[no-any-return]
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
     except VisitError as e:
         if not isinstance(e.orig_exc, _Bad):
             raise
         raise e.orig_exc.at(path) from e
+
+
+def parse_all(text: str, path: str = "") -> t.SourceUnit:
+    """Return the tree of `text`. Raises `FileInvalid` for its first error, with the first errors of the other POUs and types.
+
+    A parser cannot go on after an error. So after one, each POU and each TYPE block is parsed alone.
+    """
+    try:
+        return parse(text, path)
+    except FileInvalid as whole:
+        found = ErrorCollector()
+        try:
+            for part in _parts(blanked(text, path)):
+                with found.collect():
+                    parse(part, path)
+        except FileInvalid:  # a comment or a literal does not end
+            raise whole from None
+        found.raise_all()
+        raise
+
+
+def _parts(text: str) -> Iterator[str]:
+    """Return each POU and TYPE block of a text without comments, with blanks before it, so that its lines and columns stay."""
+    begin = 0
+    for found in _ENDS.finditer(text):
+        if found["end"] is None and found.end() < len(text):
+            continue
+        before = text[:begin]
+        yield "\n" * before.count("\n") + " " * (begin - before.rfind("\n") - 1) + text[begin : found.end()]
+        begin = found.end()
 
 
 @cache
@@ -57,8 +115,8 @@ class _Bad(Exception):
         self.token = token
 
     def at(self, path: str) -> FileInvalid:
-        where = _pos(self.token)
-        return FileInvalid(str(self), path=path, line=where.line, column=where.column, got=shortened(str(self.token)))
+        line, column = self.token.line or 1, self.token.column or 1
+        return FileInvalid(str(self), path=path, line=line, column=column, got=shortened(str(self.token)))
 
 
 def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
@@ -72,6 +130,9 @@ def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
         before = text.rstrip()
         got, line, column = "the end of the file", before.count("\n") + 1, len(before) - before.rfind("\n")
         names = getattr(e, "accepts", None) or (set() if isinstance(e, UnexpectedEOF) else e.expected)  # type: ignore[attr-defined]
+    construct = _unsupported(got, text, line, column)
+    if construct:
+        return FileInvalid(f"{construct} are not supported", path=path, line=line, column=column, got=shortened(got))
     readable = sorted({_readable(name) for name in names})
     more = f" and {len(readable) - MAX_EXPECTED} more" if len(readable) > MAX_EXPECTED else ""
     return FileInvalid(
@@ -84,6 +145,14 @@ def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
     )
 
 
+def _unsupported(got: str, text: str, line: int, column: int) -> str:
+    """Return the construct that the unexpected token `got`, or the word before it, belongs to; "" for an ordinary error."""
+    lines = text.split("\n")[:line]
+    lines[-1] = lines[-1][: column - 1]
+    before = re.search(r"([A-Za-z_]\w*)\s*\Z", "\n".join(lines[-2:]))
+    return _UNSUPPORTED.get(got.upper()) or (_UNSUPPORTED.get(before[1].upper(), "") if before else "")
+
+
 @cache
 def _readable(name: str) -> str:
     for terminal in _parser().terminals:
@@ -92,15 +161,18 @@ def _readable(name: str) -> str:
     return _READABLE.get(name, name)
 
 
-def _pos(where: Meta | Token) -> t.Pos:
-    return t.Pos(where.line or 1, where.column or 1)
-
-
 @v_args(meta=True)
 class _Build(Transformer_NonRecursive[Token, Any]):
     """The transformer that builds the tree bottom up: children are already nodes, tokens are still tokens.
 
     It is not recursive, so the nesting depth has no limit."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self._path = path
+
+    def _pos(self, where: Meta | Token) -> t.Pos:
+        return t.Pos(where.line or 1, where.column or 1, self._path)
 
     def NAME(self, token: Token) -> Token:
         if len(token) > MAX_NAME:
@@ -129,7 +201,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items
         returns = rest.pop(0) if kind == "FUNCTION" else None
-        return t.Pou(_pos(name), kind, str(name), returns, tuple(rest[:-1]), rest[-1])
+        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), rest[-1])
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
         return self._pou("PROGRAM", meta, items)
@@ -149,7 +221,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         kind, *rest = items
         qualifiers = frozenset(i.upper() for i in rest if isinstance(i, str))
         variables = tuple(v for i in rest if not isinstance(i, str) for v in i)
-        return t.VarBlock(_pos(kind), kind.upper(), qualifiers, variables)
+        return t.VarBlock(self._pos(kind), kind.upper(), qualifiers, variables)
 
     def qualifier(self, meta: Meta, items: list[Any]) -> str:
         return str(items[0])
@@ -158,7 +230,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         names = [i for i in items if isinstance(i, Token)]
         location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
         spec, initial = _spec(items), _initial(items)
-        return [t.VarDecl(_pos(n), str(n), spec, initial, location) for n in names]
+        return [t.VarDecl(self._pos(n), str(n), spec, initial, location) for n in names]
 
     def location(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
         return "at", str(items[0])
@@ -174,12 +246,12 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     def struct_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
         name, *fields = items
-        return t.StructDecl(_pos(name), str(name), tuple(f for group in fields for f in group))
+        return t.StructDecl(self._pos(name), str(name), tuple(f for group in fields for f in group))
 
     def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
         name, *rest = items
         values = tuple(i for i in rest if i[0] != "initial")
-        return t.EnumDecl(_pos(name), str(name), values, _initial(rest))
+        return t.EnumDecl(self._pos(name), str(name), values, _initial(rest))
 
     def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
         return str(items[0]), items[1] if len(items) > 1 else None
@@ -189,23 +261,23 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         return -number if str(items[0]) == "-" else number
 
     def alias_decl(self, meta: Meta, items: list[Any]) -> t.AliasDecl:
-        return t.AliasDecl(_pos(items[0]), str(items[0]), _spec(items), _initial(items))
+        return t.AliasDecl(self._pos(items[0]), str(items[0]), _spec(items), _initial(items))
 
     def named_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
-        return t.NamedType(_pos(meta), str(items[0]))
+        return t.NamedType(self._pos(meta), str(items[0]))
 
     def subrange_type(self, meta: Meta, items: list[Any]) -> t.SubrangeType:
-        return t.SubrangeType(_pos(meta), str(items[0]), items[1], items[2])
+        return t.SubrangeType(self._pos(meta), str(items[0]), items[1], items[2])
 
     def string_type(self, meta: Meta, items: list[Any]) -> t.StringType:
-        return t.StringType(_pos(meta), items[0].upper() == "WSTRING", items[1] if len(items) > 1 else None)
+        return t.StringType(self._pos(meta), items[0].upper() == "WSTRING", items[1] if len(items) > 1 else None)
 
     def messages_type(self, meta: Meta, items: list[Any]) -> t.MessagesType:
         sizes = [*items[1:], None, None]
-        return t.MessagesType(_pos(meta), sizes[0], sizes[1])
+        return t.MessagesType(self._pos(meta), sizes[0], sizes[1])
 
     def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
-        return t.ArrayType(_pos(meta), tuple(items[:-1]), items[-1])
+        return t.ArrayType(self._pos(meta), tuple(items[:-1]), items[-1])
 
     def range(self, meta: Meta, items: list[Any]) -> tuple[t.Expr, t.Expr]:
         return items[0], items[1]
@@ -217,7 +289,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         return items[0]  # type: ignore[no-any-return]
 
     def init_array(self, meta: Meta, items: list[Any]) -> t.InitArray:
-        return t.InitArray(_pos(meta), tuple(items))
+        return t.InitArray(self._pos(meta), tuple(items))
 
     def one_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init]:
         return 1, items[0]
@@ -226,7 +298,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         return _integer(items[0]), items[1] if len(items) > 1 else None
 
     def init_struct(self, meta: Meta, items: list[Any]) -> t.InitStruct:
-        return t.InitStruct(_pos(meta), tuple(items))
+        return t.InitStruct(self._pos(meta), tuple(items))
 
     def member_init(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
         return str(items[0]), items[1]
@@ -240,14 +312,14 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         return None
 
     def assign(self, meta: Meta, items: list[Any]) -> t.Assign:
-        return t.Assign(_pos(meta), items[0], items[1])
+        return t.Assign(self._pos(meta), items[0], items[1])
 
     def call_statement(self, meta: Meta, items: list[Any]) -> t.CallStatement:
-        return t.CallStatement(_pos(meta), items[0])
+        return t.CallStatement(self._pos(meta), items[0])
 
     def if_statement(self, meta: Meta, items: list[Any]) -> t.If:
         otherwise = items.pop()[1] if len(items) % 2 else ()
-        return t.If(_pos(meta), tuple(zip(items[::2], items[1::2], strict=True)), otherwise)
+        return t.If(self._pos(meta), tuple(zip(items[::2], items[1::2], strict=True)), otherwise)
 
     def else_part(self, meta: Meta, items: list[Any]) -> tuple[str, tuple[t.Statement, ...]]:
         return "else", items[0]
@@ -255,83 +327,83 @@ class _Build(Transformer_NonRecursive[Token, Any]):
     def case_statement(self, meta: Meta, items: list[Any]) -> t.Case:
         selector, *rest = items
         otherwise = rest.pop()[1] if rest and rest[-1][0] == "else" else ()
-        return t.Case(_pos(meta), selector, tuple(rest), otherwise)
+        return t.Case(self._pos(meta), selector, tuple(rest), otherwise)
 
     def case_branch(self, meta: Meta, items: list[Any]) -> tuple[tuple[t.CaseLabel, ...], tuple[t.Statement, ...]]:
         return tuple(items[:-1]), items[-1]
 
     def case_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
-        return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
+        return t.CaseLabel(self._pos(meta), items[0], items[1] if len(items) > 1 else None)
 
     def next_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
-        return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
+        return t.CaseLabel(self._pos(meta), items[0], items[1] if len(items) > 1 else None)
 
     def case_number(self, meta: Meta, items: list[Any]) -> t.Expr:
-        literal = t.Literal(_pos(meta), items[-1].type, str(items[-1]))
-        return t.Unary(_pos(meta), "-", literal) if str(items[0]) == "-" else literal
+        literal = t.Literal(self._pos(meta), items[-1].type, str(items[-1]))
+        return t.Unary(self._pos(meta), "-", literal) if str(items[0]) == "-" else literal
 
     def case_name(self, meta: Meta, items: list[Any]) -> t.Expr:
-        return t.Ref(_pos(meta), str(items[0]))
+        return t.Ref(self._pos(meta), str(items[0]))
 
     def case_enum(self, meta: Meta, items: list[Any]) -> t.Expr:
-        return t.Literal(_pos(meta), "ENUM_REF", str(items[0]))
+        return t.Literal(self._pos(meta), "ENUM_REF", str(items[0]))
 
     def for_statement(self, meta: Meta, items: list[Any]) -> t.For:
         variable, first, last, *step, body = items
-        return t.For(_pos(meta), variable, first, last, step[0] if step else None, body)
+        return t.For(self._pos(meta), variable, first, last, step[0] if step else None, body)
 
     def while_statement(self, meta: Meta, items: list[Any]) -> t.While:
-        return t.While(_pos(meta), items[0], items[1])
+        return t.While(self._pos(meta), items[0], items[1])
 
     def repeat_statement(self, meta: Meta, items: list[Any]) -> t.Repeat:
-        return t.Repeat(_pos(meta), items[0], items[1])
+        return t.Repeat(self._pos(meta), items[0], items[1])
 
     def exit(self, meta: Meta, items: list[Any]) -> t.Jump:
-        return t.Jump(_pos(meta), "EXIT")
+        return t.Jump(self._pos(meta), "EXIT")
 
     def continue_(self, meta: Meta, items: list[Any]) -> t.Jump:
-        return t.Jump(_pos(meta), "CONTINUE")
+        return t.Jump(self._pos(meta), "CONTINUE")
 
     def return_(self, meta: Meta, items: list[Any]) -> t.Jump:
-        return t.Jump(_pos(meta), "RETURN")
+        return t.Jump(self._pos(meta), "RETURN")
 
     # -- expressions
 
     def binary(self, meta: Meta, items: list[Any]) -> t.Binary:
-        return t.Binary(_pos(items[1]), items[1].upper(), items[0], items[2])
+        return t.Binary(self._pos(items[1]), items[1].upper(), items[0], items[2])
 
     def unary(self, meta: Meta, items: list[Any]) -> t.Unary:
-        return t.Unary(_pos(meta), items[0].upper(), items[1])
+        return t.Unary(self._pos(meta), items[0].upper(), items[1])
 
     def call(self, meta: Meta, items: list[Any]) -> t.Call:
-        return t.Call(_pos(meta), items[0], tuple(items[1:]))
+        return t.Call(self._pos(meta), items[0], tuple(items[1:]))
 
     def operator(self, meta: Meta, items: list[Any]) -> t.Ref:
-        return t.Ref(_pos(meta), str(items[0]))
+        return t.Ref(self._pos(meta), str(items[0]))
 
     def positional(self, meta: Meta, items: list[Any]) -> t.Argument:
-        return t.Argument(_pos(meta), "", items[0])
+        return t.Argument(self._pos(meta), "", items[0])
 
     def named(self, meta: Meta, items: list[Any]) -> t.Argument:
-        return t.Argument(_pos(meta), str(items[0]), items[1])
+        return t.Argument(self._pos(meta), str(items[0]), items[1])
 
     def output(self, meta: Meta, items: list[Any]) -> t.Argument:
-        return t.Argument(_pos(meta), str(items[-2]), None, items[-1], inverted=len(items) == 3)
+        return t.Argument(self._pos(meta), str(items[-2]), None, items[-1], inverted=len(items) == 3)
 
     def reference(self, meta: Meta, items: list[Any]) -> t.Ref:
-        return t.Ref(_pos(meta), str(items[0]), tuple(items[1:]))
+        return t.Ref(self._pos(meta), str(items[0]), tuple(items[1:]))
 
     def member(self, meta: Meta, items: list[Any]) -> t.Member:
-        return t.Member(_pos(meta), str(items[0]))
+        return t.Member(self._pos(meta), str(items[0]))
 
     def bit(self, meta: Meta, items: list[Any]) -> t.Bit:
-        return t.Bit(_pos(meta), _integer(items[0]))
+        return t.Bit(self._pos(meta), _integer(items[0]))
 
     def index(self, meta: Meta, items: list[Any]) -> t.Index:
-        return t.Index(_pos(meta), tuple(items))
+        return t.Index(self._pos(meta), tuple(items))
 
     def literal(self, meta: Meta, items: list[Any]) -> t.Literal:
-        return t.Literal(_pos(meta), items[0].type, str(items[0]))
+        return t.Literal(self._pos(meta), items[0].type, str(items[0]))
 
 
 def _spec(items: list[Any]) -> t.TypeSpec:
@@ -352,4 +424,4 @@ def _integer(token: Token) -> int:
         raise _Bad(token, "not a whole number that any type holds") from e
 
 
-__all__ = ["parse"]
+__all__ = ["parse", "parse_all"]

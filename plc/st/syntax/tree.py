@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Pos:
-    """Line and column, both from 1."""
+    """Line and column, both from 1, of a file; `path` is empty if the text is not from a file."""
 
     line: int
     column: int
+    path: str = ""
 
 
 # -- types ------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from st_bench import program, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.st.program import load_file
+from fieldtwin.plc.st.program import load_source
 from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 
 EXPORT = """<?xml version="1.0" encoding="utf-8"?>
@@ -80,7 +80,7 @@ def test_errors_name_lines_of_the_export(tmp_path: Path) -> None:
     path = tmp_path / "plant.xml"
     path.write_text(EXPORT.replace("kept := kept + 1;", "kept := kept + s;"))
     with pytest.raises(FileInvalid, match=r"plant\.xml:42:\d+: operands of \+"):
-        load_file(path)
+        load_source(path)
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,14 @@ import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import Role, ScanInfo
-from fieldtwin.plc.st.program import StProgram, load_file
+from fieldtwin.plc.st.program import StProgram, load_source
 
 SHAPES = Path(__file__).parents[2] / "vectors" / "plcopen"
 MS = 1_000_000
 
 
 def loaded(name: str) -> Any:
-    return load_file(SHAPES / f"{name}_shape.xml")()
+    return load_source(SHAPES / f"{name}_shape.xml")()
 
 
 def scan(made: StProgram, number: int) -> None:
@@ -75,7 +75,7 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
         path = tmp_path / "tank.xml"
         path.write_text(text.replace("valve := eMode = E_Mode.Filling;", f"valve := eMode = {wrong};"))
         with pytest.raises(FileInvalid, match=told) as e:
-            load_file(path)
+            load_source(path)
         assert (e.value.line, e.value.column) == (line, column)
 
 
@@ -86,4 +86,4 @@ def test_methods_and_actions_are_refused_at_their_position(tmp_path: Path) -> No
     data = '<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Reset"/></data></addData>'
     path.write_text(text.replace("<addData />", data))
     with pytest.raises(FileInvalid, match="FB_Ramp has an unsupported part: method"):
-        load_file(path)
+        load_source(path)

@@ -34,7 +34,7 @@ from fieldtwin.gateway.core.files.candump import LeftOut, read_log
 from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.protocols.canopen.eds.dictionary import load_dictionary
-from fieldtwin.plc.st.program import load_file
+from fieldtwin.plc.st.program import load_source
 from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.run.what_if.plan import load_plans
 from fieldtwin.run.what_if.state import read_state
@@ -94,7 +94,7 @@ OTHER_READERS: dict[str, Reader] = {
     "network or system": group_file,
     "EDS of the gateway": load_dictionary,
     "EDS of the emulator": load_eds,
-    "Structured Text or PLCopen XML": load_file,
+    "Structured Text or PLCopen XML": load_source,
     "recording": rows,
     "recording of a CAN bus": lambda p: list(CanLog(p).frames()),
     "candump": lambda p: sum(1 for _ in read_log(p)),
@@ -225,7 +225,7 @@ def too_long(*_: object) -> None:
 
 def main() -> None:
     folder, kinds = Path(sys.argv[1]), sys.argv[2:]
-    load_file(SHIPPED / "systems" / "relay.st")  # the compiler is loaded before the memory is limited
+    load_source(SHIPPED / "systems" / "relay.st")  # the compiler is loaded before the memory is limited
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY_BYTES,) * 2)
     signal.signal(signal.SIGALRM, too_long)

@@ -1,0 +1,35 @@
+"""Which files the source of a program in Structured Text consists of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from fieldtwin.gateway.core.errors import FileInvalid
+
+MAX_FILES = 2_000
+"""The largest number of files in a folder of a program."""
+SUFFIXES = (".st", ".iecst", ".xml")
+"""The file names' endings: Structured Text (as written here, and by other tools), and PLCopen XML."""
+
+
+def source_files(path: Path) -> tuple[Path, ...]:
+    """Return the file `path`; or, if it is a folder, the source files in it and below it, sorted, without hidden ones.
+
+    Raises `FileInvalid` if there are none or more than `MAX_FILES`.
+    """
+    if not path.is_dir():
+        return (path,)
+    found = sorted(_below(path))
+    if not found:
+        raise FileInvalid("a folder without a program", path=str(path), expected="files " + ", ".join(SUFFIXES))
+    if len(found) > MAX_FILES:
+        raise FileInvalid("too many files", path=str(path), expected=f"at most {MAX_FILES}", got=str(len(found)))
+    return tuple(found)
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    for path in folder.rglob("*"):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden:
+            yield path

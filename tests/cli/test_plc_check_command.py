@@ -1,0 +1,55 @@
+"""`fieldtwin plc check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.gateway.core.errors import UsageError
+
+
+def checked(*arguments: str) -> Result:
+    return CliRunner().invoke(check, arguments, standalone_mode=False)
+
+
+def test_a_folder_is_checked_without_a_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("plc").mkdir()
+    Path("plc/main.st").write_text(
+        "PROGRAM p VAR n : Level; END_VAR n := twice(n); END_PROGRAM\nTYPE Level : INT; END_TYPE"
+    )
+    Path("plc/twice.st").write_text("FUNCTION twice : INT VAR_INPUT n : INT; END_VAR twice := n * 2; END_FUNCTION")
+    done = checked("plc")
+    assert (done.return_value, done.output) == (0, "2 files, no errors: 1 function, 1 program, 1 type\n")
+
+
+def test_every_error_has_a_line_and_the_exit_code_is_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.st").write_text("PROGRAM p VAR n : INT; END_VAR\nn := TRUE;\nm := 1;\nEND_PROGRAM")
+    done = checked("p.st")
+    assert done.return_value == 1
+    assert done.output.splitlines() == [
+        "p.st:2:6: assigned to n; expected INT; got BOOL (BOOL_TO_INT)",
+        "p.st:3:1: a variable 'm' is not declared",
+        "2 errors in 1 file",
+    ]
+    data = json.loads(checked("p.st", "--json").output)
+    assert [(error["path"], error["line"], error["column"]) for error in data["errors"]] == [
+        ("p.st", 2, 6),
+        ("p.st", 3, 1),
+    ]
+
+
+def test_the_programs_of_a_system_are_checked() -> None:
+    done = checked("lab_vehicle")
+    assert done.output.startswith("1 file, no errors: "), done.output
+
+
+def test_a_system_of_python_programs_says_so() -> None:
+    done = checked("observatory")
+    assert isinstance(done.exception, UsageError)
+    assert "no program in Structured Text" in str(done.exception)

@@ -47,6 +47,14 @@ def test_a_template_has_everything_that_its_system_names(dam: Path, tmp_path: Pa
     assert manifest.code == ()
 
 
+def test_all_files_of_a_program_in_a_folder_are_packed(dam: Path, tmp_path: Path) -> None:
+    (dam.parent / "logic" / "types").mkdir()
+    (dam.parent / "logic" / "types" / "level.st").write_text("TYPE Level : INT; END_TYPE")
+    dam.write_text(dam.read_text().replace("logic/count.st", "logic"))
+    paths = {file.path for file in packed(dam, tmp_path / "T.zip").files}
+    assert {"systems/logic/count.st", "systems/logic/types/level.st"} <= paths
+
+
 def test_the_system_file_is_packed_byte_for_byte(dam: Path, tmp_path: Path) -> None:
     """Prose, row 2: plant, prototype and template have one configuration."""
     packed(dam, tmp_path / "T.zip")

@@ -16,7 +16,7 @@ SUFFIXES = (".st", ".iecst", ".xml")
 def source_files(path: Path) -> tuple[Path, ...]:
     """Return the file `path`; or, if it is a folder, the source files in it and below it, sorted, without hidden ones.
 
-    Raises `FileInvalid` if there are none or more than `MAX_FILES`.
+    Raises `FileInvalid` for a folder without source files, or with more than `MAX_FILES` of them.
     """
     if not path.is_dir():
         return (path,)

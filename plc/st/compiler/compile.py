@@ -63,7 +63,7 @@ class CompiledUnit:
     python: str
     programs: tuple[CompiledProgram, ...]
     kinds: tuple[str, ...]
-    """What each declaration is: program, function, function block, type or global variable."""
+    """The kind of each declaration: program, function, function block, type or global variable."""
 
 
 def compile_text(text: str, path: str = "") -> CompiledUnit:

@@ -22,6 +22,7 @@ from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
     from fieldtwin.reports.campaign.model import CampaignResult
+    from fieldtwin.run.campaigns.coverage import Coverage
     from fieldtwin.run.campaigns.ledger import LedgerEntry
     from fieldtwin.run.campaigns.many_seeds import SeedResult
     from fieldtwin.run.virtual.run import VirtualOptions
@@ -88,6 +89,7 @@ def run_many(
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
     with their recorded result, also in `reports`.
     """
+    from fieldtwin.run.campaigns.coverage import joined
     from fieldtwin.run.campaigns.ledger import Ledger, entry_of
     from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
 
@@ -121,7 +123,11 @@ def run_many(
         reports.write([_result(what, recorded, seeds, ledger_path, untested=untested and len(left) == len(seeds))])
     if as_json:
         json.dump(
-            {"results": [_plain(r) for r in results], "failed": sorted([*before, *(r.seed for r in failed)])},
+            {
+                "results": [_plain(r) for r in results],
+                "failed": sorted([*before, *(r.seed for r in failed)]),
+                "coverage": joined(r.coverage for r in results).counts(),
+            },
             sys.stdout,
             indent=2,
         )
@@ -140,6 +146,7 @@ def run_many(
     checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
     table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
     table.add_row("faults", faults_text([one for r in results for one in r.faults]))
+    table.add_row("coverage", coverage_text(joined(r.coverage for r in results)))
     table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times real time")
     if ledger is not None:
         table.add_row("not repeated", f"{len(seeds) - len(left)} seeds that the ledger has")
@@ -172,6 +179,14 @@ def _result(
         shlex.join(["fieldtwin", *sys.argv[1:]]),
         untested=untested,
     )
+
+
+def coverage_text(coverage: Coverage) -> str:
+    """Return how many different situations the runs have reached, by kind."""
+    if not coverage.elements:
+        return "none is recorded"
+    parts = ", ".join(f"{kind} {count}" for kind, count in coverage.counts().items())
+    return f"{len(coverage)} different situations ({parts})"
 
 
 def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
@@ -231,8 +246,10 @@ def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, oth
 
 
 def _plain(result: SeedResult) -> dict[str, Any]:
-    """Return the result as plain data, without the time and place of the run, so that the same campaign gives the same text."""
-    return {name: getattr(result, name) for name in result.__slots__ if name != "made"}
+    """Return the result as plain data, without the time and place of the run, so that the same campaign gives the same text, and
+    without its coverage, which the whole campaign has.
+    """
+    return {name: getattr(result, name) for name in result.__slots__ if name not in ("made", "coverage")}
 
 
 def shown_time(seconds: float) -> str:

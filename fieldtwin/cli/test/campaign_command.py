@@ -13,7 +13,7 @@ from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.output_files import replacing
-from fieldtwin.cli.run.virtual_view import shown_time
+from fieldtwin.cli.run.virtual_view import coverage_text, shown_time
 from fieldtwin.console import stderr, stdout
 
 if TYPE_CHECKING:
@@ -96,6 +96,7 @@ def _plain(runs: Runs, expected: frozenset[int]) -> dict[str, object]:
         "version": runs.version,
         "runs": len(runs.seeds),
         "hours": runs.hours,
+        "coverage": runs.coverage.counts(),
         "failed": sorted({entry.seed for entry in runs.failed}),
         "different": runs.different,
         "missing": sorted(expected - runs.seeds),
@@ -112,6 +113,7 @@ def _show(groups: list[Runs], expected: frozenset[int], files: int) -> None:
         table.add_row("campaign", f"{runs.what}, version {runs.version}")
         table.add_row("runs", f"{len(runs.seeds)} from {files} ledger{'s' if files > 1 else ''}")
         table.add_row("virtual time", shown_time(runs.hours * 3600))
+        table.add_row("coverage", coverage_text(runs.coverage))
         table.add_row("failed", _listed(sorted({entry.seed for entry in runs.failed})))
         if expected:
             table.add_row("missing", _listed(sorted(expected - runs.seeds)))

@@ -23,7 +23,7 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     never held by their device. `sha256` is the hash of the trace: the same seed has the same hash on every computer.
 
     `system`: the name of the system. `reproduce`: for a failed run, the command that repeats it. For `ended_s`, `took_s` and
-    `worker` see `many_seeds.Made`. Ledgers of older versions lack these five.
+    `worker` see `many_seeds.Made`, for `coverage` see `coverage.Coverage`. Ledgers of older versions lack these six.
     """
 
     what: str
@@ -40,6 +40,7 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     ended_s: float = 0.0
     took_s: float = 0.0
     worker: str = ""
+    coverage: str = ""
 
     @property
     def result(self) -> tuple[object, ...]:
@@ -67,6 +68,7 @@ def entry_of(what: str, hours: float, result: SeedResult, system: str = "", repr
         round(result.made.ended_s, 3),
         round(result.made.took_s, 3),
         result.made.worker,
+        result.coverage,
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
 from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
 from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.processes.workers import each
@@ -47,6 +48,8 @@ class SeedResult:
     faults: tuple[tuple[str, int, int], ...] = ()
     """For each name of a fault: how many were injected, and how often they took effect."""
     made: Made = field(default=Made(), compare=False)
+    coverage: str = ""
+    """The situations that the run reached: the text of a `fieldtwin.run.campaigns.coverage.Coverage`."""
 
 
 def fingerprint(*parts: str) -> str:
@@ -70,8 +73,8 @@ def run_seed(options: VirtualOptions) -> SeedResult:
     """Make one complete run with the seed in `options`."""
     clock = WallClock()
     began_ns = clock.monotonic_ns()
-    run = VirtualRun(options)
-    run.run()
+    run, collector = VirtualRun(options), CoverageCollector()
+    run.run(watch=collector.listen)
     summary = run.summary()
     systems: dict[str, dict[str, Any]] = summary.get("systems", {})
     errors = summary["errors"] + [f"{name}: {error}" for name, one in systems.items() for error in one["errors"]]
@@ -86,6 +89,7 @@ def run_seed(options: VirtualOptions) -> SeedResult:
         summary["trace"]["sha256"],
         _by_name([one for part in [summary, *systems.values()] for one in part.get("faults", ())]),
         Made(clock.utc_ns() / 1e9, (clock.monotonic_ns() - began_ns) / 1e9, f"{platform.node()}:{os.getpid()}"),
+        collector.coverage.text(),
     )
 
 

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from fieldtwin.run.campaigns.coverage import Coverage, joined
 from fieldtwin.run.campaigns.ledger import LedgerEntry
 
 
@@ -36,6 +37,11 @@ class Runs:
         return sum({entry.seed: entry.hours for entry in self.entries}.values())
 
     @property
+    def coverage(self) -> Coverage:
+        """Return what all runs together have seen. Raises `FileInvalid`."""
+        return joined(entry.coverage for entry in self.entries)
+
+    @property
     def different(self) -> list[int]:
         """Return the seeds that have several results: a run was not reproduced, which is a defect."""
         counts = Counter(entry.seed for entry in self.entries)
@@ -45,11 +51,15 @@ class Runs:
 def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:
     """Return each different result of all ledgers once, in an order that depends on the entries only."""
     found = {entry for ledger in ledgers for entry in ledger}
-    ordered = sorted(found, key=lambda entry: (entry.what, entry.version, entry.seed, repr(entry)))
+    ordered = sorted(found, key=lambda entry: (*_place(entry), not entry.coverage, repr(entry)))
     unique: dict[tuple[object, ...], LedgerEntry] = {}
     for entry in ordered:
         unique.setdefault(entry.result, entry)
     return list(unique.values())
+
+
+def _place(entry: LedgerEntry) -> tuple[str, str, int]:
+    return entry.what, entry.version, entry.seed
 
 
 def by_fingerprint(entries: Iterable[LedgerEntry]) -> list[Runs]:

@@ -123,8 +123,11 @@ class VirtualRun:
         members = self.group.members.values()
         return *own, *(text for m in members for text in (m.system.hash, m.prototype.path.read_text(encoding="utf-8")))
 
-    def run(self, progress: Callable[[float], None] | None = None) -> None:
-        """Run the systems. `progress` is called from time to time with the elapsed virtual seconds.
+    def run(
+        self, progress: Callable[[float], None] | None = None, watch: Callable[[Trace], None] | None = None
+    ) -> None:
+        """Run the systems. `progress` is called from time to time with the elapsed virtual seconds. `watch` gets the trace before
+        its first event, to listen to it.
 
         Raises `FileInvalid` where the trace cannot be written, and `UsageError` for options that make no sense in this
         system.
@@ -135,6 +138,8 @@ class VirtualRun:
             file = self.options.trace
             self.trace = Trace(TRACE_KEPT, open_sink(file) if file else None)
             stack.callback(self.trace.close)
+            if watch is not None:
+                watch(self.trace)
             stack.callback(loop.close)
             stack.enter_context(seeded(self.seed))
             with sealed():

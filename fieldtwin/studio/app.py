@@ -17,6 +17,8 @@ from fieldtwin.studio.access import Access
 from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces, twin
 from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api_application import api_application
+from fieldtwin.studio.campaigns import api as campaigns
+from fieldtwin.studio.campaigns.ledgers import Ledgers
 from fieldtwin.studio.commissioning.jobs import Jobs
 from fieldtwin.studio.commissioning.work_folder import WorkFolder
 from fieldtwin.studio.live.gallery import Gallery
@@ -36,6 +38,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *faults.OPERATIONS,
     *scenarios.OPERATIONS,
     *traces.OPERATIONS,
+    *campaigns.OPERATIONS,
     *commissioning.OPERATIONS,
     *twin.OPERATIONS,
 )
@@ -60,6 +63,7 @@ def application(access: Access, clock: Clock, folder: Path, known: Traces | None
             app.state.launcher, app.state.gallery, app.state.folder = launcher, gallery, folder
             app.state.recordings, app.state.runner, app.state.jobs = recordings, runner, jobs
             app.state.traces = shown
+            app.state.ledgers = Ledgers(folder, clock)
             app.state.forecaster = forecaster
             yield
 

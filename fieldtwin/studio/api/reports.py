@@ -49,5 +49,9 @@ def report_response(path: Path, traces: Mapping[str, str]) -> Response:
         at = f"?t={found[2]}" if found[2] else ""
         return f'<p><a href="/#/{escape(quote(f"trace:{name}", safe=""))}/overview{at}">Show the trace at this instant</a></p>'
 
-    page = _INSTANT.sub(link, content.decode("utf-8", "replace"))
+    return page_response(_INSTANT.sub(link, content.decode("utf-8", "replace")))
+
+
+def page_response(page: str) -> Response:
+    """Return the text of a report as a page, with its content security policy."""
     return Response(page, media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": POLICY})

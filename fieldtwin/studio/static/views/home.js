@@ -5,6 +5,7 @@ import { address } from "../lib/address.js";
 import { get, post, remove } from "../lib/api.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { PREFIX } from "../lib/trace_store.js";
+import { Campaigns } from "./campaigns.js";
 
 const AGAIN_MS = 2000;
 
@@ -12,9 +13,10 @@ export function Home() {
   const [instances, error, again] = useFetched(() => get("/instances"), []);
   const [systems] = useFetched(() => get("/systems"), []);
   const [traces, unread, look] = useFetched(() => get("/traces"), []);
+  const [campaigns, unreadable, lookAgain] = useFetched(() => get("/campaigns"), []);
   const [run, failed, busy] = useAction();
   useEffect(() => {
-    const timer = setInterval(() => (again(), look()), AGAIN_MS);
+    const timer = setInterval(() => (again(), look(), lookAgain()), AGAIN_MS);
     return () => clearInterval(timer);
   }, []);
   const start = (system) =>
@@ -26,7 +28,7 @@ export function Home() {
   const finished = (instances ?? []).filter((i) => !i.running);
   return html`<main style=${{ maxWidth: "1100px", margin: "0 auto" }}>
     <h1 style=${{ margin: "14px 0 18px" }}>fieldtwin Studio</h1>
-    <${Failure} text=${error || failed || unread} />
+    <${Failure} text=${error || failed || unread || unreadable} />
     <h2>Running</h2>
     <div class="cards" style=${{ margin: "10px 0 26px" }}>
       ${running.map((i) => html`<${Card} instance=${i} run=${run} again=${again} />`)}
@@ -36,6 +38,7 @@ export function Home() {
     html`<h2>Traces of virtual runs</h2>
       <p class="soft">Runs that were recorded with <code>--trace</code>. Each is shown as of any instant.</p>
       <div class="cards traces">${traces.map((t) => html`<${TraceCard} trace=${t} key=${t.name} />`)}</div>`}
+    ${campaigns?.length > 0 && html`<${Campaigns} ledgers=${campaigns} />`}
     <h2>Start a prototype</h2>
     <p class="soft">The devices of the system are simulated; no real device is touched. ${busy && "Starting …"}</p>
     <div class="cards" style=${{ margin: "10px 0 26px" }}>

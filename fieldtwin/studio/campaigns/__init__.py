@@ -1,0 +1,1 @@
+"""Campaigns of many seeds in Studio: their ledgers, as they grow."""

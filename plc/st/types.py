@@ -161,6 +161,17 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
+class Nothing:
+    """The result of a function that has none (IEC 61131-3, 6.6.2.2). It fits no type."""
+
+    def __str__(self) -> str:
+        return "no result"
+
+
+NOTHING = Nothing()
+
+
+@dataclass(frozen=True, slots=True)
 class MessagesIn:
     """A program's input of messages (VAR_INPUT name : MESSAGES): the messages that are new in this scan."""
 
@@ -180,7 +191,7 @@ class MessagesOut:
 
 
 Type = (
-    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | MessagesIn | MessagesOut
+    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | MessagesIn | MessagesOut | Nothing
 )  # fmt: skip
 
 

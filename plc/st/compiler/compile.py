@@ -274,7 +274,6 @@ class _Unit:
     # -- functions --------------------------------------------------------------------------------------------------------
 
     def _signature(self, pou: t.Pou) -> Signature:
-        assert pou.returns is not None
         found: dict[str, list[Parameter]] = {"VAR_INPUT": [], "VAR_IN_OUT": [], "VAR_OUTPUT": []}
         for block in pou.blocks:
             for v in block.variables:
@@ -284,7 +283,7 @@ class _Unit:
                     found[block.kind].append(Parameter(v.name, kind, initial))
         return Signature(
             pou.name,
-            self.declarations.type_of(pou.returns),
+            self.declarations.type_of(pou.returns) if pou.returns is not None else ty.NOTHING,
             tuple(found["VAR_INPUT"]),
             tuple(found["VAR_IN_OUT"]),
             tuple(found["VAR_OUTPUT"]),
@@ -296,14 +295,17 @@ class _Unit:
         symbols = self._symbols(pou, "")
         if key in symbols:
             self.env.fail(pou.pos, f"{pou.name} is the name of the function's result, and is declared again")
-        symbols.setdefault(key, Symbol(pou.name, signature.returns, f"v_{key}"))
+        result = "None" if pou.returns is None else f"v_{key}"
+        if pou.returns is not None:
+            symbols.setdefault(key, Symbol(pou.name, signature.returns, result))
         arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
         body = Statements(self.env, symbols, self.out, pou.name.lower())
-        results = [f"v_{key}", *(f"v_{p.name.lower()}" for p in signature.outputs)]
+        results = [result, *(f"v_{p.name.lower()}" for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
         with self.out.block(f"def f_{key}({arguments}):", pou.pos):
             self.out.step(pou.pos)
-            self.out.line(f"v_{key} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
+            if pou.returns is not None:
+                self.out.line(f"{result} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
             self._initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
             body.body(pou.body)
             self.out.line(body.leave, pou.pos)

@@ -36,9 +36,9 @@ class Declarations:
             with env.declaring(declared.name, env.faulty):
                 if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
                     env.fail(declared.pos, f"type {declared.name} is declared twice")
-                self._types[declared.name.lower()] = declared
                 if isinstance(declared, t.EnumDecl):
                     self._declare_enum(declared)
+                self._types[declared.name.lower()] = declared
 
     def resolve(self) -> None:
         """Resolve all types, after the global constants are known, because limits may use them."""
@@ -205,6 +205,7 @@ class Declarations:
                 self.env.fail(declared.pos, f"{declared.name} has the value {name} twice")
             values[name] = number
             number += 1
+        self._check_base(declared, values)
         first = next(iter(values.values()))
         enum = ty.Enum(declared.name, values, first)
         if isinstance(declared.initial, t.Ref):
@@ -215,6 +216,22 @@ class Declarations:
         self.env.types[declared.name.lower()] = enum
         for name, value in values.items():
             self.env.enum_values.setdefault(name.lower(), []).append((enum, value))
+
+    def _check_base(self, declared: t.EnumDecl, values: dict[str, int]) -> None:
+        """Check that each value of an enumeration fits the type that is stated for them, an elementary type."""
+        if declared.base is None:
+            return
+        base = ty.ELEMENTARY.get(declared.base.name.upper())
+        if base is None or base.kind not in ("int", "bits"):
+            expected = "an integer type or a bit string, such as INT"
+            self.env.fail(
+                declared.base.pos, "the type of an enumeration's values", expected=expected, got=declared.base.name
+            )
+        for name, value in values.items():
+            if not base.low <= value <= base.high:
+                self.env.fail(
+                    declared.pos, f"{name} is outside {base}", expected=f"{base.low} to {base.high}", got=str(value)
+                )
 
     def _subrange(self, spec: t.SubrangeType) -> ty.Subrange:
         base = self.named(spec.name, spec.pos)

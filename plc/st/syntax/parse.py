@@ -200,7 +200,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items
-        returns = rest.pop(0) if kind == "FUNCTION" else None
+        returns = rest.pop(0) if isinstance(rest[0], t.TypeSpec) else None
         return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), rest[-1])
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
@@ -250,8 +250,11 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
         name, *rest = items
-        values = tuple(i for i in rest if i[0] != "initial")
-        return t.EnumDecl(self._pos(name), str(name), values, _initial(rest))
+        bases = [t.NamedType(self._pos(i), str(i)) for i in rest if isinstance(i, Token)]
+        if len(bases) > 1:
+            raise _Bad(name, "an enumeration with two types of its values")
+        values = tuple(i for i in rest if isinstance(i, tuple) and i[0] != "initial")
+        return t.EnumDecl(self._pos(name), str(name), values, _initial(rest), bases[0] if bases else None)
 
     def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
         return str(items[0]), items[1] if len(items) > 1 else None

@@ -168,12 +168,8 @@ class _Converter:
                 raise self._fail(found, f"{self._name(pou)} has an unsupported part: {unsupported.lower()}")
         interface = pou.find("interface")
         returns = interface.find("returnType") if interface else None
-        if kind == "FUNCTION" and (returns is None or not returns.children):
-            raise self._fail(pou, f"function {self._name(pou)} has no type", expected="<returnType>")
-        head = f"{kind} {self._name(pou)}"
-        self._put(
-            pou.line, head + (f" : {self._type_of(returns.children[0])}" if kind == "FUNCTION" and returns else "")
-        )
+        result = returns.children[0] if kind == "FUNCTION" and returns is not None and returns.children else None
+        self._put(pou.line, f"{kind} {self._name(pou)}" + (f" : {self._type_of(result)}" if result is not None else ""))
         for block in interface.children if interface else ():
             if block.tag in _BLOCKS:
                 self._variables(block)

@@ -92,12 +92,13 @@ class StructDecl:
 
 @dataclass(frozen=True, slots=True)
 class EnumDecl:
-    """An enumeration. `values`: names with their stated number, if any."""
+    """An enumeration. `values`: names with their stated number, if any. `base`: the type of the values, if it is stated."""
 
     pos: Pos
     name: str
     values: tuple[tuple[str, int | None], ...]
     initial: Init | None
+    base: NamedType | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,8 @@ class VarBlock:
 
 @dataclass(frozen=True, slots=True)
 class Pou:
-    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is a function's type."""
+    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is the type of a
+    function's result; None for a function without a result."""
 
     pos: Pos
     kind: str

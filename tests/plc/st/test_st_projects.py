@@ -118,6 +118,12 @@ def test_a_name_with_an_error_is_reported_once(tmp_path: Path) -> None:
     ]
 
 
+def test_an_enumeration_with_an_error_is_reported_once(tmp_path: Path) -> None:
+    file = tmp_path / "p.st"
+    file.write_text("TYPE T : (a, b, a); END_TYPE PROGRAM p VAR x : T; END_VAR x := 1; END_PROGRAM")
+    assert errors_of(file) == [":1:6: T has the value a twice"]
+
+
 def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert errors_of(tmp_path) == [": a folder without a program; expected files .st, .iecst, .xml"]
     monkeypatch.setattr(source_files, "MAX_FILES", 2)

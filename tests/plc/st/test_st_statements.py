@@ -302,3 +302,35 @@ def test_which_program_is_meant() -> None:
     assert program(two, "B").variables.keys() == {"x"}
     with pytest.raises(FileInvalid, match="no PROGRAM c"):
         program(two, "c")
+
+
+def test_a_function_without_a_result_is_called_as_a_statement() -> None:
+    before = """FUNCTION note VAR_INPUT n : INT; END_VAR VAR_OUTPUT twice : INT; END_VAR VAR_IN_OUT total : INT; END_VAR
+    IF n < 0 THEN RETURN; END_IF twice := 2 * n; total := total + n; END_FUNCTION
+    FUNCTION nothing END_FUNCTION"""
+    got = run("sum, two : INT;", "note(n := 4, total := sum, twice => two); note(-1, sum); nothing();", before)
+    assert (got["sum"], got["two"]) == (4, 8)
+
+
+@pytest.mark.parametrize(
+    "use", ["x := nothing();", "x := 1 + nothing();", "IF nothing() THEN x := 1; END_IF", "x := ABS(nothing());"]
+)
+def test_a_function_without_a_result_has_no_value(use: str) -> None:
+    with pytest.raises(FileInvalid, match=r"got .*no result"):
+        run("x : INT;", use, "FUNCTION nothing END_FUNCTION")
+
+
+def test_an_enumeration_may_state_the_type_of_its_values() -> None:
+    for types in (
+        "TYPE Light : USINT (red := 7, green) := green; END_TYPE",
+        "TYPE Light : (red := 7, green) USINT := green; END_TYPE",
+    ):
+        got = run("l : Light; r : Light := red;", "", types)
+        assert (got["l"], got["r"]) == (8, 7)
+    for types, reason in (
+        ("TYPE Light : USINT (red := 255, green); END_TYPE", "green is outside USINT; expected 0 to 255; got 256"),
+        ("TYPE Light : REAL (red); END_TYPE", "the type of an enumeration's values"),
+        ("TYPE Light : INT (red) INT; END_TYPE", "two types"),
+    ):
+        with pytest.raises(FileInvalid, match=reason):
+            run("", "", types)

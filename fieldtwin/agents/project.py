@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError, os_reason
 from fieldtwin.scenarios.language.file_name import SUFFIX
+from fieldtwin.scenarios.language.new_file import create_scenario_file
 from fieldtwin.twin.site.data_files import data_root, search_path
 
 MOST_FILES = 1_000
@@ -92,13 +93,7 @@ class Project:
     def save_scenario(self, text: str, content: str) -> Path:
         """Write a new scenario file. Raises `UsageError` for an existing file or a different kind of file."""
         path = self.inside(text if text.endswith(SUFFIX) else text + SUFFIX)
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(content)
-        except FileExistsError as e:
-            raise UsageError(f"{self.name_of(path)} exists already", hint="choose another name") from e
-        except OSError as e:
-            raise UsageError(f"{self.name_of(path)} cannot be written: {os_reason(e)}") from e
+        create_scenario_file(path, content, self.name_of(path))
         return path
 
 

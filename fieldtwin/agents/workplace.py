@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Collection
 from pathlib import Path
 
+from fieldtwin.agents.device_jobs import DeviceJobs
 from fieldtwin.agents.plant_writes import PlantWrites
 from fieldtwin.agents.project import Project
 from fieldtwin.agents.results import Results
@@ -27,14 +28,18 @@ OWN = "agent-"
 
 
 class Workplace(AsyncResource):
-    """The project, the prototypes of the agent, the running systems `plants` that it may read, and the `writes` that it proposes.
+    """The project, the prototypes of the agent, the running systems `plants` that it may read, the `writes` that it proposes,
+    and the `devices` that it may read without a running system.
 
     Leaving the block ``async with`` stops all prototypes and the scenario that is running.
     """
 
-    def __init__(self, folder: Path, plants: Collection[str], writes: PlantWrites, clock: Clock) -> None:
+    def __init__(
+        self, folder: Path, plants: Collection[str], writes: PlantWrites, devices: DeviceJobs, clock: Clock
+    ) -> None:
         super().__init__()
         self.writes = writes
+        self.devices = devices
         self.project = Project(folder)
         self.plants = frozenset(plants)
         self.runner = ScenarioRunner()
@@ -47,6 +52,7 @@ class Workplace(AsyncResource):
         await self._stack.enter_async_context(self._launcher)
         await self._stack.enter_async_context(self._gallery)
         await self._stack.enter_async_context(self.runner)
+        await self._stack.enter_async_context(self.devices)
         nursery = await self._stack.enter_async_context(Nursery())
         nursery.start(self.writes.expire(), "expiry of proposals")
 

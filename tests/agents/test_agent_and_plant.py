@@ -43,16 +43,21 @@ def test_a_thousand_random_calls_change_nothing_on_a_plant(tmp_path: Path) -> No
     project = write_project(tmp_path)
 
     async def work() -> tuple[Counter[str], Counter[str]]:
-        async with plant(tmp_path, project) as (_, bus, port), agent(tmp_path, project, "--plant", "shed") as one:
+        enabled = ("--plant", "shed", "--allow-proposals", "shed", "--allow-devices", str(project / "shed.yaml"))
+        async with plant(tmp_path, project) as (_, bus, port), agent(tmp_path, project, *enabled) as one:
             await one.data("wait_for_tag", instance="shed", tag="tank.valve", quality="good", seconds=30)
             before = await asyncio.to_thread(registers, port)
+            files = contents(project)
             audited = (tmp_path / "shed" / "audit.jsonl").read_bytes()
             forces = (await one.data("get_status", instance="shed"))["plc"]
             called, failed = await random_calls(one)
             assert await asyncio.to_thread(registers, port) == before
             assert (tmp_path / "shed" / "audit.jsonl").read_bytes() == audited
             assert (await one.data("get_status", instance="shed"))["plc"] == forces
-            assert set(bus.requests) <= READS, bus.requests
+            after = contents(project)
+            assert {name: after.get(name) for name in files} == files
+            assert all(name.endswith((".scenario.yaml", ".jsonl")) for name in after.keys() - files.keys())
+            assert set(bus.requests) <= READS | {0x11}, bus.requests
             assert sum(bus.requests.values()) > 10
             return called, failed
 
@@ -62,6 +67,11 @@ def test_a_thousand_random_calls_change_nothing_on_a_plant(tmp_path: Path) -> No
     assert CALLS // 10 < sum(failed.values()) < CALLS
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of the project."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 async def random_calls(one: Agent) -> tuple[Counter[str], Counter[str]]:
     """Make random calls of all tools, and return the number of calls and of errors by tool."""
     rng = random.Random(SEED)
@@ -69,7 +79,7 @@ async def random_calls(one: Agent) -> tuple[Counter[str], Counter[str]]:
     called: Counter[str] = Counter()
     failed: Counter[str] = Counter()
     for _ in range(CALLS):
-        name = rng.choice([*tools, "write_tag"])
+        name = rng.choice([*tools, "write_tag", "approve"])
         properties = tools.get(name, {}).get("properties", {"tag": {}, "value": {}})
         given = {key: value_for(key, rng) for key in properties if rng.random() < 0.95}
         result = await one.client.session.call_tool(name, given)
@@ -87,8 +97,27 @@ VALUES: dict[str, list[Any]] = {
     "tags": [["tank.valve"], [], ["x"]],
     "value": [0, 1, 1, 1e9, -1.5, True, None],
     "fault": [{"name": "silence", "device": "tank"}, {"name": "set", "device": "tank"}, {}, {"name": 5}],
-    "system": ["shed.yaml", "nothing.yaml", "../shed.yaml", "tank.yaml"],
-    "path": ["shed.yaml", "silent.scenario.yaml", "../x", "x.scenario.yaml", "tank.yaml", "shed.prototype.yaml"],
+    "system": ["shed.yaml", "nothing.yaml", "../shed.yaml", "tank.yaml", "shed", "shed"],
+    "device": ["tank", "tank", "pump", "--log=x"],
+    "bus": ["lan", "lan", "wan", "tcp://127.0.0.1:502"],
+    "items": [["valve"], [], ["holding:0"], ["--log=x"], ["x"]],
+    "address": [1, 2, -1, 300],
+    "addresses": ["1", "1-2", "--all", "x"],
+    "ranges": [["holding:0..1"], ["--out=x"], [5]],
+    "passes": [1, 0, 10**6],
+    "job": [1, 2, 3, 0, -1],
+    "proposal": [1, 2, 3, 0, -1],
+    "reason": ["why not", "", "x" * 300, "\x1b[2J"],
+    "path": [
+        "shed.yaml",
+        "silent.scenario.yaml",
+        "../x",
+        "d.jsonl",
+        "e.jsonl",
+        "x.scenario.yaml",
+        "tank.yaml",
+        "shed.prototype.yaml",
+    ],
     "text": [SCENARIO, "scenario: x", "", "{", SCENARIO.replace("tank.level", "tank.valve")],
     "words": ["stale", "timeout", "exception 02", "?", ""],
     "quality": ["good", "bad", ""],

@@ -47,6 +47,7 @@ def test_tools_that_change_something_are_those_of_prototypes_new_scenarios_and_p
         "save_scenario": "project",
         "propose_write": "proposal",
         "withdraw_proposal": "proposal",
+        "start_dump": "project",
     }
 
 

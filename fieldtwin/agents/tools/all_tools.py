@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
-from fieldtwin.agents.tools import instances, knowledge, plants, prototypes, records, scenarios
+from fieldtwin.agents.tools import devices, instances, knowledge, plants, prototypes, records, scenarios
 
-TOOLS = (*knowledge.TOOLS, *records.TOOLS, *instances.TOOLS, *prototypes.TOOLS, *scenarios.TOOLS, *plants.TOOLS)
+TOOLS = (
+    *knowledge.TOOLS,
+    *records.TOOLS,
+    *instances.TOOLS,
+    *prototypes.TOOLS,
+    *scenarios.TOOLS,
+    *plants.TOOLS,
+    *devices.TOOLS,
+)

@@ -12,8 +12,8 @@ import msgspec
 from fieldtwin.agents.project import shipped_systems
 from fieldtwin.agents.tool import Tool
 from fieldtwin.agents.workplace import Workplace
+from fieldtwin.emulators.faults.description import describe_fault
 from fieldtwin.emulators.faults.registry import FAULTS
-from fieldtwin.emulators.faults.schema import aims_of
 from fieldtwin.explain.lookup import explain
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.yaml_file import parse
@@ -70,16 +70,7 @@ async def explain_words(work: Workplace, given: OfWords) -> list[dict[str, Any]]
 
 async def list_faults(work: Workplace, _: Any) -> list[dict[str, Any]]:
     """Return every kind of fault with its parameters as JSON schema, and the keys by which it is aimed."""
-    return [
-        {
-            "name": name,
-            "on": kind.kind.value,
-            "summary": kind.summary,
-            "aims": aims_of(kind),
-            "parameters": kind.form.model_json_schema().get("properties", {}),
-        }
-        for name, kind in FAULTS.items()
-    ]
+    return [describe_fault(kind) for kind in FAULTS.values()]
 
 
 async def draw_system(work: Workplace, given: OfSystem) -> str:

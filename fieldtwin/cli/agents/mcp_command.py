@@ -16,6 +16,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
 from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.site.system import load_system
 
 AUDIT = "agent-audit.jsonl"
 READY = "MCP  →  "
@@ -67,6 +68,14 @@ class HttpOptions:
     help="Let the agent read this running system, and propose writes to it. A user confirms each with `fieldtwin approve`.",
 )
 @click.option(
+    "--allow-devices",
+    "systems",
+    multiple=True,
+    metavar="SYSTEM",
+    allow_from_autoenv=False,
+    help="Let the agent open the buses of this system file to read, scan, dump and identify devices.",
+)
+@click.option(
     "--audit",
     type=click.Path(dir_okay=False, path_type=Path),
     default=None,
@@ -74,19 +83,26 @@ class HttpOptions:
 )
 @group("HTTP", http=HttpOptions)
 def command(
-    project: Path, plants: tuple[str, ...], proposals: tuple[str, ...], audit: Path | None, http: HttpOptions
+    project: Path,
+    plants: tuple[str, ...],
+    proposals: tuple[str, ...],
+    systems: tuple[str, ...],
+    audit: Path | None,
+    http: HttpOptions,
 ) -> int:
     """Serve tools to a language-model agent over the Model Context Protocol (MCP), on stdin and stdout or over HTTP.
 
     The agent reads the files in the folder PROJECT, explanations and documentation; starts prototypes and injects faults into
     them; checks, saves and runs scenarios. It reads a running plant only if --plant names it, and no tool writes to a plant:
-    a write that the agent proposes (--allow-proposals) waits until a user confirms it. The audit log has every call.
+    a write that the agent proposes (--allow-proposals) waits until a user confirms it. It opens the buses of a system
+    to read devices only if --allow-devices names it. The audit log has every call.
     """
     try:
         from fieldtwin.agents.mcp_server import serve_http, serve_stdio
     except ModuleNotFoundError as e:
         raise UsageError(f"the server for agents needs {e.name}", hint=install_hint("mcp")) from e
     from fieldtwin.agents.calls import Calls
+    from fieldtwin.agents.device_jobs import DeviceJobs
     from fieldtwin.agents.http_place import HttpPlace, parsed_address
     from fieldtwin.agents.library import Library
     from fieldtwin.agents.plant_writes import PlantWrites
@@ -104,9 +120,10 @@ def command(
     log = AuditLog(audit, clock)
     by = "agent over stdio" if place is None else "agent over HTTP"
     writes = PlantWrites(proposals, clock, by, audit)
+    devices = DeviceJobs({system.name: system for system in map(load_system, systems)}, project, log, by)
 
     async def serve() -> None:
-        async with Workplace(project, (*plants, *proposals), writes, clock) as workplace:
+        async with Workplace(project, (*plants, *proposals), writes, devices, clock) as workplace:
             calls = Calls(TOOLS, Library(workplace), workplace, log, by)
             if place is None:
                 await serve_stdio(calls)

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import stdout
-from fieldtwin.emulators.faults.fault import Fault
 
 
 @click.command("faults")
@@ -26,10 +25,11 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
     id, bus or device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
     from, until, probability.
     """
+    from fieldtwin.emulators.faults.description import describe_fault
     from fieldtwin.emulators.faults.registry import FAULTS, fault_class
 
     chosen = [fault_class(name) for name in names] or list(FAULTS.values())
-    described = [_described(kind) for kind in chosen]
+    described = [describe_fault(kind) for kind in chosen]
     if as_json:
         json.dump(described, sys.stdout, indent=2)
         sys.stdout.write("\n")
@@ -46,33 +46,10 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
     return 0
 
 
-def _described(kind: type[Fault]) -> dict[str, Any]:
-    """Return a fault as JSON data, with its parameters as a JSON schema."""
-    from fieldtwin.emulators.faults.schema import aims_of
-
-    own = kind.form.model_json_schema().get("properties", {})
-    for parameter in own.values():
-        parameter.pop("title", None)
-    ways = sorted(way.value for way in kind.ways)
-    return {
-        "name": kind.name,
-        "on": kind.kind.value,
-        "summary": kind.summary,
-        "direction": ways,
-        "aims": aims_of(kind),
-        "parameters": own,
-        **({"codes": {_code(code): text for code, text in kind.codes.items()}} if kind.codes else {}),
-    }
-
-
 def _told(described: dict[str, Any], *, codes: bool) -> str:
     own = ", ".join(f"{name}: {_number(p['default'])}" for name, p in described["parameters"].items())
     known = "".join(f"\n{code}  {text}" for code, text in described.get("codes", {}).items()) if codes else ""
     return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "") + known
-
-
-def _code(code: int) -> str:
-    return f"0x{code:08X}" if code > 0xFF else str(code)
 
 
 def _number(value: float | str | None) -> str:

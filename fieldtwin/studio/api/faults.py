@@ -19,19 +19,10 @@ class InjectFault(msgspec.Struct, forbid_unknown_fields=True):
 
 async def list_fault_kinds(request: Request) -> list[dict[str, Any]]:
     """Return every kind of fault with its parameters as JSON schema, and the targets at which it can be aimed."""
-    from fieldtwin.emulators.faults.registry import FAULTS  # here: a plant has no emulators installed
-    from fieldtwin.emulators.faults.schema import aims_of
+    from fieldtwin.emulators.faults.description import describe_fault  # here: a plant has no emulators installed
+    from fieldtwin.emulators.faults.registry import FAULTS
 
-    return [
-        {
-            "name": name,
-            "kind": kind.kind.value,
-            "summary": kind.summary,
-            "aims": aims_of(kind),
-            "parameters": kind.form.model_json_schema().get("properties", {}),
-        }
-        for name, kind in FAULTS.items()
-    ]
+    return [describe_fault(kind) for kind in FAULTS.values()]
 
 
 async def list_faults(request: Request) -> dict[str, Any]:

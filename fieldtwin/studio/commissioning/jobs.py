@@ -36,10 +36,14 @@ RUNNING, DONE, FINDINGS, STOPPED, FAILED = "running", "done", "findings", "stopp
 
 
 class Jobs:
-    """All jobs of the guide. Use it as ``async with Jobs(folder) as jobs``; leaving the block stops every job that still runs."""
+    """All jobs of the guide. Use it as ``async with Jobs(folder) as jobs``; leaving the block stops every job that still runs.
 
-    def __init__(self, folder: WorkFolder) -> None:
+    Each job is stopped after `longest_s` seconds.
+    """
+
+    def __init__(self, folder: WorkFolder, longest_s: float = LONGEST_S) -> None:
         self.folder = folder
+        self._longest_s = longest_s
         self.forgotten = 0
         self._jobs: dict[int, Job] = {}
         self._listeners: set[asyncio.Event] = set()
@@ -69,7 +73,7 @@ class Jobs:
         if len(running) >= MOST_RUNNING:
             raise UsageError("too many steps at once", expected=f"at most {MOST_RUNNING}", hint="stop an emulator")
         self._last += 1
-        job = self._jobs[self._last] = Job(self._last, step, made, self.folder, self._tell)
+        job = self._jobs[self._last] = Job(self._last, step, made, self.folder, self._longest_s, self._tell)
         try:
             await job.begin()
         except BaseException:
@@ -123,13 +127,16 @@ class Jobs:
 class Job:
     """A step that runs or has run."""
 
-    def __init__(self, number: int, step: Step, command: Command, folder: WorkFolder, changed: Any) -> None:
+    def __init__(
+        self, number: int, step: Step, command: Command, folder: WorkFolder, longest_s: float, changed: Any
+    ) -> None:
         self.number = number
         self.command = command
         self.step = str(type(step).__struct_config__.tag)
         self.result: Any = None
         self._form = msgspec.to_builtins(step)
         self._folder = folder
+        self._longest_s = longest_s
         self._changed = changed
         self._lines: deque[str] = deque(maxlen=MOST_LINES)
         self._count = 0
@@ -196,13 +203,13 @@ class Job:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         try:
-            async with asyncio.timeout(LONGEST_S):
+            async with asyncio.timeout(self._longest_s):
                 output, _ = await asyncio.gather(
                     self._read(self._process.stdout), self._read_lines(self._process.stderr)
                 )
                 self._exit_code = await self._process.wait()
         except TimeoutError:
-            self._trouble = f"stopped after {LONGEST_S:g} s"
+            self._trouble = f"stopped after {self._longest_s:g} s"
         except child_process.OutputTooLong:
             self._trouble = f"stopped: the result is longer than {MOST_RESULT_BYTES} bytes"
         else:
@@ -262,6 +269,11 @@ class Job:
                     file.write(output)
             except OSError as e:
                 self._trouble = f"cannot write {self.command.out}: {e.strerror or e}"
+
+    async def wait(self) -> None:
+        """Wait until the job has ended. If the waiting is cancelled, the job runs on."""
+        if self._following is not None:
+            await asyncio.wait([self._following])
 
     async def stop(self) -> None:
         """Interrupt the command as Ctrl-C does, and kill it if it does not end."""

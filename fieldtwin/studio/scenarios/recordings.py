@@ -9,6 +9,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.language.file_name import SUFFIX
+from fieldtwin.scenarios.language.new_file import create_scenario_file
 from fieldtwin.studio.live.attachment import Attachment
 from fieldtwin.studio.scenarios.proposal import as_scenario
 from fieldtwin.studio.scenarios.recorder import Recorder
@@ -86,13 +87,7 @@ class Recordings:
             expected = "at most 60 letters, digits, dots, hyphens and underscores"
             raise UsageError("the name of the file", expected=expected, got=repr(name[:60]))
         path = folder / f"{name}{SUFFIX}"
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(draft)
-        except FileExistsError as e:
-            raise UsageError(f"{path.name} exists already", hint="choose another name") from e
-        except OSError as e:
-            raise UsageError(f"{path} cannot be written: {e.strerror or e}") from e
+        create_scenario_file(path, draft)
         return path
 
     def _recorder(self, attachment: Attachment) -> Recorder | None:

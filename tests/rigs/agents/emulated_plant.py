@@ -59,17 +59,24 @@ def registers(port: int) -> list[list[int]]:
 
 
 @asynccontextmanager
-async def plant(root: Path, project: Path) -> AsyncIterator[tuple[Fieldtwin, Bus, int]]:
-    """The site as a plant that allows writes, against an emulated device on a socket."""
+async def emulated_device(root: Path, project: Path) -> AsyncIterator[tuple[Bus, int]]:
+    """The tank on a socket: the relay to which the bus of shed.yaml leads, and the port of the tank itself."""
     port = free_port()
     bus = Bus(port)
     with fieldtwin(
         root, "emulate", str(project / "tank.yaml"), "--on", f"tcp://127.0.0.1:{port}", name="emulate"
     ) as device:
-        wait_for(lambda: str(port) in device.out + device.err, WITHIN_S, "the emulated device")
+        await asyncio.to_thread(wait_for, lambda: str(port) in device.out + device.err, WITHIN_S, "the emulated device")
         async with bus.serving() as relay:
             system = project / "shed.yaml"
             system.write_text(system.read_text().replace("tank:502", f"127.0.0.1:{relay}"))
-            with fieldtwin(root, "run", str(system), "--plant", "--allow-writes") as run:
-                await asyncio.to_thread(wait_for, (root / "shed" / "gateway.sock").is_socket, WITHIN_S, "the gateway")
-                yield run, bus, port
+            yield bus, port
+
+
+@asynccontextmanager
+async def plant(root: Path, project: Path) -> AsyncIterator[tuple[Fieldtwin, Bus, int]]:
+    """The site as a plant that allows writes, against an emulated device on a socket."""
+    async with emulated_device(root, project) as (bus, port):
+        with fieldtwin(root, "run", str(project / "shed.yaml"), "--plant", "--allow-writes") as run:
+            await asyncio.to_thread(wait_for, (root / "shed" / "gateway.sock").is_socket, WITHIN_S, "the gateway")
+            yield run, bus, port

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from agent_site import Agent, Failed, agent, write_project
-from emulated_plant import READS, Bus, emulated_device, registers
+from emulated_plant import COMMISSIONING_READS, READ_DIAGNOSTICS, Bus, emulated_device, registers
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 
@@ -52,7 +52,8 @@ def test_an_agent_reads_identifies_scans_and_dumps_a_device(tmp_path: Path) -> N
                 await one.data("start_dump", **dump)
 
             assert await asyncio.to_thread(registers, port) == before
-            assert set(bus.requests) <= READS | {0x11}, bus.requests
+            assert set(bus.requests) <= COMMISSIONING_READS, bus.requests
+            assert bus.diagnostics <= READ_DIAGNOSTICS
             jobs = [entry for entry in one.entries() if entry["action"] == "job"]
             assert [entry["tool"] for entry in jobs] == ["read", "read", "identify", "scan", "dump"]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from agent_site import SCENARIO, Agent, Failed, agent, write_project
-from emulated_plant import READS, plant, registers
+from emulated_plant import COMMISSIONING_READS, READ_DIAGNOSTICS, plant, registers
 from mcp_types import TextContent
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
@@ -57,7 +57,8 @@ def test_a_thousand_random_calls_change_nothing_on_a_plant(tmp_path: Path) -> No
             after = contents(project)
             assert {name: after.get(name) for name in files} == files
             assert all(name.endswith((".scenario.yaml", ".jsonl")) for name in after.keys() - files.keys())
-            assert set(bus.requests) <= READS | {0x11}, bus.requests
+            assert set(bus.requests) <= COMMISSIONING_READS, bus.requests
+            assert bus.diagnostics <= READ_DIAGNOSTICS
             assert sum(bus.requests.values()) > 10
             return called, failed
 

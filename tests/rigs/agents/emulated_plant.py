@@ -14,6 +14,10 @@ from pyModbusTCP.client import ModbusClient
 WITHIN_S = 60.0
 READS = {1, 2, 3, 4, 0x2B}
 """Function codes of Modbus requests that change nothing."""
+COMMISSIONING_READS = READS | {7, 8, 0x0B, 0x0C, 0x11}
+"""Those that `fieldtwin dump` and `fieldtwin identify` also send. Diagnostics (08h) depend on their sub-function."""
+READ_DIAGNOSTICS = {0, 2, *range(0x0B, 0x13)}
+"""The sub-functions of the diagnostics that change nothing (AP 6.8.1)."""
 
 
 class Bus:
@@ -21,6 +25,8 @@ class Bus:
 
     def __init__(self, device_port: int) -> None:
         self.requests: Counter[int] = Counter()
+        self.diagnostics: set[int] = set()
+        """The sub-functions of the diagnostics (08h) that were requested."""
         self._device_port = device_port
 
     @asynccontextmanager
@@ -39,6 +45,8 @@ class Bus:
                 header = await reader.readexactly(6)
                 body = await reader.readexactly(int.from_bytes(header[4:6], "big"))
                 self.requests[body[1]] += 1
+                if body[1] == 8:
+                    self.diagnostics.add(int.from_bytes(body[2:4], "big"))
                 device_writer.write(header + body)
         except (asyncio.IncompleteReadError, ConnectionError):
             pass

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -73,7 +73,7 @@ class Jobs:
         if len(running) >= MOST_RUNNING:
             raise UsageError("too many steps at once", expected=f"at most {MOST_RUNNING}", hint="stop an emulator")
         self._last += 1
-        job = self._jobs[self._last] = Job(self._last, step, made, self.folder, self._longest_s, self._tell)
+        job = self._jobs[self._last] = Job(self._last, step, made, self.folder, self._tell, self._longest_s)
         try:
             await job.begin()
         except BaseException:
@@ -128,7 +128,13 @@ class Job:
     """A step that runs or has run."""
 
     def __init__(
-        self, number: int, step: Step, command: Command, folder: WorkFolder, longest_s: float, changed: Any
+        self,
+        number: int,
+        step: Step,
+        command: Command,
+        folder: WorkFolder,
+        changed: Callable[[], None],
+        longest_s: float = LONGEST_S,
     ) -> None:
         self.number = number
         self.command = command

@@ -50,6 +50,24 @@ def test_an_agent_with_the_token_calls_tools(url: str) -> None:
     asyncio.run(work())
 
 
+def test_an_agent_over_http_needs_the_permission_of_the_user_too(url: str) -> None:
+    async def work() -> None:
+        headers = {"Authorization": f"Bearer {TOKEN}"}
+        async with (
+            httpx2.AsyncClient(headers=headers, timeout=30) as http,
+            Client(streamable_http_client(url, http_client=http)) as client,
+        ):
+            for tool, given, option in (
+                ("propose_write", {"instance": "a", "tag": "b.c", "value": 1, "reason": ""}, "--allow-proposals"),
+                ("read_device", {"system": "a", "device": "b"}, "--allow-devices"),
+            ):
+                result = await client.call_tool(tool, given)
+                assert result.is_error
+                assert option in str(result.content[0])
+
+    asyncio.run(work())
+
+
 def test_requests_without_the_token_or_from_other_sites_are_refused(url: str) -> None:
     body = {"jsonrpc": "2.0", "id": 1, "method": "tools/list"}
     valid = {"Authorization": f"Bearer {TOKEN}"}

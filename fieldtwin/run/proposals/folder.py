@@ -75,8 +75,9 @@ class ProposalFolder:
         self.expire()
         proposal = self._read(self._path(number, WAITING), Proposal)
         if proposal is None:
-            waiting = ", ".join(map(str, sorted(self._numbers(WAITING)))) or "none waits"
-            raise UsageError(f"proposal {number} does not wait: {self.state(number)}", expected=waiting)
+            waiting = ", ".join(map(str, sorted(self._numbers(WAITING))))
+            expected = f"a proposal that waits: {waiting}" if waiting else "a proposal that waits, but there is none"
+            raise UsageError(f"proposal {number} does not wait: {self.state(number)}", expected=expected)
         return proposal
 
     def state(self, number: int) -> str:

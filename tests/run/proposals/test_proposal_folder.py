@@ -127,6 +127,18 @@ def test_numbers_are_unique_and_the_number_of_waiting_proposals_is_limited(
         folder.add(proposal)
 
 
+def test_the_error_about_an_unknown_number_names_the_proposals_that_wait(
+    folder: ProposalFolder, proposal: Proposal
+) -> None:
+    with pytest.raises(
+        UsageError, match="proposal 3 does not wait: unknown; expected a proposal that waits, but there"
+    ):
+        folder.open(3)
+    folder.add(proposal)
+    with pytest.raises(UsageError, match=r"expected a proposal that waits: 1$"):
+        folder.open(3)
+
+
 def test_only_the_latest_ended_proposals_are_kept(folder: ProposalFolder, proposal: Proposal) -> None:
     for _ in range(MOST_KEPT + 5):
         folder.refuse(folder.add(proposal), "refused", "user anna")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -10,8 +11,10 @@ import click
 from fieldtwin.cli.option_groups import option
 from fieldtwin.cli.options import Duration
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.run.places.names import LOCAL, PLACES
 
 if TYPE_CHECKING:
+    from fieldtwin.run.places.place import Place
     from fieldtwin.run.virtual.fault_schedule import RandomFaults
 
 
@@ -19,10 +22,14 @@ def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[s
     return tuple(part.strip() for part in value.split(",") if part.strip())
 
 
+def _places(context: click.Context, param: click.Parameter, start: str) -> list[str]:
+    return [place for place in PLACES if place.startswith(start)]
+
+
 @dataclass(frozen=True)
 class SeedOptions:
     """The options for the seeds of several runs, as text such as ``1..200`` or empty, for the part of them that this computer
-    runs, such as ``3/16`` or empty, and for the number of runs at a time.
+    runs, such as ``3/16`` or empty, for the place of the runs, and for the number of runs at a time.
     """
 
     seeds: str = option(
@@ -37,7 +44,38 @@ class SeedOptions:
         metavar="3/16",
         help="With --seeds: run only this part of the seeds, for several computers or CI jobs.",
     )
-    jobs: int = option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time.")
+    jobs: int | None = option(
+        "--jobs", type=click.IntRange(1, 10_000), default=None, help="Number of --seeds runs at a time; default: 1."
+    )
+    on: str = option(
+        "--on",
+        default=LOCAL,
+        metavar="PLACE",
+        shell_complete=_places,
+        help="With --seeds: run on local processes (default), dask://HOST:PORT, slurm or kubernetes.",
+    )
+    ledger: Path | None = option(
+        "--ledger",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="With --seeds: record each run in this file, and skip seeds that it contains.",
+    )
+
+    def place(self) -> Place:
+        """Return where the seeds run. Raises `UsageError`."""
+        from fieldtwin.run.places.clusters import place_named
+
+        return place_named(self.on, self.jobs)
+
+    @property
+    def given(self) -> str:
+        """Return an option that was given and has no effect without --seeds, or an empty text."""
+        values = {
+            "--shard": self.shard,
+            "--jobs": self.jobs is not None,
+            "--on": self.on != LOCAL,
+            "--ledger": self.ledger,
+        }
+        return next((option for option, value in values.items() if value), "")
 
     def chosen(self) -> range:
         """Return the seeds that this computer runs. Raises `UsageError`."""
@@ -114,7 +152,8 @@ class CampaignOptions(FaultChoice, _ScenarioRuns):
     def check(self) -> None:
         """Raise `UsageError` for options that have no effect without --seeds, or without random faults."""
         self.of(self.faults)
-        if not self.seeds and (self.faults or self.jobs != 1 or self.shard or self.duration_s):
-            raise UsageError("--faults, --for, --shard and --jobs of scenarios need --seeds", expected="--seeds 1..200")
+        given = "--faults" if self.faults else "--for" if self.duration_s else self.given
+        if given and not self.seeds:
+            raise UsageError(f"{given} of scenarios needs --seeds", expected="--seeds 1..200")
         if self.duration_s and not self.faults:
             raise UsageError("--for needs --faults random: without it the steps determine the length of a run")

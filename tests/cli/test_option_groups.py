@@ -82,7 +82,7 @@ def test_headings_of_run_and_simulate() -> None:
         "Plant or prototype", "Simulated devices", "Digital thread", "Profiles and templates", "Output", "Other options",
     ]  # fmt: skip
     shown = headings("simulate")
-    assert shown["Virtual time and seeds"] == ["--for", "--seed", "--seeds", "--shard", "--jobs", "--ledger"]
+    assert shown["Virtual time and seeds"] == ["--for", "--seed", "--seeds", "--shard", "--jobs", "--on", "--ledger"]
     assert shown["Faults"] == ["--faults", "--fault-every", "--fault-kinds", "--fault-aims"]
     assert shown["Output"] == ["--trace", "--compare", "--json", "--junit", "--junit-flavour", "--html"]
     assert shown["Profiles and templates"] == headings("run")["Profiles and templates"]

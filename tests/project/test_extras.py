@@ -26,6 +26,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
 from fieldtwin.northbound.process_config import require_packages
 from fieldtwin.run.fmu_export.packing import ExportOptions, export_fmu
+from fieldtwin.run.places.clusters import place_named
 from fieldtwin.run.processes import event_loop as loops
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
@@ -85,11 +86,16 @@ def use_aas(folder: Path) -> None:
     require_aas()
 
 
+def use_cluster(folder: Path) -> None:
+    place_named("dask://127.0.0.1:8786", None)
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "aiomqtt": ("mqtt", use_mqtt, "fieldtwin.twin.thread.mqtt.session"),
     "asyncua": ("opcua", use_opcua, ""),
     "asyncpg": ("postgres", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "mcp": ("mcp", use_mcp, "fieldtwin.agents.mcp_server"),
+    "distributed": ("cluster", use_cluster, "fieldtwin.run.places.dask_place"),
     "matplotlib": ("plot", use_plot, ""),
     "fmpy": ("fmi", use_fmi, ""),
     "pythonfmu": ("fmi", use_fmi_export, ""),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ import click
 from fieldtwin.cli.campaign_options import FaultChoice, SeedOptions
 from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.completions import systems
-from fieldtwin.cli.option_groups import GroupedCommand, group, option
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, systems_of
 from fieldtwin.cli.run.virtual_view import run_many, run_one
@@ -23,18 +23,9 @@ from fieldtwin.run.template import system_file
 if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
-OF_A_GROUP = "--for, --seed, --seeds, --shard, --jobs, --ledger, --junit, --html, --commands, --faults, --trace, --json"
-
-
-@dataclass(frozen=True)
-class ManyRuns(SeedOptions):
-    """The options for the seeds of several runs, and for the file that records each run."""
-
-    ledger: Path | None = option(
-        "--ledger",
-        type=click.Path(dir_okay=False, path_type=Path),
-        help="With --seeds: record each run in this file, and skip seeds that it contains.",
-    )
+OF_A_GROUP = (
+    "--for, --seed, --seeds, --shard, --jobs, --on, --ledger, --junit, --html, --commands, --faults, --trace, --json"
+)
 
 
 @click.command("simulate", cls=GroupedCommand)
@@ -45,7 +36,7 @@ class ManyRuns(SeedOptions):
         "--for", "duration_s", type=Duration(), default=0.0, help="Length in virtual time, such as 24h; required."
     ),
     click.option("--seed", type=int, default=None, help="Use this seed instead of the prototype file's."),
-    runs=ManyRuns,
+    runs=SeedOptions,
 )
 @group("Simulated devices", replay=ReplayOptions)
 @group("Simulated devices", commands_option)
@@ -79,7 +70,7 @@ def command(
     system: str,
     duration_s: float,
     seed: int | None,
-    runs: ManyRuns,
+    runs: SeedOptions,
     commands: tuple[int, ...] | None,
     replay: ReplayOptions,
     faults: str,
@@ -130,10 +121,9 @@ def command(
             raise UsageError(
                 "--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run"
             )
-        return run_many(options, runs.chosen(), runs.jobs, as_json, runs.ledger, reports)
-    if runs.ledger is not None or runs.shard or reports.given:
-        option_name = "--shard" if runs.shard else "--ledger" if runs.ledger is not None else reports.given
-        raise UsageError(f"{option_name} needs --seeds", expected="--seeds 1..200")
+        return run_many(options, runs.chosen(), runs.place(), as_json, runs.ledger, reports)
+    if given := runs.given or reports.given:
+        raise UsageError(f"{given} needs --seeds", expected="--seeds 1..200")
     return run_one(options, as_json) if compare is None else _run_against(options, compare, as_json)
 
 

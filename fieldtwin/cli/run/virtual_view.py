@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.cli.campaign_ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
     from fieldtwin.run.campaigns.coverage import Coverage
     from fieldtwin.run.campaigns.ledger import LedgerEntry
     from fieldtwin.run.campaigns.many_seeds import SeedResult
+    from fieldtwin.run.places.place import Ended, Place
     from fieldtwin.run.virtual.run import VirtualOptions
 
 
-OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--ledger", "--junit", "--junit-flavour", "--html")
+OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--on", "--ledger", "--junit", "--junit-flavour", "--html")
 """Options that the command line of a single run does not have."""
 
 
@@ -79,19 +81,20 @@ def again(seed: int) -> str:
 def run_many(
     options: VirtualOptions,
     seeds: range,
-    jobs: int,
+    place: Place,
     as_json: bool,
     ledger_path: Path | None,
     reports: CampaignReports,
 ) -> int:
-    """Run once for each seed and return the exit status: 0 if all passed.
+    """Run once for each seed and return the exit status: 0 if all passed, 130 if Ctrl-C ended the campaign early.
 
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
     with their recorded result, also in `reports`.
     """
     from fieldtwin.run.campaigns.coverage import joined
     from fieldtwin.run.campaigns.ledger import Ledger, entry_of
-    from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
+    from fieldtwin.run.campaigns.many_seeds import SeedRuns, what_runs
+    from fieldtwin.run.places.place import Repeats
 
     began_ns = WallClock().monotonic_ns()
     ledger = Ledger(ledger_path) if ledger_path is not None else None
@@ -100,16 +103,30 @@ def run_many(
     left = [seed for seed in seeds if seed not in done]
     hours = options.duration_s / 3600
     entries: list[LedgerEntry] = []
+    results: list[SeedResult] = []
+    work = SeedRuns(options)
+    repeats = Repeats(work)
+
+    def record(one: Ended[SeedResult]) -> None:
+        entry = entry_of(what, hours, one.result, system, again(one.seed), one.worker)
+        if ledger is not None:
+            ledger.record(entry)
+        entries.append(entry)
+
     with CampaignView(system, len(left)) as view:
 
-        def ended(result: SeedResult) -> None:
-            entry = entry_of(what, hours, result, system, again(result.seed))
-            if ledger is not None:
-                ledger.record(entry)
-            entries.append(entry)
-            view.ended(result.seed, hours, None if result.ok else "; ".join(result.errors[:1]) or "failed")
+        def ended(one: Ended[SeedResult]) -> None:
+            record(one)
+            results.append(one.result)
+            view.ended(one.seed, hours, None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed")
 
-        results = run_seeds(options, left, jobs, ended)
+        interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
+    results.sort(key=lambda result: result.seed)
+    for _, second in repeats.different:
+        record(second)
+    different = {first.seed for first, _ in repeats.different}
+    if ledger is not None:
+        different |= ledger.different_of(what, seeds)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     failed = [r for r in results if not r.ok]
     before = sorted(ledger.failed_of(what, seeds) - {r.seed for r in failed}) if ledger is not None else []
@@ -127,19 +144,24 @@ def run_many(
                 "results": [_plain(r) for r in results],
                 "failed": sorted([*before, *(r.seed for r in failed)]),
                 "coverage": joined(r.coverage for r in results).counts(),
+                "repeated": repeats.count,
+                "different": sorted(different),
+                "interrupted": interrupted,
             },
             sys.stdout,
             indent=2,
         )
         sys.stdout.write("\n")
-        return 1 if failed or before or untested else 0
+        return INTERRUPTED if interrupted else 1 if failed or before or untested or different else 0
     for result in failed:
         stdout.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
         for error in result.errors:
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
-    if failed and (options.random_faults is not None or options.faults or options.fault_file):
-        _shrink(options, failed[0])
+    found = next((result for result in failed if result.sha256), None)
+    with_faults = options.random_faults is not None or options.faults or options.fault_file
+    if found is not None and with_faults and not interrupted:
+        _shrink(options, found)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
@@ -147,22 +169,32 @@ def run_many(
     table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
     table.add_row("faults", faults_text([one for r in results for one in r.faults]))
     table.add_row("coverage", coverage_text(joined(r.coverage for r in results)))
+    if repeats.count:
+        table.add_row("repeated", repeats_text(repeats))
     table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times real time")
     if ledger is not None:
         table.add_row("not repeated", f"{len(seeds) - len(left)} seeds that the ledger has")
-        bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
-        table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
+        failures = (
+            f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
+        )
+        table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{failures}")
     stdout.print(table)
     for seed in before:
         stdout.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
-    if untested and not failed and not before:
+    for line in different_texts(different, repeats):
+        stdout.print(line, soft_wrap=True, markup=False, highlight=False)
+    if interrupted:
+        stdout.print(interrupted_text(len(results), len(left)), soft_wrap=True)
+        return INTERRUPTED
+    if untested and not failed and not before and not different:
         stdout.print(
             "no fault took effect in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True
         )
         stdout.print("[bold yellow]inconclusive[/bold yellow]")
         return 1
-    stdout.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
-    return 1 if failed or before else 0
+    bad = bool(failed or before or different)
+    stdout.print("[bold red]not ok[/bold red]" if bad else "[bold green]ok[/bold green]")
+    return 1 if bad else 0
 
 
 def _result(

@@ -2,54 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.markup import escape
 
+from fieldtwin.cli.campaign_ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.virtual_view import shrunk_texts
 from fieldtwin.console import stderr, stdout
-from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, scenario_entry, verdict_of, what_tests
 from fieldtwin.run.campaigns.confirming import CONFIRMED
+from fieldtwin.run.campaigns.ledger import Ledger
 from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of, shrink_seed
+from fieldtwin.run.places.place import Ended, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
 FAULTS_SHOWN = 12
+INTERRUPTED_CHECK = "interrupted"
+"""The number of the check of a campaign that Ctrl-C has ended early."""
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignResults:
+    """The results of the whole campaign, of each seed that ran, and of the scenario that the first failing seed was shrunk to.
+
+    `interrupted`: Ctrl-C ended the campaign early.
+    """
+
+    whole: ScenarioResult
+    seeds: list[ScenarioResult]
+    shrunk: list[ScenarioResult]
+    interrupted: bool
+
+    @property
+    def all(self) -> list[ScenarioResult]:
+        return [self.whole, *self.seeds, *self.shrunk]
 
 
 def run_scenario_campaign(
     path: Path, profiles: tuple[Path, ...], options: CampaignOptions, show: Callable[[ScenarioResult], None] | None
-) -> list[ScenarioResult]:
-    """Run a scenario with each seed.
-
-    Return the result of the whole campaign, of each seed, and of the scenario that the first failing seed was shrunk to. `show`
-    None: nothing is printed to stdout.
-    """
+) -> CampaignResults:
+    """Run a scenario with each seed that the ledger does not have yet. `show` None: nothing is printed to stdout."""
     seeds = options.chosen()
     campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
-    with CampaignView(case_of(path), len(seeds)) as view:
+    work, ledger, what = ScenarioRuns(campaign), None, ""
+    if options.ledger is not None:
+        ledger, what = Ledger(options.ledger), what_tests(campaign)
+    before = ledger.recorded(what, seeds) if ledger is not None else []
+    done = {entry.seed for entry in before}
+    left = [seed for seed in seeds if seed not in done]
+    campaign.check()
+    repeats = Repeats(work)
+    results: list[ScenarioResult] = []
 
-        def ended(result: ScenarioResult) -> None:
-            assert result.seed is not None
-            passed = result.verdict is Verdict.PASSED
-            view.ended(result.seed, result.simulated_s / 3600, None if passed else result.why or result.verdict.value)
+    def record(one: Ended[ScenarioResult]) -> None:
+        if ledger is not None:
+            ledger.record(scenario_entry(what, one, WallClock().utc_ns() / 1e9))
 
-        results = run_campaign(campaign, seeds, options.jobs, ended)
+    with CampaignView(case_of(path), len(left)) as view:
+
+        def ended(one: Ended[ScenarioResult]) -> None:
+            record(one)
+            results.append(one.result)
+            passed = one.result.verdict is Verdict.PASSED
+            cause = None if passed else one.result.why or one.result.verdict.value
+            view.ended(one.seed, one.result.simulated_s / 3600, cause)
+
+        interrupted = ends_early(lambda: options.place().run(work, left, ended, repeats))
+    results.sort(key=lambda result: result.seed or 0)
+    different = {first.seed for first, _ in repeats.different}
+    for _, second in repeats.different:
+        record(second)
+    if ledger is not None:
+        different |= ledger.different_of(what, seeds)
     shard = ("--shard", options.shard) if options.shard else ()
-    whole = verdict_of(campaign, results, ("--seeds", options.seeds, *shard))
+    more = [*_repeats_checks(different, repeats), *([_interrupted(len(results), len(left))] if interrupted else [])]
+    whole = verdict_of(campaign, results, ("--seeds", options.seeds, *shard), before, more)
     if show is not None:
         for result in results:
             _show_seed(result, show)
-    small = next((result for result in results if result.verdict.bad), None)
-    found = [] if small is None or campaign.random_faults is None else _shrink(campaign, small, show is not None)
+    small = next((result for result in results if result.verdict.bad and result.trace_hash), None)
+    found = (
+        []
+        if small is None or interrupted or campaign.random_faults is None
+        else _shrink(campaign, small, show is not None)
+    )
     if show is not None:
         _show_whole(whole)
-    return [whole, *results, *found]
+    return CampaignResults(whole, results, found, interrupted)
+
+
+def _repeats_checks(different: Collection[int], repeats: Repeats[ScenarioResult]) -> list[CheckResult]:
+    """Return the check that seeds which ran again on a different worker had the same trace; none if there is nothing to check."""
+    if not repeats.count and not different:
+        return []
+    verdict = Verdict.FAILED if different else Verdict.PASSED
+    got = "; ".join([repeats_text(repeats), *different_texts(different, repeats)])
+    return [CheckResult("repeated", "the same seed gives the same run on every worker", verdict, got=got)]
+
+
+def _interrupted(ended: int, wanted: int) -> CheckResult:
+    return CheckResult(INTERRUPTED_CHECK, "every seed runs", Verdict.INCONCLUSIVE, got=interrupted_text(ended, wanted))
 
 
 def _words(options: CampaignOptions) -> tuple[str, ...]:

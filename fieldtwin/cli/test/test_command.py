@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.cli.campaign_ending import INTERRUPTED
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
@@ -171,15 +172,19 @@ def command(
     shown = Progress(Path(progress)) if progress else None
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
+    interrupted = False
     for scenario, file in zip(scenarios, events, strict=True):
         if campaign.seeds:
             from fieldtwin.cli.test.campaign_view import run_scenario_campaign
 
             found = run_scenario_campaign(scenario.path, folders, campaign, None if as_json else _show)
-            found = [replace(result, system=scenario.system) for result in found]
-            waived_ones = [waive(result, waived, datetime.now(UTC).date()) for result in found]
-            results += waived_ones
-            seeds += waived_ones[1 : 1 + len(campaign.chosen())]
+            today = datetime.now(UTC).date()
+            judged = [waive(replace(one, system=scenario.system), waived, today) for one in found.all]
+            results += judged
+            seeds += judged[1 : 1 + len(found.seeds)]
+            interrupted = found.interrupted
+            if interrupted:
+                break
             continue
         result = run_scenario(scenario, where, file, retries, shown)
         result = replace(result, system=scenario.system)
@@ -220,7 +225,7 @@ def command(
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
         if not campaign.seeds:
             _tell_how_to_see_more(results)
-    return 0 if all_well(results) else 1
+    return INTERRUPTED if interrupted else 0 if all_well(results) else 1
 
 
 def _counts(results: Sequence[ScenarioResult], of: str) -> str:

@@ -7,24 +7,32 @@ The same seed always gives the same run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.__about__ import __version__
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
-from fieldtwin.run.processes.workers import each
+from fieldtwin.run.campaigns.ledger import LedgerEntry
+from fieldtwin.run.campaigns.many_seeds import fingerprint
+from fieldtwin.run.places.bundle import files_of, profile_folders, relative
+from fieldtwin.run.places.place import Ended
 from fieldtwin.run.targets.virtual_scenario import group_of, reproduce, run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.run.virtual.run import texts_of
 from fieldtwin.scenarios.judging.runner import ByChance
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
 SHORTEST_S = 600.0
 """Default duration in seconds of a run with random faults."""
+MOST_REASON = 2000
+"""Largest number of characters of the reason of a failure in the ledger."""
+_EFFECTS = ("fault ", "set ")
+"""The beginnings of the numbers of checks that a run lists only if a fault or a value had no effect."""
 _BY_RUN = ("running", "refused", "judge")
 """The checks of a whole run, whose text does not name the cause of a failure; `got` does."""
 
@@ -100,32 +108,91 @@ def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | N
     return replace(result, reproduce=reproduce(scenario, *campaign.words, "--seeds", str(seed)))
 
 
-def _slim(campaign: Campaign, seed: int) -> ScenarioResult:
-    """Run a seed and drop the events of its run, because the events of two hundred seeds would not fit into memory. To see
-    them, run the seed again.
+@dataclass(frozen=True, slots=True)
+class ScenarioRuns:
+    """Runs of a scenario with many seeds, as work for a place.
+
+    The events of a run are dropped, because the events of two hundred seeds would not fit into memory. To see them, run the
+    seed again.
     """
-    result = run_seed(campaign, seed)
-    return replace(result, trace=(), dropped=0)
+
+    campaign: Campaign
+
+    @property
+    def virtual_s(self) -> float:
+        return self.campaign.length_s(self.campaign.check())
+
+    def run(self, seed: int) -> ScenarioResult:
+        return replace(run_seed(self.campaign, seed), trace=(), dropped=0)
+
+    def unfinished(self, seed: int, reason: str) -> ScenarioResult:
+        text = f"the run did not finish: {reason}"
+        scenario = self.campaign.check()
+        again = reproduce(scenario, *self.campaign.words, "--seeds", str(seed))
+        return replace(
+            result_of(scenario, "virtual", Verdict.ERROR, checks=(), reason=text), seed=seed, reproduce=again
+        )
+
+    def hash_of(self, result: ScenarioResult) -> str:
+        return result.trace_hash
+
+    def portable(self) -> tuple[ScenarioRuns, tuple[Path, ...]]:
+        campaign = self.campaign
+        files = files_of(group_of(campaign.check()), campaign.profiles)
+        moved = replace(campaign, path=relative(campaign.path), profiles=profile_folders(campaign.profiles))
+        return ScenarioRuns(moved), (campaign.path, *files)
 
 
-def run_campaign(
-    campaign: Campaign, seeds: Sequence[int], jobs: int, on_result: Callable[[ScenarioResult], None] | None = None
-) -> list[ScenarioResult]:
-    """Return a result for each seed, in their order; `jobs` at a time."""
-    campaign.check()
-    return each(jobs, partial(_slim, campaign), seeds, on_result)
+def what_tests(campaign: Campaign) -> str:
+    """Return a fingerprint of a campaign without its seeds, from the contents of its files and its options."""
+    scenario = campaign.check()
+    options = (campaign.random_faults, campaign.length_s(scenario))
+    return fingerprint(*texts_of(group_of(scenario)), campaign.path.read_text(encoding="utf-8"), repr(options))
 
 
-def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult], chosen: Sequence[str]) -> ScenarioResult:
+def scenario_entry(what: str, ended: Ended[ScenarioResult], ended_s: float) -> LedgerEntry:
+    """Return the line of the ledger for a run. `what` is the campaign's fingerprint, `ended_s` the time since 1970 in seconds."""
+    result = ended.result
+    checks = [check for check in result.checks if not check.vacuous]
+    passed = result.verdict is Verdict.PASSED
+    return LedgerEntry(
+        what,
+        __version__,
+        ended.seed,
+        result.simulated_s / 3600,
+        passed,
+        len(checks),
+        sum(check.verdict.bad for check in checks),
+        result.trace_hash,
+        () if passed else (result.why[:MOST_REASON],),
+        system=result.case,
+        reproduce="" if passed else result.reproduce,
+        ended_s=round(ended_s, 3),
+        took_s=round(result.took_s, 3),
+        worker=ended.worker,
+        verdict=result.verdict.value,
+        judged=tuple(check.number for check in checks if not check.number.isdigit()),
+        struck=sum(fault.struck for fault in result.faults),
+    )
+
+
+def verdict_of(
+    campaign: Campaign,
+    results: Sequence[ScenarioResult],
+    chosen: Sequence[str],
+    before: Sequence[LedgerEntry] = (),
+    more: Sequence[CheckResult] = (),
+) -> ScenarioResult:
     """Return the result of the campaign: how many seeds checked each rule, and how often faults took effect.
 
     It is FAILED if a seed is. It is INCONCLUSIVE if a seed is, if no seed checked a rule of the scenario, or if no
-    fault took effect. `chosen`: the command-line options that choose these seeds.
+    fault took effect. `chosen`: the command-line options that choose these seeds. `before`: runs of a ledger, which count like
+    `results`. `more`: further checks of the campaign.
     """
     scenario = load_scenario(campaign.path, campaign.profiles)
-    checks = [*_seeds_check(results), *_rule_checks(results)]
+    checks = [*more, *_seeds_check(results, before), *_rule_checks(results, before)]
     if campaign.random_faults is not None:
-        checks.append(_faults_check(results))
+        checks.append(_faults_check(results, before))
     verdicts = [check.verdict for check in checks]
     worst = next((v for v in (Verdict.FAILED, Verdict.INCONCLUSIVE) if v in verdicts), Verdict.PASSED)
     first = next((check for check in checks if check.verdict is worst), None)
@@ -133,24 +200,27 @@ def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult], chosen: Se
     made = result_of(scenario, "virtual", worst, checks=tuple(checks), reason=told)
     return replace(
         made,
-        name=f"{made.name} [{len(results)} seeds]",
+        name=f"{made.name} [{len(results) + len(before)} seeds]",
         reproduce=reproduce(scenario, *campaign.words, *chosen),
         simulated_s=sum(result.simulated_s for result in results),
         took_s=sum(result.took_s for result in results),
     )
 
 
-def _seeds_check(results: Sequence[ScenarioResult]) -> list[CheckResult]:
+def _seeds_check(results: Sequence[ScenarioResult], before: Sequence[LedgerEntry]) -> list[CheckResult]:
     """Return the check that every seed passed."""
-    bad = [result for result in results if result.verdict is not Verdict.PASSED]
-    failed = [result for result in bad if result.verdict.bad]
+    ended = [(result.seed or 0, result.verdict) for result in results]
+    ended += [(entry.seed, Verdict(entry.verdict)) for entry in before]
+    bad = sorted((seed, verdict.value) for seed, verdict in ended if verdict is not Verdict.PASSED)
+    failed = any(verdict.bad for _, verdict in ended)
     verdict = Verdict.FAILED if failed else Verdict.INCONCLUSIVE if bad else Verdict.PASSED
-    named = ", ".join(f"{one.seed} ({one.verdict.value})" for one in bad[:10]) + (", ..." if len(bad) > 10 else "")
-    got = f"{len(results) - len(bad)} of {len(results)} passed" + (f"; not: {named}" if bad else "")
+    named = ", ".join(f"{seed} ({word})" for seed, word in bad[:10]) + (", ..." if len(bad) > 10 else "")
+    recorded = f"; {len(before)} of them by the ledger" if before else ""
+    got = f"{len(ended) - len(bad)} of {len(ended)} passed{recorded}" + (f"; not: {named}" if bad else "")
     return [CheckResult("seeds", "every seed passes", verdict, expected="all of them" if bad else "", got=got)]
 
 
-def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
+def _rule_checks(results: Sequence[ScenarioResult], before: Sequence[LedgerEntry]) -> list[CheckResult]:
     """Return a check for each rule.
 
     A rule that no seed checked is INCONCLUSIVE, unless it is an invariant of the system file.
@@ -164,23 +234,26 @@ def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
     for number, every in found.items():
         first = next((one for one in every if one.verdict.bad), every[0])
         broken = sum(one.verdict.bad for one in every)
-        puts_in = number.startswith(("fault ", "set "))  # listed only if it had no effect
+        puts_in = number.startswith(_EFFECTS)  # listed only if it had no effect
         judged = len(results) - len(every) if puts_in else sum(not one.vacuous for one in every)
+        judged += sum(number in entry.judged for entry in before)
         verdict = Verdict.FAILED if broken else Verdict.PASSED
         if not judged and "invariant" not in number:
             verdict = Verdict.INCONCLUSIVE
-        got = f"checked with {judged} of {len(results)} seeds, broken with {broken}"
+        got = f"checked with {judged} of {len(results) + len(before)} seeds, broken with {broken}"
         checks.append(CheckResult(number, first.text, verdict, got=got, where=first.where, names=first.names))
     return checks
 
 
-def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
+def _faults_check(results: Sequence[ScenarioResult], before: Sequence[LedgerEntry]) -> CheckResult:
     """Return the check that at least one fault took effect, with the number of times by name of the fault."""
     names = sorted({fault.name for result in results for fault in result.faults})
     struck = {n: [fault.struck for result in results for fault in result.faults if fault.name == n] for n in names}
     parts = [f"{name} {len(each)} (took effect {sum(each)} times)" for name, each in struck.items()]
     got = f"{sum(map(len, struck.values()))} injected: {', '.join(parts)}" if parts else "none was injected"
-    verdict = Verdict.PASSED if any(map(sum, struck.values())) else Verdict.INCONCLUSIVE
+    recorded = sum(entry.struck for entry in before)
+    got += f"; by the ledger, faults took effect {recorded} times before" if before else ""
+    verdict = Verdict.PASSED if recorded or any(map(sum, struck.values())) else Verdict.INCONCLUSIVE
     return CheckResult("faults", "random faults are injected", verdict, got=got)
 
 

@@ -20,10 +20,13 @@ from fieldtwin.run.campaigns.many_seeds import SeedResult
 
 class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """One finished run. `what` is the fingerprint that `many_seeds.what_runs` returns; `wrong` of the `checked` values were
-    never held by their device. `sha256` is the hash of the trace: the same seed has the same hash on every computer.
+    never held by their device. `sha256` is the hash of the trace: the same seed has the same hash on every computer. It is empty
+    if no process could finish the run; the seed then runs again when the campaign is resumed.
 
     `system`: the name of the system. `reproduce`: for a failed run, the command that repeats it. For `ended_s`, `took_s` and
-    `worker` see `many_seeds.Made`, for `coverage` see `coverage.Coverage`. Ledgers of older versions lack these six.
+    `worker` see `many_seeds.Made`; on a cluster, `worker` is the name of the cluster's worker. For `coverage` see
+    `coverage.Coverage`. Ledgers of older versions lack these six. The last three are for the run of a scenario, whose checks
+    `checked` and `wrong` count.
     """
 
     what: str
@@ -41,23 +44,36 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     took_s: float = 0.0
     worker: str = ""
     coverage: str = ""
+    verdict: str = ""
+    judged: tuple[str, ...] = ()
+    """The numbers of the scenario's rules that the run checked, such as ``within 1``."""
+    struck: int = 0
+    """How often random faults took effect."""
+
+    @property
+    def finished(self) -> bool:
+        return bool(self.sha256)
 
     @property
     def result(self) -> tuple[object, ...]:
         """Return what every computer must get for the same run; when and where the run was made is left out."""
         return (
             *(self.what, self.version, self.seed, self.hours, self.ok),
-            *(self.checked, self.wrong, self.sha256, self.errors),
+            *(self.checked, self.wrong, self.sha256, self.errors, self.verdict),
         )
 
 
-def entry_of(what: str, hours: float, result: SeedResult, system: str = "", reproduce: str = "") -> LedgerEntry:
-    """Return the entry of a run by this version; `reproduce` is kept for a failed run only."""
+def entry_of(
+    what: str, hours: float, result: SeedResult, system: str = "", reproduce: str = "", worker: str = ""
+) -> LedgerEntry:
+    """Return the entry of a run by this version; `reproduce` is kept for a failed run only. `worker`: the worker of a cluster
+    that made the run, if there is one.
+    """
     return LedgerEntry(
         what,
         __version__,
         result.seed,
-        hours,
+        hours if result.sha256 else 0.0,
         result.ok,
         result.checked,
         result.wrong,
@@ -67,9 +83,27 @@ def entry_of(what: str, hours: float, result: SeedResult, system: str = "", repr
         "" if result.ok else reproduce,
         round(result.made.ended_s, 3),
         round(result.made.took_s, 3),
-        result.made.worker,
+        worker or result.made.worker,
         result.coverage,
     )
+
+
+def differing(entries: Iterable[LedgerEntry]) -> set[int]:
+    """Return the seeds with different results in these entries, which are of one fingerprint and version: a run was not
+    reproduced, which is a defect.
+    """
+    results: dict[int, set[tuple[object, ...]]] = {}
+    for entry in entries:
+        if entry.finished:
+            results.setdefault(entry.seed, set()).add(entry.result)
+    return {seed for seed, different in results.items() if len(different) > 1}
+
+
+def unfinished_left(entries: Iterable[LedgerEntry]) -> list[LedgerEntry]:
+    """Return the entries without those of unfinished runs whose seed finished in a different run."""
+    entries = list(entries)
+    finished = {(e.what, e.version, e.seed) for e in entries if e.finished}
+    return [e for e in entries if e.finished or (e.what, e.version, e.seed) not in finished]
 
 
 MAX_BYTES = 256 * 1024 * 1024
@@ -107,15 +141,15 @@ class Ledger:
                 os.truncate(path, path.stat().st_size - incomplete)
 
     def done(self, what: str) -> set[int]:
-        """Return the seeds with which this version has run `what`."""
-        return {e.seed for e in self.entries if e.what == what and e.version == __version__}
+        """Return the seeds with which this version has finished a run of `what`."""
+        return {e.seed for e in self._of(what) if e.finished}
 
     def add(self, what: str, hours: float, result: SeedResult, system: str = "", reproduce: str = "") -> None:
         """Add a result and write it to disk."""
         self.record(entry_of(what, hours, result, system, reproduce))
 
     def record(self, entry: LedgerEntry) -> None:
-        """Add an entry and write it to disk."""
+        """Add an entry and write it to disk. Raises `Unreachable`."""
         try:
             with self.path.open("ab") as file:
                 file.write(msgspec.json.encode(entry) + b"\n")
@@ -125,13 +159,24 @@ class Ledger:
             raise Unreachable(f"cannot write the ledger: {e.strerror}", where=str(self.path)) from e
         self.entries.append(entry)
 
+    def _of(self, what: str) -> list[LedgerEntry]:
+        return [e for e in self.entries if e.what == what and e.version == __version__]
+
     def entries_of(self, what: str, seeds: range) -> list[LedgerEntry]:
         """Return the runs of these seeds that this version made with this fingerprint."""
-        return [e for e in self.entries if e.what == what and e.version == __version__ and e.seed in seeds]
+        return [e for e in self._of(what) if e.seed in seeds]
+
+    def recorded(self, what: str, seeds: range) -> list[LedgerEntry]:
+        """Return the finished runs of these seeds by this version with this fingerprint, each seed once."""
+        return list({e.seed: e for e in self.entries_of(what, seeds) if e.finished}.values())
+
+    def different_of(self, what: str, seeds: range) -> set[int]:
+        """Return which of these seeds have different results in this ledger."""
+        return differing(self.entries_of(what, seeds))
 
     def failed_of(self, what: str, seeds: range) -> set[int]:
         """Return which of these seeds failed when this version ran them with this fingerprint."""
-        return {e.seed for e in self.entries_of(what, seeds) if not e.ok}
+        return {e.seed for e in unfinished_left(self.entries_of(what, seeds)) if not e.ok}
 
     @property
     def hours(self) -> float:
@@ -145,4 +190,4 @@ class Ledger:
     @property
     def failed(self) -> list[LedgerEntry]:
         """Return the runs that failed."""
-        return [e for e in self.entries if not e.ok]
+        return [e for e in unfinished_left(self.entries) if not e.ok]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
 from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
+from fieldtwin.run.places.bundle import files_of, profile_folders, relative
 from fieldtwin.run.processes.topside import Scripted
-from fieldtwin.run.processes.workers import each
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
+from fieldtwin.twin.site.data_files import find_recording
 
 _ERRORS_SHOWN = 5
 
@@ -127,11 +129,36 @@ def shrunk(options: VirtualOptions, found: SeedResult) -> Shrunk:
     return Shrunk(*small, run.scripted)
 
 
-def run_seeds(
-    options: VirtualOptions, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
-) -> list[SeedResult]:
-    """Run each seed, `jobs` at a time, and return the results in the order of the seeds.
+@dataclass(frozen=True, slots=True)
+class SeedRuns:
+    """Runs of a system with many seeds, as work for a place. `options` has no seed and no trace file."""
 
-    `on_result` is called with each result as its run ends.
-    """
-    return each(jobs, run_seed, [replace(options, seed=seed) for seed in seeds], on_result)
+    options: VirtualOptions
+
+    @property
+    def virtual_s(self) -> float:
+        return self.options.duration_s
+
+    def run(self, seed: int) -> SeedResult:
+        return run_seed(replace(self.options, seed=seed))
+
+    def unfinished(self, seed: int, reason: str) -> SeedResult:
+        return SeedResult(seed, False, (f"the run did not finish: {reason}",), 0, 0, 0, "")
+
+    def hash_of(self, result: SeedResult) -> str:
+        return result.sha256
+
+    def portable(self) -> tuple[SeedRuns, tuple[Path, ...]]:
+        options = self.options
+        run = VirtualRun(options)
+        recordings = {device: find_recording(name) for device, name in options.recordings.items()}
+        moved = replace(
+            options,
+            system=str(relative(Path(options.system))),
+            profiles=profile_folders(options.profiles),
+            prototype_file=options.prototype_file and relative(options.prototype_file),
+            recordings={device: str(relative(path)) for device, path in recordings.items()},
+            faults=run.given_faults,
+            fault_file=None,
+        )
+        return SeedRuns(moved), (*files_of(run.group, options.profiles), *recordings.values())

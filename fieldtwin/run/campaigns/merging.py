@@ -6,12 +6,11 @@ also if several computers made it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from fieldtwin.run.campaigns.coverage import Coverage, joined
-from fieldtwin.run.campaigns.ledger import LedgerEntry
+from fieldtwin.run.campaigns.ledger import LedgerEntry, differing, unfinished_left
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +28,15 @@ class Runs:
     @property
     def failed(self) -> list[LedgerEntry]:
         """Return the runs that failed, by seed."""
-        return [entry for entry in self.entries if not entry.ok]
+        return [entry for entry in unfinished_left(self.entries) if not entry.ok]
 
     @property
     def hours(self) -> float:
         """Return the virtual hours; a seed counts once."""
-        return sum({entry.seed: entry.hours for entry in self.entries}.values())
+        longest: dict[int, float] = {}
+        for entry in self.entries:
+            longest[entry.seed] = max(entry.hours, longest.get(entry.seed, 0.0))
+        return sum(longest.values())
 
     @property
     def coverage(self) -> Coverage:
@@ -43,9 +45,8 @@ class Runs:
 
     @property
     def different(self) -> list[int]:
-        """Return the seeds that have several results: a run was not reproduced, which is a defect."""
-        counts = Counter(entry.seed for entry in self.entries)
-        return sorted(seed for seed, count in counts.items() if count > 1)
+        """Return the seeds that have different results: a run was not reproduced, which is a defect."""
+        return sorted(differing(self.entries))
 
 
 def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:

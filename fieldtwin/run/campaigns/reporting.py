@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fieldtwin.reports.campaign.model import CampaignResult, CampaignRun, FailureGroup
 from fieldtwin.results.model import Report, ScenarioResult, Verdict
-from fieldtwin.run.campaigns.ledger import LedgerEntry
+from fieldtwin.run.campaigns.ledger import LedgerEntry, unfinished_left
 from fieldtwin.run.campaigns.merging import Runs
 from fieldtwin.run.campaigns.shrink import kind_of
 
@@ -24,7 +24,9 @@ def campaign_of(
     untested: bool = False,
 ) -> CampaignResult:
     """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known."""
-    failures_last = sorted(runs.entries, key=lambda entry: not entry.ok)  # of several results, a failure is shown
+    failures_last = sorted(
+        unfinished_left(runs.entries), key=lambda entry: not entry.ok
+    )  # of several results, a failure is shown
     of_seed = {entry.seed: entry for entry in failures_last}
     every = [_run(of_seed[seed]) for seed in sorted(of_seed)]
     return CampaignResult(

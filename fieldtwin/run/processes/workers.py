@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
 P = ParamSpec("P")
-A = TypeVar("A")
 T = TypeVar("T")
 
 
@@ -41,38 +40,6 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.terminate()
         self._pool.shutdown(cancel_futures=True)
-
-
-def each(
-    jobs: int, work: Callable[[A], T], items: Sequence[A], on_result: Callable[[T], None] | None = None
-) -> list[T]:
-    """Return the result of `work` for each item, in the order of the items; `jobs` processes at a time.
-
-    `on_result` is called with each result as it is ready. Memory: at most two items per process are in progress.
-    """
-    heard = on_result or (lambda result: None)
-    if jobs <= 1:
-        results = []
-        for item in items:
-            results.append(work(item))
-            heard(results[-1])
-        return results
-    found: dict[int, T] = {}
-    with Workers(jobs) as pool:
-        waiting: dict[Future[T], int] = {}
-
-        def take(done: set[Future[T]]) -> None:
-            for future in done:
-                found[number := waiting.pop(future)] = future.result()
-                heard(found[number])
-
-        for number, item in enumerate(items):
-            waiting[pool.submit(work, item)] = number
-            if len(waiting) >= 2 * jobs:
-                take(wait(waiting, return_when=FIRST_COMPLETED).done)
-        while waiting:
-            take(wait(waiting, return_when=FIRST_COMPLETED).done)
-    return [found[number] for number in range(len(items))]
 
 
 def _ends_quietly() -> None:

@@ -80,6 +80,13 @@ def load_one(options: VirtualOptions) -> SystemGroup:
     return one_system(twin.ecs.system, twin.prototype)
 
 
+def texts_of(group: SystemGroup) -> tuple[str, ...]:
+    """Return the texts of the files that the runs of these systems depend on, or their hashes."""
+    own = (group.path.read_text(encoding="utf-8"),) if group.kind else ()
+    members = group.members.values()
+    return *own, *(text for m in members for text in (m.system.hash, m.prototype.path.read_text(encoding="utf-8")))
+
+
 class VirtualRun:
     """One run: ``run()``, then `summary()`. `errors` are those of the run itself.
 
@@ -119,9 +126,7 @@ class VirtualRun:
     @property
     def files(self) -> tuple[str, ...]:
         """Return the texts of the files that the run depends on, or their hashes; a changed file changes the result."""
-        own = (self.group.path.read_text(encoding="utf-8"),) if self.group.kind else ()
-        members = self.group.members.values()
-        return *own, *(text for m in members for text in (m.system.hash, m.prototype.path.read_text(encoding="utf-8")))
+        return texts_of(self.group)
 
     def run(
         self, progress: Callable[[float], None] | None = None, watch: Callable[[Trace], None] | None = None

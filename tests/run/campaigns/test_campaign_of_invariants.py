@@ -16,9 +16,11 @@ from click.testing import CliRunner
 from fieldtwin.cli.run.simulate_command import command as simulate_command
 from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.results.model import Verdict
-from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, run_seed, verdict_of
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, run_seed, verdict_of
 from fieldtwin.run.campaigns.confirming import CONFIRMED
+from fieldtwin.run.places.local import LocalPlace
+from fieldtwin.run.places.place import Repeats
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.language.form import load_scenario
@@ -176,6 +178,13 @@ def test_a_campaign_of_runs_finds_a_broken_invariant_and_confirms_its_scenario(f
     told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
     assert (told.return_value, CONFIRMED in told.output) == (1, True), told.output
     assert "invariant within 1: not well.runs" in told.output
+
+
+def run_campaign(campaign: Campaign, seeds: range, jobs: int) -> list[ScenarioResult]:
+    results: list[ScenarioResult] = []
+    work = ScenarioRuns(campaign)
+    LocalPlace(jobs).run(work, seeds, lambda ended: results.append(ended.result), Repeats(work))
+    return sorted(results, key=lambda result: result.seed or 0)
 
 
 def test_a_seed_gives_the_same_result_whatever_the_number_of_processes(folder: Path) -> None:

@@ -1,0 +1,1 @@
+"""Places where the units of a campaign run: processes of this computer, or the workers of a cluster."""

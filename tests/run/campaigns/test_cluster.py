@@ -225,7 +225,7 @@ def test_a_seed_whose_processes_are_killed_is_an_error_and_runs_again_when_resum
     words = ["simulate", "shed.yaml", "--for", "5s", "--seeds", "1..2", "--ledger", "l.jsonl"]
     done = invoke(*words, "--on", f"dask://{cluster.address}")
     assert done.return_value == 1, done.output
-    assert done.output.count("the run did not finish: its process ended by SIGKILL, 2 times") == 2
+    assert done.stdout.count("the run did not finish: its process ended by SIGKILL, 2 times") == 2
     assert [(entry.ok, entry.sha256, entry.hours) for entry in read(site / "l.jsonl")] == [(False, "", 0.0)] * 2
     monkeypatch.setenv("SHED", "0")
     healed = invoke(*words, "--jobs", "2")

@@ -13,8 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.campaign_ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaign_reports import CampaignReports
+from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary

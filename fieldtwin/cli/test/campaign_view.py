@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from fieldtwin.cli.campaign_ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaign_options import CampaignOptions
+from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.virtual_view import shrunk_texts

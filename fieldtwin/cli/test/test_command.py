@@ -19,8 +19,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.campaign_ending import INTERRUPTED
 from fieldtwin.cli.campaign_options import CampaignOptions
+from fieldtwin.cli.campaigns.ending import INTERRUPTED
 from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option

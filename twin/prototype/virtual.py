@@ -99,9 +99,7 @@ class VirtualPrototype(AsyncResource):
         ecs, clock = self.twin.ecs, self.clock
         memory = memoryview(bytearray(ecs.layout.size))
         ecs.layout.format(memory)
-        for_gateway = self._stack.enter_context(ecs.layout.attach(memory))
-        for_plc = self._stack.enter_context(ecs.layout.attach(memory))
-        self.image = self._stack.enter_context(ecs.layout.attach(memory))
+        self.image = self._stack.enter_context(ecs.layout.attach(memory, private=True))
         audit = AuditLog(self._run_dir / "audit.jsonl", clock)
         self._stack.callback(audit.close)
         log = ExchangeLog(_IN_MEMORY, system=self.system.name, prototype=True)
@@ -112,7 +110,7 @@ class VirtualPrototype(AsyncResource):
         self.gateway = ecs.gateway(
             connector,
             clock,
-            for_gateway,
+            self.image,
             audit,
             log,
             allow_writes=True,
@@ -124,7 +122,7 @@ class VirtualPrototype(AsyncResource):
         alarm = alarm_if_free(max(VIRTUAL_STUCK_MS, config.stuck_ms))
         if alarm is not None:
             self._stack.callback(alarm.close)
-        self.plc = TaskRunner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change, modules=False)
+        self.plc = TaskRunner(config, self.image, clock.monotonic_ns, alarm, on_change=self._on_change, modules=False)
         self._stack.callback(self.plc.close)
         self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:

@@ -22,7 +22,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.image.layout import LINE, RegionLayout, RegionShape, TagKind, TagSpec, message_tag
-from fieldtwin.gateway.core.image.region import NotEncodable, RegionReader, RegionWriter
+from fieldtwin.gateway.core.image.region import Heartbeat, NotEncodable, RegionReader, RegionWriter
 from fieldtwin.gateway.core.image.snapshot import Message, RegionFlag, Snapshot
 
 __all__ = [
@@ -112,8 +112,11 @@ class ImageLayout:
         memory[: self.size] = bytes(self.size)
         memory[: _HEADER.size] = _HEADER.pack(_MAGIC, FORMAT, self.digest)
 
-    def attach(self, memory: memoryview) -> Image:
-        """Use the image in `memory`. Raises `FileInvalid` if it holds no image, or one with a different layout."""
+    def attach(self, memory: memoryview, *, private: bool = False) -> Image:
+        """Use the image in `memory`. Raises `FileInvalid` if it holds no image, or one with a different layout.
+
+        `private`: no other `Image` uses this memory, so that a publication may stay outside of it (`Heartbeat`).
+        """
         self._check_size(memory)
         magic, version, digest = _HEADER.unpack_from(memory)
         if magic != _MAGIC or version != FORMAT:
@@ -125,7 +128,7 @@ class ImageLayout:
                 got=digest.hex()[:16],
                 hint="gateway and PLC were started from different system files",
             )
-        return Image(self, memory)
+        return Image(self, memory, private=private)
 
     def _check_size(self, memory: memoryview) -> None:
         if memory.nbytes < self.size:
@@ -137,8 +140,9 @@ class ImageLayout:
 class Image:
     """An attached image, which provides writers and readers. `release` (or leaving ``with``) gives the memory back."""
 
-    def __init__(self, layout: ImageLayout, memory: memoryview) -> None:
+    def __init__(self, layout: ImageLayout, memory: memoryview, *, private: bool = False) -> None:
         self.layout = layout
+        self._heartbeats = {region.name: Heartbeat() for region in layout.regions} if private else {}
         self._given: list[RegionWriter | RegionReader] = []
         self._regions: dict[str, tuple[RegionShape, memoryview]] = {}
         offset = LINE
@@ -151,14 +155,14 @@ class Image:
     def writer(self, region: str) -> RegionWriter:
         """Return the region's writer. The caller guarantees that a region has only one writer in the whole system."""
         shape, view = self._region(region)
-        writer = RegionWriter(view, shape)
+        writer = RegionWriter(view, shape, self._heartbeats.get(region))
         self._given.append(writer)
         return writer
 
     def reader(self, region: str) -> RegionReader:
         """Return a new reader of the region."""
         shape, view = self._region(region)
-        reader = RegionReader(view, shape)
+        reader = RegionReader(view, shape, self._heartbeats.get(region))
         self._given.append(reader)
         return reader
 

@@ -45,11 +45,29 @@ class NotEncodable(Bug):
         super().__init__(message, expected=expected, got=got, where=tag)
 
 
+class Heartbeat:
+    """The latest publication of a region that only one process uses, if it repeats the values of the one in the memory.
+
+    Most publications change only the counter and times. If writer and readers share this object, such a publication is passed on
+    here, and the memory stays as it was: packing, check sum and unpacking took 20 % of a cycle in virtual time.
+    """
+
+    __slots__ = ("counter", "in_memory", "stamps", "t_ns")
+
+    def __init__(self) -> None:
+        self.counter = 0
+        self.in_memory = 0
+        """The counter of the publication in the memory."""
+        self.t_ns = 0
+        self.stamps = b""
+
+
 class _Region:
     """The base of writer and reader: views into the memory of a region. `release` releases them."""
 
-    def __init__(self, memory: memoryview, shape: RegionShape) -> None:
+    def __init__(self, memory: memoryview, shape: RegionShape, heartbeat: Heartbeat | None = None) -> None:
         self.shape = shape
+        self._heartbeat = heartbeat
         self._memory = memory[: shape.size]
         self._words = self._memory[:8].cast("Q")
         self._rings = {ring.spec.name: ring for ring in shape.rings}
@@ -82,12 +100,13 @@ class RegionWriter(_Region):
     sequence. Raises `FileInvalid` if the region's content is damaged.
     """
 
-    def __init__(self, memory: memoryview, shape: RegionShape) -> None:
-        super().__init__(memory, shape)
+    def __init__(self, memory: memoryview, shape: RegionShape, heartbeat: Heartbeat | None = None) -> None:
+        super().__init__(memory, shape, heartbeat)
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
         self._packed = False
         """True if `_body` holds the values, qualities and reasons of the last publication."""
+        self._flags = 0
         self._last = {ring.spec.name: 0 for ring in shape.rings}
         self.counter = int(self._words[0])
         if self.counter:
@@ -144,7 +163,7 @@ class RegionWriter(_Region):
         """
         stamps = self._stamps(times_ns)
         if same and not messages and self._packed:
-            return self._commit(stamps, now_ns, _UNFLAGGED)
+            return self._repeat(stamps, now_ns, _UNFLAGGED)
         return self._publish(values, qualities, reasons, stamps, now_ns, messages, _UNFLAGGED)
 
     def publish_columns(
@@ -168,7 +187,7 @@ class RegionWriter(_Region):
         """
         count = len(values)
         if same and not messages and self._packed:
-            return self._commit(now_ns.to_bytes(8, "little", signed=True) * count, now_ns, flags)
+            return self._repeat(now_ns.to_bytes(8, "little", signed=True) * count, now_ns, flags)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
         if but:
             mixed = bytearray(marks)
@@ -227,17 +246,31 @@ class RegionWriter(_Region):
             self._last = last
         return self._commit(stamps, now_ns, flags)
 
+    def _repeat(self, stamps: bytes, now_ns: int, flags: int) -> int:
+        """Publish the columns packed in `_body` again, which differ from the last publication only in their times."""
+        beat = self._heartbeat
+        if beat is None or flags or self._flags:
+            return self._commit(stamps, now_ns, flags)
+        self.counter = beat.counter = self.counter + 1
+        beat.t_ns, beat.stamps = now_ns, stamps
+        return self.counter
+
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
         """Publish the columns packed in `_body`. `stamps` holds the packed time of each tag, `now_ns` is the heartbeat."""
-        shape, body, counter = self.shape, self._body, self.counter + 1
+        self._store(self.counter + 1, stamps, now_ns, flags)
+        if self._heartbeat is not None:
+            self._heartbeat.counter = self._heartbeat.in_memory = self.counter
+        return self.counter
+
+    def _store(self, counter: int, stamps: bytes, now_ns: int, flags: int) -> None:
+        shape, body = self.shape, self._body
         body[shape.times_at : shape.columns_at] = stamps
         shape.head.pack_into(body, 0, counter, now_ns, flags)
         CHECK.pack_into(self._copy, 0, zlib.crc32(body))
         at = self._slots[counter % SLOTS]
         self._memory[at : at + len(self._copy)] = self._copy
         self._words[0] = counter
-        self.counter = counter
-        return counter
+        self.counter, self._flags = counter, flags
 
     def _pack(
         self,
@@ -298,6 +331,10 @@ class RegionWriter(_Region):
         return Bug("values that do not fit their region", where=f"region {self.shape.layout.name}")
 
     def release(self) -> None:
+        beat = self._heartbeat
+        if beat is not None and beat.counter > beat.in_memory:  # the next writer continues from the memory
+            self._store(beat.counter, beat.stamps, beat.t_ns, self._flags)
+            beat.in_memory = beat.counter
         self._body.release()
         super().release()
 
@@ -309,8 +346,8 @@ class RegionReader(_Region):
     tag, that were overwritten before this reader read them.
     """
 
-    def __init__(self, memory: memoryview, shape: RegionShape) -> None:
-        super().__init__(memory, shape)
+    def __init__(self, memory: memoryview, shape: RegionShape, heartbeat: Heartbeat | None = None) -> None:
+        super().__init__(memory, shape, heartbeat)
         self.retries = 0
         self.gave_up = 0
         self.missed = {ring.spec.name: 0 for ring in shape.rings}
@@ -348,6 +385,12 @@ class RegionReader(_Region):
         """Return the latest complete publication. Never waits: after at most `MAX_LOOKS` attempts, it returns the last
         snapshot again.
         """
+        beat = self._heartbeat
+        if beat is not None and beat.counter > beat.in_memory:
+            return self._beaten(beat)
+        return self._from_memory()
+
+    def _from_memory(self) -> Snapshot:
         for _ in range(MAX_LOOKS):
             counter = self._words[0]
             if counter == self._latest.counter:
@@ -359,6 +402,20 @@ class RegionReader(_Region):
             self.retries += 1
         self.gave_up += 1
         return self._again()
+
+    def _beaten(self, beat: Heartbeat) -> Snapshot:
+        """Return the publication of `beat`: the one in the memory with a new counter and new times."""
+        s = self._latest
+        if s.counter == beat.counter:
+            return self._again()
+        messages = _NO_MESSAGES
+        if s.counter < beat.in_memory or not self._columns:
+            s = self._from_memory()
+            messages = s.messages
+        self._latest = Snapshot(
+            s.shape, beat.counter, beat.t_ns, s.flags, s.values, s.qualities, s.reasons, beat.stamps, messages
+        )
+        return self._latest
 
     def _again(self) -> Snapshot:
         """Return the last snapshot without its messages, which were returned before."""

@@ -272,10 +272,12 @@ class Program(ABC):
     def execute(self, scan: ScanInfo) -> None:
         """Execute one scan: read inputs, set outputs, return. An error that it raises stops the task."""
 
-    def _whole_state(self, now_ns: int) -> Any:
+    def whole_state(self, now_ns: int) -> Any:
         """Return the whole state on which the next scans depend, as a hashable value with times relative to `now_ns`.
 
-        Return None if it is unknown, as for logic in Python, which can keep state anywhere.
+        Return None if it is unknown, as for logic in Python, which can keep state anywhere. A program that overrides this
+        depends only on this state, on its inputs with their qualities, and on the time of the scan, and equal states behave the
+        same from now on. Its scans are then skipped while they can change nothing (fieldtwin.plc.cycle.skipping).
         """
         return None
 

@@ -167,7 +167,7 @@ def _check(proof: Proof, program: Program) -> None:
             expected=", ".join(sorted(inputs)) or "none",
             got=", ".join(sorted(proof.domain)) or "none",
         )
-    if proof.key is None and program._whole_state(0) is None:
+    if proof.key is None and program.whole_state(0) is None:
         raise UsageError("a proof of a program in Python needs a key", expected="key: what of the program matters")
 
 
@@ -176,7 +176,7 @@ def _key(proof: Proof, point: _Point) -> Hashable:
     scan."""
     program, now_ns = point.program, point.now_ns
     if proof.key is None:
-        return point.number == 0, program._whole_state(now_ns)
+        return point.number == 0, program.whole_state(now_ns)
     blocks = [v.state(now_ns) for v in vars(program).values() if isinstance(v, FunctionBlock)]
     return point.number == 0, proof.key(program), tuple(blocks)
 

@@ -14,7 +14,7 @@ import json
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Bug, Desync
@@ -231,3 +231,17 @@ class Relay(Program):
         self.dropped = (
             logic.sensor.dropped + logic.transmitter.dropped + self._outgoing.dropped + self._log_lost + self._too_long
         )
+
+    def whole_state(self, now_ns: int) -> Any:
+        """Return counters and queues. Nothing in this program depends on the time between two scans."""
+        logic = self.logic
+        counters = (logic.commands, logic.responses, logic.bad_commands, logic.data_log.total, self._log_sent)
+        losses = (
+            logic.sensor.dropped,
+            logic.transmitter.dropped,
+            self._outgoing.dropped,
+            self._log_lost,
+            self._too_long,
+        )
+        queued = [tuple(item.data for item in c.queue) for c in (logic.transmitter, logic.sensor, self._outgoing)]
+        return logic.period_s, counters, losses, tuple(queued)

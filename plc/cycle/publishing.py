@@ -241,6 +241,16 @@ class OutputImage:
             values[output.index] = value
             self._same = False
 
+    @property
+    def taken_indexes(self) -> set[int]:
+        """Return the indexes in INPUTS of the counters of messages that the receivers have taken."""
+        return {output.taken for output, _ in self.outboxes if output.taken is not None}
+
+    @property
+    def same(self) -> bool:
+        """Return whether the collected values equal those published last."""
+        return self._same
+
     def publish(self, now_ns: int) -> None:
         """Publish what was collected. Raises `ProgramFailed` with the name of a program whose value does not fit its
         tag."""

@@ -20,10 +20,11 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.image.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, Image, Message, Snapshot, TagKind, TagSpec
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram, InputBinding, substitute
 from fieldtwin.plc.cycle.publishing import OutputImage, find
+from fieldtwin.plc.cycle.skipping import Settling
 from fieldtwin.plc.cycle.start import ProgramStart
 from fieldtwin.plc.program import (
     InputTripped,
@@ -80,7 +81,8 @@ class Scan:
 
     `outputs` is the output image of all tasks; without it, the scan creates an output image for its programs. With
     `outputs_first`, a scan begins by publishing what the previous scan computed, so that outputs change at the start of the
-    cycle, however long the logic runs. `starts` determines by name which programs may run; without it all may run. After a
+    cycle, however long the logic runs. `starts` determines by name which programs may run; without it all may run. `may_skip`
+    allows skipping the logic of a scan that would change nothing; the programs must share no data with other tasks. After a
     restart of the process, messages continue after the last message that OUTPUTS reports as consumed. Raises `FileInvalid` when
     a binding's tag is not in the image.
     """
@@ -94,6 +96,7 @@ class Scan:
         *,
         outputs_first: bool = False,
         starts: Mapping[str, ProgramStart] | None = None,
+        may_skip: bool = False,
     ) -> None:
         self.number = 0
         """How many scans were executed, including the one that runs."""
@@ -117,6 +120,18 @@ class Scan:
         self._seen: dict[str, Callable[[], dict[str, Scalar | None]]] = {}
         for bound in programs:
             self._bind_inputs(bound)
+        self._settling = Settling(programs if may_skip else (), _state_of)
+        self.skipped = 0
+        """How many scans did not execute the logic, because it would have changed nothing."""
+        self._held = [item for item in self._plain if item.hold]
+        self._deciding = sorted({item.index for item in self._plain} | self.output_image.taken_indexes)
+        """The indexes in INPUTS on which the logic depends."""
+        self._steady = False
+        """Whether the inputs of the last scan were those of the scan before."""
+        self._columns: Sequence[Scalar | None] = ()
+        """The values of INPUTS that the last scan read. They are the same object as long as nothing but a time changed."""
+        self._given = ""
+        """The inputs of the programs with qualities and reasons, and the counters of taken messages, of the last scan."""
         self._by_tag: dict[str, list[_Input]] = {}
         for item in self._plain:
             self._by_tag.setdefault(item.tag, []).append(item)
@@ -166,15 +181,39 @@ class Scan:
             self.output_image.publish(now_ns)
         if self._not_run:
             self._execute_started(now_ns)
+        elif self._is_skipped(now_ns):
+            self.skipped += 1
         else:
-            self._read(now_ns, self._reader)
             self.output_image.force()
             info = ScanInfo(now_ns, self.number, self.number == 1)
             for bound in self._programs:
                 _run(bound, info)
             self.output_image.collect(now_ns, self.number, self._seen)
+            if self._steady:
+                self._settling.executed(now_ns, same_outputs=self.output_image.same)
         if not self._outputs_first:
             self.output_image.publish(now_ns)
+
+    def _is_skipped(self, now_ns: int) -> bool:
+        """Read the inputs, and return whether the logic need not be executed, because it would change nothing."""
+        settling, forces = self._settling, self.output_image.forces
+        snapshot = self._reader.snapshot()
+        forced = bool(forces.inputs or forces.outputs)
+        if settling.settled and snapshot.values is self._columns and not forced and self._is_alive(snapshot, now_ns):
+            self._snapshot, self.gateway_alive = snapshot, True
+            for item in self._held:
+                if snapshot.qualities[item.index] != _BAD:
+                    item.held = snapshot.values[item.index], snapshot.time_ns(item.index)
+            return True
+        self._take(snapshot, now_ns)
+        if not settling.possible:
+            return False
+        given = repr([(snapshot.values[at], snapshot.qualities[at], snapshot.reasons[at]) for at in self._deciding])
+        self._steady = self.gateway_alive and given == self._given and not forced and not snapshot.messages
+        self._columns, self._given = snapshot.values, given
+        if not self._steady:
+            settling.disturbed()
+        return settling.settled
 
     def _execute_started(self, now_ns: int) -> None:
         """Execute a scan while some programs have not started, or just have started. Only started programs run."""
@@ -196,7 +235,7 @@ class Scan:
         Messages are not consumed while a program that takes messages waits."""
         waiting = self._waiting = frozenset(bound.name for bound, start in self._not_run if not start.started)
         held_back = any(item.owner in waiting for item in self._messages)
-        self._read(now_ns, self._onlooker if held_back else self._reader)
+        self._take((self._onlooker if held_back else self._reader).snapshot(), now_ns)
         if held_back:
             for item in self._messages:
                 item.namespace[item.name] = ()
@@ -218,7 +257,7 @@ class Scan:
             self.output_image.publish_forces()
         else:
             self._snapshot = self._onlooker.snapshot()
-            self.gateway_alive = self._alive(now_ns)
+            self.gateway_alive = self._is_alive(self._snapshot, now_ns)
         self.output_image.publish(now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -229,13 +268,13 @@ class Scan:
         self._reader.release()
         self._onlooker.release()
 
-    def _alive(self, now_ns: int) -> bool:
-        snapshot = self._snapshot
+    def _is_alive(self, snapshot: Snapshot, now_ns: int) -> bool:
         return snapshot.counter > 0 and now_ns - snapshot.t_ns <= self._limit_ns and not snapshot.stopped
 
-    def _read(self, now_ns: int, reader: RegionReader) -> None:
-        snapshot = self._snapshot = reader.snapshot()
-        alive = self.gateway_alive = self._alive(now_ns)
+    def _take(self, snapshot: Snapshot, now_ns: int) -> None:
+        """Set the inputs of the programs from `snapshot`."""
+        self._snapshot = snapshot
+        alive = self.gateway_alive = self._is_alive(snapshot, now_ns)
         values, qualities = snapshot.values, snapshot.qualities
         for item in self._plain:
             if alive and qualities[item.index] != _BAD:
@@ -332,6 +371,7 @@ class Scan:
             "mailbox_waits": sum(outbox.waits for _, outbox in self.output_image.outboxes),
             "image_retries": self._reader.retries,
             "image_gave_up": self._reader.gave_up,
+            "scans_skipped": self.skipped,
         }
 
 
@@ -340,6 +380,14 @@ def _run(bound: BoundProgram, info: ScanInfo) -> None:
     try:
         bound.program.execute(info)
     except (Exception, SystemExit, ScanStuck) as e:  # the logic is the user's: any error that it raises stops the task
+        raise failed(bound, e) from e
+
+
+def _state_of(bound: BoundProgram, now_ns: int) -> Any:
+    """Return the whole state of a program. Raises `ProgramFailed` if the program raises an error."""
+    try:
+        return bound.program.whole_state(now_ns)
+    except Exception as e:  # a program in Python may describe its state itself
         raise failed(bound, e) from e
 
 

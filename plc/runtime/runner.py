@@ -150,6 +150,7 @@ class TaskRunner:
                 self.outputs,
                 outputs_first=config.outputs_first,
                 starts=self.starts.all,
+                may_skip=len(specs) == 1,  # programs of one file share global variables, also those of different tasks
             )
             cycle_ms = _EVENT_MS if spec.single else spec.interval_ms
             timing = TaskConfig(cycle_ms, spec.late_ms or config.late_ms, config.stop_after, spec.name)

@@ -57,7 +57,7 @@ class StProgram(Program):
         body.execute()
         self.st_show()
 
-    def _whole_state(self, now_ns: int) -> Any:
+    def whole_state(self, now_ns: int) -> Any:
         """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global variables."""
         resource = self.st_resource
         body = {name: value for name, value in vars(self.st_body).items() if not is_line(name)}

@@ -134,6 +134,8 @@ class MailboxPump:
         """Start the next mailbox request. `all_consumed` says that the PLC has consumed all messages that were passed to it."""
         self._now_ns = now_ns
         self._keep(all_consumed)
+        if not self.driver.to_acknowledge and not self.driver.consumer.queue:
+            return
         if not self._allow_writes:
             self._withhold()
         if now_ns < self._next_ns or not self._allow_writes or not self._boxes.ready:
@@ -154,11 +156,13 @@ class MailboxPump:
         Until the device is online, the content of the inbox is unknown.
         """
         driver, name = self.driver, self.driver.config.name
+        if not driver.to_acknowledge and not self._taken.of(name):
+            return
         with suppress(Unreachable):  # without the file the message may be delivered twice
             if driver.to_acknowledge:
                 if all_consumed and not self.inbox.queue:
                     self._taken.note(name, driver.emitted)
-            elif self._taken.of(name) and self._bus.online(driver):
+            elif self._bus.online(driver):
                 self._taken.note(name, b"")
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:

@@ -44,7 +44,7 @@ DELAYED = """
 
 @dataclass(frozen=True)
 class Given:
-    """What the gateway publishes before a scan; `silent`: nothing, so that its heartbeat becomes too old."""
+    """The values that the gateway publishes before a scan. A `silent` gateway publishes none, and its heartbeat becomes old."""
 
     level: float = 0.0
     on: bool = False

@@ -8,12 +8,14 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from click.testing import CliRunner, Result
+from msgspec.structs import replace
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.reports.campaign.html import MOST_SEEDS, render_campaign
 from fieldtwin.reports.campaign.workers import BINS, timeline_of, workers_of
 from fieldtwin.results.model import Verdict
+from fieldtwin.run.campaigns.coverage import Coverage
 from fieldtwin.run.campaigns.ledger import LedgerEntry, write_entries
 from fieldtwin.run.campaigns.merging import Runs
 from fieldtwin.run.campaigns.reporting import campaign_of, junit_report
@@ -44,6 +46,15 @@ def test_failures_with_the_same_cause_are_one_group_with_one_command() -> None:
     assert "--seed 3<" not in page
     assert "2 runs: seeds 2, 3" in page
     assert "causes of failures found over virtual hours" in page
+
+
+def test_the_coverage_curve_counts_each_situation_once_in_the_order_of_the_ends() -> None:
+    first, second, third = Coverage(frozenset({1, 2})), Coverage(frozenset({2})), Coverage(frozenset({2, 3, 9}))
+    every = [replace(entry(n), coverage=c.text()) for n, c in ((3, third), (1, first), (2, second))]
+    campaign = campaign_of(runs(*every))
+    assert campaign.coverage == [(8.0, 2), (24.0, 4), (24.0, 4)]
+    assert "4 different situations" in render_campaign([campaign])
+    assert "Coverage over virtual hours" not in render_campaign([campaign_of(runs(entry(1)))])
 
 
 def test_a_missing_seed_is_inconclusive_and_is_an_error_in_junit(tmp_path: Path) -> None:

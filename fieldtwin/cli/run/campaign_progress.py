@@ -46,9 +46,9 @@ class CampaignView:
         if self._live is not None:
             self._live.stop()
 
-    def ended(self, seed: int, hours: float, cause: str | None) -> None:
+    def ended(self, seed: int, hours: float, cause: str | None, coverage: str = "") -> None:
         """Count a run that has ended (see `CampaignProgress.ended`)."""
-        self.progress.ended(seed, hours, cause)
+        self.progress.ended(seed, hours, cause, coverage)
         if self._live is not None:
             return
         if cause is not None and len(self.progress.failures) == self.progress.failed:
@@ -64,11 +64,13 @@ class CampaignView:
 
 def line(progress: CampaignProgress, now_ns: int) -> str:
     """Return the progress as one line."""
+    covered = [f"{len(progress.coverage)} different situations"] if progress.coverage.elements else []
     parts = [
         f"{progress.done} of {progress.total} runs",
         f"{progress.failed} failed",
         f"{_hours(progress.hours)} of virtual time",
         f"{progress.hours_per_hour(now_ns):,.0f} virtual hours per hour",
+        *covered,
         _remaining(progress, now_ns),
     ]
     return ", ".join(parts)
@@ -94,6 +96,8 @@ def render(progress: CampaignProgress, now_ns: int) -> RenderableType:
     hours = f"{_hours(progress.hours)}, {progress.hours_per_hour(now_ns):,.0f} hours per hour"
     if progress.done:
         facts.add_row("virtual time", hours)
+    if progress.coverage.elements:
+        facts.add_row("coverage", f"{len(progress.coverage):,} different situations")
     facts.add_row("failed", Text(str(progress.failed), "bold red") if progress.failed else Text("none", "green"))
     parts: list[RenderableType] = [head, facts]
     for failure in progress.failures:

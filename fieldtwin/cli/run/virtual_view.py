@@ -118,7 +118,8 @@ def run_many(
         def ended(one: Ended[SeedResult]) -> None:
             record(one)
             results.append(one.result)
-            view.ended(one.seed, hours, None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed")
+            cause = None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed"
+            view.ended(one.seed, hours, cause, one.result.coverage)
 
         interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
     results.sort(key=lambda result: result.seed)

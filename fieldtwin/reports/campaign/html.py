@@ -62,6 +62,9 @@ def _section(campaign: CampaignResult, *, alone: bool) -> Markup:
         facts=_facts(campaign, timeline),
         speed=_speed(campaign, timeline),
         runs_chart=runs_chart(timeline) if timeline is not None else None,
+        coverage_chart=curve_chart("different situations reached over virtual hours", campaign.coverage, "h")
+        if campaign.coverage
+        else None,
         causes_chart=_causes_chart(campaign) if len(campaign.groups) > 1 else None,
         workers=workers[:MOST_WORKERS],
         more_workers=len(workers) - MOST_WORKERS,

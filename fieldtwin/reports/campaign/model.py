@@ -1,4 +1,4 @@
-"""What a report of a campaign shows. The ledgers from which it is made are read in `fieldtwin.run.campaigns`."""
+"""The content of a report of a campaign. The ledgers from which it is made are read in `fieldtwin.run.campaigns`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ class CampaignResult:
     """The runs of one campaign, ordered by seed, each seed once. `what` is the fingerprint of files and options.
 
     `missing`: seeds of the campaign without a run. `different`: seeds with several results. `untested`: faults were chosen, and
-    none took effect. `reproduce`: the command of the campaign, empty if it is not known.
+    none took effect. `coverage`: virtual hours, rising, each with the number of different situations that the runs until then
+    reached; empty if it is not known. `reproduce`: the command of the campaign, empty if it is not known.
     """
 
     system: str
@@ -58,6 +59,7 @@ class CampaignResult:
     untested: bool = False
     ledgers: Sequence[str] = ()
     reproduce: str = ""
+    coverage: Sequence[tuple[float, int]] = ()
 
     @property
     def failed(self) -> list[CampaignRun]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.run.campaigns.coverage import Coverage
 
 MOST_FAILURES = 10
 """Largest number of failures that are kept with their cause; further ones are only counted."""
@@ -30,9 +31,12 @@ class CampaignProgress:
     hours: float = 0.0
     """Virtual hours of the runs that have ended."""
     failures: list[Failure] = field(default_factory=list)
+    coverage: Coverage = field(default_factory=Coverage)
+    """The situations that the runs have reached."""
 
-    def ended(self, seed: int, hours: float, cause: str | None) -> None:
-        """Count a run that has ended. `hours`: its virtual hours. `cause`: None if the run passed."""
+    def ended(self, seed: int, hours: float, cause: str | None, coverage: str = "") -> None:
+        """Count a run that has ended. `hours`: its virtual hours. `cause`: None if the run passed. `coverage`: its text."""
+        self.coverage |= Coverage.parse(coverage)
         self.done += 1
         self.hours += hours
         if cause is not None:

@@ -28,7 +28,7 @@ MOST_LISTED = 20
 """Largest number of ledgers that are listed, the latest first."""
 MOST_FOLDERS = 200
 MOST_BYTES = 32 << 20
-"""Size in bytes up to which a ledger is shown: that of about 100,000 runs."""
+"""Size in bytes up to which a ledger is shown: that of about 15,000 runs with random faults."""
 MOST_CAUSES = 5
 QUIET_S = 60.0
 """Time in seconds after its last run until which a campaign counts as running, at least three times its longest run."""
@@ -70,7 +70,12 @@ class _Reading:
         except msgspec.DecodeError as e:
             raise FileInvalid(f"not a line of a ledger: {e}", path=str(path)) from e
         self.offset += len(whole) + len(newline)
-        self.campaigns = [campaign_of(runs, ledgers=[path.name]) for runs in by_fingerprint(merged([self.entries]))]
+        self.campaigns = self.results(path, with_coverage=False)
+
+    def results(self, path: Path, *, with_coverage: bool) -> list[CampaignResult]:
+        """Return the campaigns. Raises `FileInvalid` for an invalid coverage."""
+        every = by_fingerprint(merged([self.entries]))
+        return [campaign_of(runs, ledgers=[path.name], with_coverage=with_coverage) for runs in every]
 
 
 class Ledgers:
@@ -98,7 +103,7 @@ class Ledgers:
                     f"no ledger {name[:80]!r} is known",
                     hint="put it into Studio's working directory, or a folder in it",
                 )
-            return self._campaigns(path)
+            return self._updated(path).results(path, with_coverage=True)
 
     def _paths(self) -> list[Path]:
         subfolders = [path for path in self._folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
@@ -106,19 +111,19 @@ class Ledgers:
         found = [path for folder in folders for path in folder.glob("*.jsonl")]
         return list(islice(filter(_is_ledger, sorted(found, key=_changed_ns, reverse=True)), MOST_LISTED))
 
-    def _campaigns(self, path: Path) -> list[CampaignResult]:
+    def _updated(self, path: Path) -> _Reading:
         known = self._read.setdefault(path, _Reading())
         try:
             known.update(path)
         except FieldtwinError:
             del self._read[path]
             raise
-        return known.campaigns
+        return known
 
     def _state(self, path: Path) -> dict[str, Any]:
         name = self._name(path)
         try:
-            campaigns = self._campaigns(path)
+            campaigns = self._updated(path).campaigns
         except FieldtwinError as e:
             return {"name": name, "path": str(path), "trouble": str(e), "campaigns": []}
         now_s = self._clock.utc_ns() / NS_PER_S

@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 from fieldtwin.cli.run.campaign_progress import CampaignView, line, render, wall_time
+from fieldtwin.run.campaigns.coverage import Coverage
 from fieldtwin.run.campaigns.progress import MOST_FAILURES, CampaignProgress
 
 S = 1_000_000_000
@@ -45,6 +46,13 @@ def test_no_line_is_wider_than_the_terminal_and_failures_are_named(width: int) -
     assert "400 of 1000 runs" in text
     assert "seed 0  tank: the level was 12 m" in text
     assert "and 2 more" in text
+
+
+def test_the_coverage_of_all_runs_is_shown() -> None:
+    progress = CampaignProgress("observatory", 1000, 0)
+    for numbers in ({1, 2}, {2, 3}):
+        progress.ended(1, 8.0, None, Coverage(frozenset(numbers)).text())
+    assert "3 different situations" in line(progress, S)
 
 
 class Clock:

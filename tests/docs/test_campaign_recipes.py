@@ -72,6 +72,19 @@ def test_the_shards_of_a_recipe_have_all_seeds_once(recipe):
     assert len(ledgers) == len(environments)
 
 
+@pytest.mark.parametrize("recipe", ["dask-slurm-command", "dask-kubernetes-command"])
+def test_the_command_of_a_recipe_for_dask_is_valid(recipe):
+    words = shlex.split(RECIPES[recipe])
+    params = cli.get_command(click.Context(cli), "simulate").make_context("simulate", words[2:]).params
+    assert params["on"] == recipe.split("-")[1]
+    assert params["jobs"] > 1
+
+
+@pytest.mark.parametrize(("recipe", "part"), [("dask-slurm", "jobqueue"), ("dask-kubernetes", "kubernetes")])
+def test_a_file_for_dask_is_yaml(recipe, part):
+    assert list(yaml.safe_load(RECIPES[recipe])) == [part]
+
+
 def parse(params: dict[str, object]) -> list[int]:
     from fieldtwin.run.campaigns.seeds import parse_seeds
 

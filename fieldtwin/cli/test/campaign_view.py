@@ -20,7 +20,7 @@ from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, scenario_en
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.ledger import Ledger
 from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of, shrink_seed
-from fieldtwin.run.places.place import Ended, Repeats
+from fieldtwin.run.places.place import Ended, Place, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
@@ -47,7 +47,11 @@ class CampaignResults:
 
 
 def run_scenario_campaign(
-    path: Path, profiles: tuple[Path, ...], options: CampaignOptions, show: Callable[[ScenarioResult], None] | None
+    path: Path,
+    profiles: tuple[Path, ...],
+    options: CampaignOptions,
+    place: Place,
+    show: Callable[[ScenarioResult], None] | None,
 ) -> CampaignResults:
     """Run a scenario with each seed that the ledger does not have yet. `show` None: nothing is printed to stdout."""
     seeds = options.chosen()
@@ -75,7 +79,7 @@ def run_scenario_campaign(
             cause = None if passed else one.result.why or one.result.verdict.value
             view.ended(one.seed, one.result.simulated_s / 3600, cause)
 
-        interrupted = ends_early(lambda: options.place().run(work, left, ended, repeats))
+        interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
     results.sort(key=lambda result: result.seed or 0)
     different = {first.seed for first, _ in repeats.different}
     for _, second in repeats.different:

@@ -173,24 +173,25 @@ def command(
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
     interrupted = False
-    for scenario, file in zip(scenarios, events, strict=True):
-        if campaign.seeds:
-            from fieldtwin.cli.test.campaign_view import run_scenario_campaign
+    with campaign.place() as place:
+        for scenario, file in zip(scenarios, events, strict=True):
+            if campaign.seeds:
+                from fieldtwin.cli.test.campaign_view import run_scenario_campaign
 
-            found = run_scenario_campaign(scenario.path, folders, campaign, None if as_json else _show)
-            today = datetime.now(UTC).date()
-            judged = [waive(replace(one, system=scenario.system), waived, today) for one in found.all]
-            results += judged
-            seeds += judged[1 : 1 + len(found.seeds)]
-            interrupted = found.interrupted
-            if interrupted:
-                break
-            continue
-        result = run_scenario(scenario, where, file, retries, shown)
-        result = replace(result, system=scenario.system)
-        results.append(waive(result, waived, datetime.now(UTC).date()))
-        if not as_json:
-            _show(results[-1])
+                found = run_scenario_campaign(scenario.path, folders, campaign, place, None if as_json else _show)
+                today = datetime.now(UTC).date()
+                judged = [waive(replace(one, system=scenario.system), waived, today) for one in found.all]
+                results += judged
+                seeds += judged[1 : 1 + len(found.seeds)]
+                interrupted = found.interrupted
+                if interrupted:
+                    break
+                continue
+            result = run_scenario(scenario, where, file, retries, shown)
+            result = replace(result, system=scenario.system)
+            results.append(waive(result, waived, datetime.now(UTC).date()))
+            if not as_json:
+                _show(results[-1])
     if shown is not None:
         shown.close()
     machines = _machines([one.system for one in scenarios]) if html else {}

@@ -45,6 +45,7 @@ def place_named(text: str, jobs: int | None) -> Place:
     if text == LOCAL:
         return LocalPlace(jobs or 1)
     if text in _STARTED:
+        _check_package(text)
         return _dask(partial(_started, text, jobs or 1), text, QUEUE_WAIT_S)
     if not text.startswith(DASK):
         raise UsageError("--on", expected=FORMS, got=text)
@@ -54,6 +55,15 @@ def place_named(text: str, jobs: int | None) -> Place:
             hint="dask worker --nworkers N --nthreads 1 sets it",
         )
     return _dask(partial(_existing, _address(text)), text, WORKERS_WAIT_S)
+
+
+def _check_package(kind: str) -> None:
+    """Raise `UsageError` if the package that starts this kind of cluster is not installed."""
+    module, _, package, file = _STARTED[kind]
+    if find_spec(module.partition(".")[0]) is None:
+        raise UsageError(
+            f"--on {kind} needs {package}", expected=f"{package}, configured in {file}", hint=f"pip install {package}"
+        )
 
 
 def _dask(connect: Callable[[], AbstractContextManager[Client]], name: str, wait_s: float) -> Place:
@@ -97,26 +107,19 @@ def _client(address: Any, name: str) -> Client:
 
 @contextmanager
 def _started(kind: str, jobs: int) -> Iterator[Client]:
-    """Start a cluster with room for `jobs` units at a time, and end it after the block."""
+    """Start a cluster with `jobs` workers, and end it after the block."""
     module, class_name, package, file = _STARTED[kind]
-    try:
-        cluster_class = getattr(import_module(module), class_name)
-    except ModuleNotFoundError as e:
-        raise UsageError(
-            f"--on {kind} needs {package}",
-            expected=f"{package}, configured in {file}",
-            hint=f"pip install {package}",
-        ) from e
+    cluster_class = getattr(import_module(module), class_name)
     try:
         cluster = cluster_class()
     except Exception as e:  # each of these packages reports a missing or wrong configuration in its own way
         raise UsageError(
-            f"{package} cannot start a cluster: {e}",
+            f"{package} cannot start a cluster: {' '.join(str(e).split())}",
             expected=f"a complete configuration in {file}",
             hint="docs/how-to/many-computers.md has an example",
         ) from e
     with cluster:
-        cluster.scale(**({"cores": jobs} if kind == SLURM else {"n": jobs}))
+        cluster.scale(jobs)
         client = _client(cluster, kind)
         try:
             yield client

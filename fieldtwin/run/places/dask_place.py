@@ -11,10 +11,11 @@ import pickle
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
-from typing import Generic
+from types import TracebackType
+from typing import Generic, Self
 
 from distributed import Client, Future, KilledWorker
 
@@ -38,21 +39,35 @@ FETCH_S = 30.0
 LEDGER_HINT = "run the same command again: with --ledger it continues where it stopped"
 
 
-@dataclass(frozen=True, slots=True)
 class DaskPlace:
-    """A cluster that `connect` connects to. `wait_s`: the longest time without a worker, in seconds."""
+    """A cluster that `connect` connects to when the first campaign runs. `wait_s`: the longest time without a worker, in seconds.
 
-    connect: Callable[[], AbstractContextManager[Client]]
-    name: str
-    wait_s: float
+    Use it as a context manager; the end of the block ends the connection, and the cluster if `connect` started it.
+    """
+
+    def __init__(self, connect: Callable[[], AbstractContextManager[Client]], name: str, wait_s: float) -> None:
+        self._connect, self.name, self.wait_s = connect, name, wait_s
+        self._open = ExitStack()
+        self._client: Client | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._client = None
+        self._open.close()
 
     def run(
         self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]
     ) -> None:
+        if not seeds:
+            return
         portable, files = work.portable()
         parcel = CampaignParcel(bundle(files), pickle.dumps(portable), local_environment(), unit_limit_s(work))
-        with self.connect() as client, _registered(client, parcel) as campaign:
-            units = _Units(self, client, campaign, work, seeds, on_ended, repeats)
+        if self._client is None:
+            self._client = self._open.enter_context(self._connect())
+        with _registered(self._client, parcel) as campaign:
+            units = _Units(self, self._client, campaign, work, seeds, on_ended, repeats)
             try:
                 units.run()
             finally:

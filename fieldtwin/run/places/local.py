@@ -8,6 +8,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from fieldtwin.run.places.place import Ended, Repeats, SeedWork, T, unit_limit_s
 from fieldtwin.run.places.unit_processes import UnitLost, UnitProcesses
@@ -22,6 +24,12 @@ class LocalPlace:
     """
 
     jobs: int = 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Do nothing: each campaign ends its processes itself."""
 
     def run(
         self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 T = TypeVar("T")
@@ -69,7 +70,13 @@ class Repeats(Generic[T]):
 
 
 class Place(Protocol):
-    """Computers or processes that run units."""
+    """Computers or processes that run units. Use it as a context manager."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None: ...
 
     def run(
         self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]

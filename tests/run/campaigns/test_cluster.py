@@ -139,7 +139,8 @@ def results(
         found[one.seed] = one.result
         heard(one)
 
-    place.run(work, seeds, ended, repeats)
+    with place:
+        place.run(work, seeds, ended, repeats)
     assert sorted(found) == list(seeds)
     return found, repeats
 

@@ -26,11 +26,10 @@ RECIPES = dict(
     re.findall(r"^<!-- recipe: ([\w-]+) -->\n```\w+\n(.*?)^```$", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
 )
 SBATCH = """#!/bin/sh
-count=$(ls jobs/*.pid 2>/dev/null | wc -l)
-cp "$1" "jobs/$count.sh"
-setsid sh "jobs/$count.sh" > "jobs/$count.log" 2>&1 &
-echo $! > "jobs/$count.pid"
-echo "Submitted batch job $count"
+cp "$1" "jobs/$$.sh"
+setsid sh "jobs/$$.sh" > "jobs/$$.log" 2>&1 &
+echo $! > "jobs/$$.pid"
+echo "Submitted batch job $$"
 """
 SCANCEL = """#!/bin/sh
 for job; do kill -9 -- -$(cat "jobs/$job.pid"); touch "jobs/$job.cancelled"; done

@@ -74,7 +74,7 @@ class OpcuaServer:
         """The time of the present look at the image, which is the ServerTimestamp of its samples."""
         self._ids: dict[str, ua.NodeId] = {}
         self._held: dict[str, _Held] = {}
-        """The present value of each variable that is not bad."""
+        """What is present of each tag that is not bad, by the name of its variable."""
         self._statuses: dict[StatusCode, ua.StatusCode] = {}
         logging.getLogger("asyncua").addFilter(_FirstMessages())
 
@@ -105,7 +105,7 @@ class OpcuaServer:
         server.iserver.write_value = self._write_for_client
         waiting = Sample(None, Quality.BAD, Reason.NEVER_READ, 0)
         for name in self.variables.data_types:
-            await self._write(name, waiting)
+            await self._write(name, waiting, None)
 
     async def listen(self) -> None:
         """Accept clients. Raises `EndpointBusy` or `Unreachable`; a later call tries again."""
@@ -150,8 +150,18 @@ class OpcuaServer:
         """Write samples to variables. `names` gives the variable of each tag."""
         self._times.follow()
         self._server_time = self._utc(self._clock.monotonic_ns())
+        source_ns, source_time = 0, self._utc(0)
         for tag, sample in changes:
-            await self._write(names[tag], sample)
+            if sample.source_ns != source_ns:  # the tags of a reply have the same time
+                source_ns, source_time = sample.source_ns, self._utc(sample.source_ns)
+            name = names[tag]
+            held = self._held.get(name)
+            if held is not None and held.content == sample[:3]:
+                for data in held.shared:
+                    data.SourceTimestamp = source_time
+                    data.ServerTimestamp = self._server_time
+            else:
+                await self._write(name, sample, source_time)
             self.updates += 1
 
     async def permit_writes(self, tags: Iterable[str]) -> None:
@@ -174,40 +184,38 @@ class OpcuaServer:
         name = str(item.NodeId.Identifier) if is_own else item.NodeId.to_string()
         return await self.writes.write(item, name, account, address)
 
-    async def _write(self, name: str, sample: Sample) -> None:
+    async def _write(self, name: str, sample: Sample, source_time: datetime | None) -> None:
+        """Set the variable of a tag, and those that show its value as a text or as the serial number of its device."""
         kind = self.variables.data_types[name]
         value = None if sample.value is None else fitted(sample.value, kind)
         status = status_code(sample.quality, sample.reason)
         if value is None and status.number < 0x8000_0000:  # the data type cannot hold the value
             status = BAD_CODES[Reason.OUT_OF_RANGE]
-        await self._set(name, value, kind, status, sample.source_ns)
+        shared = [await self._set(name, value, kind, status, source_time)]
         if name in self.variables.words:
             text = self.variables.words[name].get(int(value), "") if isinstance(value, int) else ""
-            await self._set(
-                f"{name}/{VALUE_AS_TEXT}", ua.LocalizedText(text), "LocalizedText", status, sample.source_ns
-            )
+            shown = ua.LocalizedText(text)
+            shared.append(await self._set(f"{name}/{VALUE_AS_TEXT}", shown, "LocalizedText", status, source_time))
         if name in self.variables.serials and value is not None:
-            await self._set(self.variables.serials[name], str(value), "String", status, sample.source_ns)
+            serial = self.variables.serials[name]
+            shared.append(await self._set(serial, str(value), "String", status, source_time))
+        if value is None:
+            self._held.pop(name, None)  # asyncua has stored a copy of a bad value
+        else:
+            self._held[name] = _Held(sample[:3], shared)
 
-    async def _set(self, name: str, value: Any, kind: str, status: StatusCode, source_ns: int) -> None:
-        """Set the value of a variable. Clients are notified if its value or status differs from the last one."""
-        held = self._held.get(name)
-        if held is not None and held.status == status and held.value == value:
-            held.data.SourceTimestamp = self._utc(source_ns)
-            held.data.ServerTimestamp = self._server_time
-            return
+    async def _set(
+        self, name: str, value: Any, kind: str, status: StatusCode, source_time: datetime | None
+    ) -> _SharedValue:
+        """Set the value of a variable. asyncua notifies clients if its value or status differs from the last one."""
         code = self._statuses.get(status)
         if code is None:
             code = self._statuses[status] = ua.StatusCode(status.number)
-        node = self._id_of(name)
         data = _SharedValue(
-            self._variant(value, kind), code, SourceTimestamp=self._utc(source_ns), ServerTimestamp=self._server_time
+            self._variant(value, kind), code, SourceTimestamp=source_time, ServerTimestamp=self._server_time
         )
-        await self._server.write_attribute_value(node, data)
-        if code.is_bad():
-            self._held.pop(name, None)  # asyncua has stored a copy of a bad value
-        else:
-            self._held[name] = _Held(value, status, data)
+        await self._server.write_attribute_value(self._id_of(name), data)
+        return data
 
     def _id_of(self, name: str) -> ua.NodeId:
         assert self._nodes is not None
@@ -240,9 +248,10 @@ class _SharedValue(ua.DataValue):  # type: ignore[misc]
 
 
 class _Held(NamedTuple):
-    value: Any
-    status: StatusCode
-    data: _SharedValue
+    """The present sample of a tag that is not bad: value, quality and reason, and the values of its variables."""
+
+    content: tuple[Any, ...]
+    shared: list[_SharedValue]
 
 
 class _FirstMessages(logging.Filter):

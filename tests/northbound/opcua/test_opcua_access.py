@@ -186,6 +186,50 @@ def test_a_client_cannot_continue_the_session_of_a_different_one(server: tuple[P
     asyncio.run(attack())
 
 
+def test_a_client_cannot_use_or_delete_the_subscription_of_a_different_one(server: tuple[Path, str]) -> None:
+    """asyncua numbers subscriptions, so an attacker can guess the number of each one."""
+    folder, url = server
+    invalid = "BadSubscriptionIdInvalid"
+
+    async def attack() -> None:
+        async with (
+            await client_of(url, folder / "hmi.der") as victim,
+            await client_of(url, folder / "hmi.der", user="bert") as attacker,
+        ):
+            received = asyncio.Queue[Any]()
+            subscription = await victim.create_subscription(50, Receiver(received))
+            number = subscription.subscription_id
+            assert number is not None
+            session = attacker.uaclient.session
+            assert [code.name for code in await session.delete_subscriptions([number])] == [invalid]
+            mode = ua.SetPublishingModeParameters(False, [number])
+            assert [code.name for code in await session.set_publishing_mode(mode)] == [invalid]
+            for refused in (
+                session.create_monitored_items(ua.CreateMonitoredItemsParameters(number)),
+                session.modify_monitored_items(ua.ModifyMonitoredItemsParameters(number)),
+                session.delete_monitored_items(ua.DeleteMonitoredItemsParameters(number, [1])),
+                session.set_monitoring_mode(ua.SetMonitoringModeParameters(number, ua.MonitoringMode.Disabled, [1])),
+                session.modify_subscription(ua.ModifySubscriptionParameters(number)),
+            ):
+                with pytest.raises(ua.UaStatusCodeError, match=invalid):
+                    await refused
+            await subscription.subscribe_data_change(victim.get_node(TAG))
+            assert await asyncio.wait_for(received.get(), 60) == 50.0
+            await subscription.delete()
+
+    asyncio.run(attack())
+
+
+class Receiver:
+    """Puts the values of a subscription into a queue."""
+
+    def __init__(self, received: asyncio.Queue[Any]) -> None:
+        self._received = received
+
+    def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+        self._received.put_nowait(value)
+
+
 def test_an_altered_message_ends_the_connection(server: tuple[Path, str]) -> None:
     folder, url = server
 

@@ -1,7 +1,7 @@
 """The part of asyncua that holds sessions, with the checks of users that it lacks.
 
 asyncua 2.1 accepts a password that was encrypted for an earlier session, and passwords and signatures with unsafe algorithms (RSA
-PKCS #1 v1.5 and SHA-1).
+PKCS #1 v1.5 and SHA-1). It also lets each session use the subscriptions of all others.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hmac
 import logging
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from struct import unpack_from
 from typing import Any
 
@@ -22,6 +23,8 @@ from asyncua.server.internal_session import InternalSession
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.northbound.opcua.access.users import Account, Users
 
+NO_SUBSCRIPTION = 0
+"""A number that no subscription has."""
 _OAEP = "http://www.w3.org/2001/04/xmlenc#rsa-oaep"
 _RSA_SHA256 = "http://www.w3.org/2001/04/xmldsig-more#rsa-sha256"
 _log = logging.getLogger(__name__)
@@ -59,6 +62,65 @@ class Session(InternalSession):  # type: ignore[misc]
         write, address = self.iserver.write_value, str(self.name[0])
         codes = [await write(item, self.account, address) for item in params.NodesToWrite]
         return [ua.StatusCode(getattr(ua.StatusCodes, code)) for code in codes]
+
+    def _owns(self, subscription: int) -> bool:
+        """Return whether a subscription exists and is that of this session (OPC 10000-4, 5.14.1)."""
+        found = self.subscription_service.subscriptions.get(subscription)
+        return found is not None and found.session_id == self.session_id
+
+    def _check_own(self, subscription: int) -> None:
+        if not self._owns(subscription):
+            raise ServiceError(ua.StatusCodes.BadSubscriptionIdInvalid)
+
+    async def delete_subscriptions(self, ids: list[int]) -> list[ua.StatusCode]:
+        """Delete the subscriptions of this session. Those of other sessions do not exist for it, as in all services below."""
+        own = [each if self._owns(each) else NO_SUBSCRIPTION for each in ids]
+        found: list[ua.StatusCode] = await super().delete_subscriptions(own)
+        return found
+
+    def modify_subscription(self, params: ua.ModifySubscriptionParameters) -> ua.ModifySubscriptionResult:
+        self._check_own(params.SubscriptionId)
+        return super().modify_subscription(params)
+
+    async def set_publishing_mode(self, params: ua.SetPublishingModeParameters) -> list[ua.StatusCode]:
+        own = [each if self._owns(each) else NO_SUBSCRIPTION for each in params.SubscriptionIds]
+        found: list[ua.StatusCode] = await super().set_publishing_mode(replace(params, SubscriptionIds=own))
+        return found
+
+    async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> Any:
+        self._check_own(params.SubscriptionId)
+        return await super().create_monitored_items(params)
+
+    async def modify_monitored_items(self, params: ua.ModifyMonitoredItemsParameters) -> Any:
+        self._check_own(params.SubscriptionId)
+        return await super().modify_monitored_items(params)
+
+    async def delete_monitored_items(self, params: ua.DeleteMonitoredItemsParameters) -> Any:
+        self._check_own(params.SubscriptionId)
+        return await super().delete_monitored_items(params)
+
+    async def set_monitoring_mode(self, params: ua.SetMonitoringModeParameters) -> Any:
+        self._check_own(params.SubscriptionId)
+        return await super().set_monitoring_mode(params)
+
+    def republish(self, params: ua.RepublishParameters) -> Any:
+        self._check_own(params.SubscriptionId)
+        return super().republish(params)
+
+    def publish(self, acks: Any = None) -> tuple[int, list[ua.StatusCode]]:
+        """Acknowledge messages of this session's subscriptions."""
+        own = [
+            each
+            if self._owns(each.SubscriptionId)
+            else ua.SubscriptionAcknowledgement(NO_SUBSCRIPTION, each.SequenceNumber)
+            for each in acks or []
+        ]
+        found: tuple[int, list[ua.StatusCode]] = super().publish(own)
+        return found
+
+    async def transfer_subscriptions(self, params: ua.TransferSubscriptionsParameters, callback: Any) -> Any:
+        """Refuse to take over subscriptions: a client continues its session on a new channel instead, and keeps them."""
+        raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
         """Read attributes. The `UserAccessLevel` is that of the user of this session."""

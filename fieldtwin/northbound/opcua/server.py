@@ -74,7 +74,7 @@ class OpcuaServer:
         """The time of the present look at the image, which is the ServerTimestamp of its samples."""
         self._ids: dict[str, ua.NodeId] = {}
         self._held: dict[str, _Held] = {}
-        """What is present of each tag that is not bad, by the name of its variable."""
+        """The present sample of each tag that is not bad, by the name of its variable."""
         self._statuses: dict[StatusCode, ua.StatusCode] = {}
         logging.getLogger("asyncua").addFilter(_FirstMessages())
 

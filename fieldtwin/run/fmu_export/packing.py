@@ -64,12 +64,15 @@ class ExportOptions:
 def export_fmu(system: System, prototype: Prototype, out: Path, options: ExportOptions) -> FmuInterface:
     """Write the FMU of a prototype to `out`, and return its variables.
 
-    Raises `UsageError` without the extra `fmi` and for wrong options, and `FileInvalid` if a file cannot be packed.
+    Raises `UsageError` without the extra `fmi` and for wrong options, and `FileInvalid` if a file cannot be packed or `out` exists
+    already.
     """
     if find_spec("pythonfmu") is None:
         raise UsageError("the export of FMUs needs an extra", hint=install_hint("fmi"))
     if out.suffix.lower() != ".fmu":
         raise UsageError("the file of the FMU", expected="a name that ends in .fmu", got=str(out))
+    if out.exists():
+        raise FileInvalid("the file exists already", path=str(out), hint="choose another name with --out")
     interface = interface_of(system, prototype, options.inputs)
     with tempfile.TemporaryDirectory(prefix="ft-export-") as place:
         folder = Path(place)

@@ -39,6 +39,15 @@ def test_wrong_option_is_an_error_that_says_what_is_expected(
     assert not list(tmp_path.glob("*.fmu*"))
 
 
+def test_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "plc.fmu"
+    out.write_bytes(b"an FMU of a different tool")
+    done = export(drive_site(tmp_path / "site"), out)
+    assert isinstance(done.exception, FieldtwinError)
+    assert "the file exists already" in str(done.exception)
+    assert out.read_bytes() == b"an FMU of a different tool"
+
+
 def test_network_of_systems_is_no_fmu(tmp_path: Path) -> None:
     done = export("ocean_network", tmp_path / "x.fmu")
     assert isinstance(done.exception, FieldtwinError)

@@ -64,8 +64,8 @@ class ExportOptions:
 def export_fmu(system: System, prototype: Prototype, out: Path, options: ExportOptions) -> FmuInterface:
     """Write the FMU of a prototype to `out`, and return its variables.
 
-    Raises `UsageError` without the extra `fmi` and for wrong options, and `FileInvalid` if a file cannot be packed or `out` exists
-    already.
+    Raises `UsageError` without the extra `fmi` and for wrong options, and `FileInvalid` if a file cannot be packed or `out`
+    exists already.
     """
     if find_spec("pythonfmu") is None:
         raise UsageError("the export of FMUs needs an extra", hint=install_hint("fmi"))

@@ -14,8 +14,8 @@ from rich.table import Table
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_reports import CampaignReports
+from fieldtwin.cli.campaigns.causes import find_causes, show_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
-from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
@@ -85,11 +85,12 @@ def run_many(
     as_json: bool,
     ledger_path: Path | None,
     reports: CampaignReports,
+    jobs: int,
 ) -> int:
     """Run once for each seed and return the exit status: 0 if all passed, 130 if Ctrl-C ended the campaign early.
 
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
-    with their recorded result, also in `reports`.
+    with their recorded result, also in `reports`. `jobs`: number of processes that reduce the faults of failed seeds.
     """
     from fieldtwin.run.campaigns.coverage import joined
     from fieldtwin.run.campaigns.ledger import Ledger, entry_of
@@ -139,11 +140,15 @@ def run_many(
     if reports.given:
         recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
         reports.write([_result(what, recorded, seeds, ledger_path, untested=untested and len(left) == len(seeds))])
+    has_faults = options.random_faults is not None or options.faults or options.fault_file
+    finished = [r for r in failed if r.sha256]
+    found = find_causes(options, finished, jobs) if finished and has_faults and not interrupted else []
     if as_json:
         json.dump(
             {
                 "results": [_plain(r) for r in results],
                 "failed": sorted([*before, *(r.seed for r in failed)]),
+                "groups": [one.plain() for one in found],
                 "coverage": joined(r.coverage for r in results).counts(),
                 "repeated": repeats.count,
                 "different": sorted(different),
@@ -159,10 +164,7 @@ def run_many(
         for error in result.errors:
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
-    found = next((result for result in failed if result.sha256), None)
-    with_faults = options.random_faults is not None or options.faults or options.fault_file
-    if found is not None and with_faults and not interrupted:
-        _shrink(options, found)
+    show_causes(found)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
@@ -231,51 +233,6 @@ def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
         f"{name} {sum(n for n, _ in each)} (took effect {sum(m for _, m in each)} times)" for name, each in of.items()
     ]
     return f"{sum(n for _, n, _ in faults)} injected: {', '.join(sorted(parts))}"
-
-
-def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
-    """Reduce the faults of a failed seed to those that the failure needs, and write them as a scenario into the working
-    directory.
-
-    Nothing is written if the seed does not fail again with the same faults.
-    """
-    from fieldtwin.run.campaigns.confirming import confirm_run
-    from fieldtwin.run.campaigns.many_seeds import shrunk
-    from fieldtwin.run.campaigns.shrink import as_scenario
-    from fieldtwin.scenarios.language.file_name import SUFFIX
-
-    stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
-    small = shrunk(options, failed)
-    if small.result.ok:
-        stdout.print(
-            f"seed {failed.seed} does not fail again with the same faults, so no scenario is written", soft_wrap=True
-        )
-        return
-    path = Path(f"{Path(options.system).stem}-seed{failed.seed}{SUFFIX}")
-    title = f"what failed with seed {failed.seed}"
-    acts = [(one.at_s, {"send": {"period_s": one.period_s}}) for one in small.scripted]
-    text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)
-    write_text(path, text)
-    told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)
-    told += [f"it is written to {path}", confirm_run(path, small.result, options.profiles)]
-    for line in told:
-        stdout.print(line, soft_wrap=True, markup=False, highlight=False)
-
-
-def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
-    """Return sentences that state how many faults of its schedule a seed needs to fail, and the result of a run without
-    faults.
-    """
-    if not count:
-        return [f"seed {seed} also fails without faults, so the faults are not the cause"]
-    what = f"{count} fault{'s' if count > 1 else ''}"
-    least = f"; none of {'them' if count > 1 else 'it'} can be left out" if minimal and count > 1 else ""
-    without = (
-        "without faults the run passes"
-        if passes_without
-        else f"without faults it fails in a different way: {otherwise[0]}"
-    )
-    return [f"seed {seed} fails with {what} of its schedule{least}; {without}"]
 
 
 def _plain(result: SeedResult) -> dict[str, Any]:

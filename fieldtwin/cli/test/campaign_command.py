@@ -91,6 +91,8 @@ def merge_command(
 
 
 def _plain(runs: Runs, expected: frozenset[int]) -> dict[str, object]:
+    from fieldtwin.run.campaigns.reporting import campaign_of
+
     return {
         "what": runs.what,
         "version": runs.version,
@@ -98,6 +100,10 @@ def _plain(runs: Runs, expected: frozenset[int]) -> dict[str, object]:
         "hours": runs.hours,
         "coverage": runs.coverage.counts(),
         "failed": sorted({entry.seed for entry in runs.failed}),
+        "groups": [
+            {"check": group.cause, "count": len(group.runs), "seeds": [run.seed for run in group.runs]}
+            for group in campaign_of(runs).groups
+        ],
         "different": runs.different,
         "missing": sorted(expected - runs.seeds),
     }

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.markup import escape
 
 from fieldtwin.cli.campaign_options import CampaignOptions
+from fieldtwin.cli.campaigns.causes import not_compared_text, seeds_text, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
-from fieldtwin.cli.run.virtual_view import shrunk_texts
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, scenario_entry, verdict_of, what_tests
+from fieldtwin.run.campaigns.causes import shape_text
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.ledger import Ledger
-from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of, shrink_seed
+from fieldtwin.run.campaigns.shrink_failure import ShrunkSeed, causes_of, confirm, scenario_of
 from fieldtwin.run.places.place import Ended, Place, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 
@@ -92,12 +93,9 @@ def run_scenario_campaign(
     if show is not None:
         for result in results:
             _show_seed(result, show)
-    small = next((result for result in results if result.verdict.bad and result.trace_hash), None)
-    found = (
-        []
-        if small is None or interrupted or campaign.random_faults is None
-        else _shrink(campaign, small, show is not None)
-    )
+    failed = [result for result in results if result.verdict.bad and result.trace_hash]
+    shrinks = bool(failed) and not interrupted and campaign.random_faults is not None
+    found = _find_causes(campaign, failed, options.jobs or 1, show is not None) if shrinks else []
     if show is not None:
         _show_whole(whole)
     return CampaignResults(whole, results, found, interrupted)
@@ -155,19 +153,35 @@ def _show_whole(whole: ScenarioResult) -> None:
         stdout.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[ScenarioResult]:
-    """Reduce the faults of a failed seed to those that the failure needs, write them as a scenario into the working
-    directory, and run this scenario to confirm it.
+def _find_causes(campaign: Campaign, failed: list[ScenarioResult], jobs: int, told: bool) -> list[ScenarioResult]:
+    """Shrink the failed seeds by cause, write a scenario for each cause into the working directory, and run it to confirm it.
 
-    Return the result of the confirmed scenario in a list, empty if no scenario was confirmed. `told`: print the findings.
+    Return the results of the confirmed scenarios. `told`: print the findings.
     """
-    stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
-    small = shrink_seed(campaign, failed)
+    stderr.print(f"shrinking the faults of {seeds_text(_seeds(failed))}", markup=False)
+    found, left = causes_of(campaign, failed, jobs)
+    confirmed = []
+    for cause in found:
+        lines, result = _written(campaign, cause.small)
+        confirmed += [result] if result is not None else []
+        if told:
+            title = f"{shape_text(cause.small.faults)}: {seeds_text(_seeds(cause.runs))}"
+            stdout.print(f"[bold]cause[/bold]  {escape(title)}", soft_wrap=True, highlight=False)
+        for line in lines if told else ():
+            stdout.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+    if left:
+        stderr.print(not_compared_text(_seeds(left)), markup=False)
+    return confirmed
+
+
+def _seeds(results: Sequence[ScenarioResult]) -> list[int]:
+    return [result.seed for result in results if result.seed is not None]
+
+
+def _written(campaign: Campaign, small: ShrunkSeed) -> tuple[list[str], ScenarioResult | None]:
+    """Write the shrunk schedule as a scenario and run it. Return sentences about it, and its result if it is confirmed."""
     if not small.result.verdict.bad:
-        stderr.print(
-            f"seed {small.seed} does not fail again with the same faults, so no scenario is written", markup=False
-        )
-        return []
+        return [f"seed {small.seed} does not fail again with the same faults, so no scenario is written"], None
     path = Path(f"{case_of(campaign.path)}-seed{small.seed}{SUFFIX}")
     write_text(path, scenario_of(campaign, small, Path()))
     confirmed = confirm(path, campaign, small)
@@ -178,6 +192,4 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
     lines.append(
         CONFIRMED if confirmed else f"not confirmed: this scenario has a different result; use {small.result.reproduce}"
     )
-    for line in lines if told else ():
-        stdout.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
-    return [confirmed] if confirmed is not None else []
+    return lines, confirmed

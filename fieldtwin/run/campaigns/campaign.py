@@ -108,13 +108,16 @@ def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | N
     return replace(result, reproduce=reproduce(scenario, *campaign.words, "--seeds", str(seed)))
 
 
+def slim_run(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None) -> ScenarioResult:
+    """Run a seed as `run_seed` does and drop the events of its run, because the events of two hundred seeds would not fit into
+    memory. To see them, run the seed again.
+    """
+    return replace(run_seed(campaign, seed, faults), trace=(), dropped=0)
+
+
 @dataclass(frozen=True, slots=True)
 class ScenarioRuns:
-    """Runs of a scenario with many seeds, as work for a place.
-
-    The events of a run are dropped, because the events of two hundred seeds would not fit into memory. To see them, run the
-    seed again.
-    """
+    """Runs of a scenario with many seeds, as work for a place."""
 
     campaign: Campaign
 
@@ -123,7 +126,7 @@ class ScenarioRuns:
         return self.campaign.length_s(self.campaign.check())
 
     def run(self, seed: int) -> ScenarioResult:
-        return replace(run_seed(self.campaign, seed), trace=(), dropped=0)
+        return slim_run(self.campaign, seed)
 
     def unfinished(self, seed: int, reason: str) -> ScenarioResult:
         text = f"the run did not finish: {reason}"

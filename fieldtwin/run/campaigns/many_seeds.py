@@ -7,14 +7,17 @@ import os
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
 from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
 from fieldtwin.run.places.bundle import files_of, profile_folders, relative
 from fieldtwin.run.processes.topside import Scripted
+from fieldtwin.run.processes.workers import each
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.twin.site.data_files import find_recording
 
@@ -116,17 +119,38 @@ class Shrunk:
     scripted: list[Scripted]
 
 
-def shrunk(options: VirtualOptions, found: SeedResult) -> Shrunk:
-    """Return the fewest faults with which the run of `found`'s seed still fails in the same way."""
-    options = replace(options, seed=found.seed)
-    run = VirtualRun(options)
-    base = replace(options, random_faults=None, faults=(), fault_file=None)
-
-    def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
-        return run_seed(replace(base, faults=tuple(part)))
-
-    small = shrunk_run(run.faults, ended, lambda result: same_failure(found.errors, result.errors))
+def shrunk(options: VirtualOptions, found: SeedResult, jobs: int = 1) -> Shrunk:
+    """Return the fewest faults with which the run of `found`'s seed still fails in the same way; `jobs` runs at a time."""
+    run = VirtualRun(replace(options, seed=found.seed))
+    small = shrunk_run(
+        run.faults,
+        partial(_with_faults, options, found.seed),
+        lambda result: same_failure(found.errors, result.errors),
+        jobs,
+    )
     return Shrunk(*small, run.scripted)
+
+
+def _with_faults(options: VirtualOptions, seed: int, faults: Sequence[dict[str, Any]]) -> SeedResult:
+    return run_seed(replace(options, seed=seed, random_faults=None, fault_file=None, faults=tuple(faults)))
+
+
+def causes_of(
+    options: VirtualOptions, failed: Sequence[SeedResult], jobs: int
+) -> tuple[list[Cause[SeedResult, Shrunk]], list[SeedResult]]:
+    """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
+    return causes(
+        failed,
+        lambda one: one.errors,
+        lambda one: shrunk(options, one, jobs),
+        lambda small, others: each(jobs, partial(_fails_with, options, shape_of(small.faults)), others),
+    )
+
+
+def _fails_with(options: VirtualOptions, shape: frozenset[str], found: SeedResult) -> bool:
+    """Return whether the run of a seed still fails in the same way with its faults of this shape only."""
+    faults = VirtualRun(replace(options, seed=found.seed)).faults
+    return same_failure(found.errors, _with_faults(options, found.seed, of_shape(faults, shape)).errors)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, TypeVar
+
+from fieldtwin.run.processes.workers import Workers, run_all
 
 T = TypeVar("T")
 RESULT = TypeVar("RESULT")
@@ -17,55 +20,67 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 def smallest(
-    items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs: int = MOST_RUNS
+    items: Sequence[T],
+    fails: Callable[[Sequence[T]], bool],
+    most_runs: int = MOST_RUNS,
+    first_of: Callable[[Sequence[Sequence[T]]], int | None] | None = None,
 ) -> tuple[list[T], bool]:
     """Return a part of `items` that still `fails`, and whether all its items are necessary.
 
     The first test uses no item, so that a failure which occurs without any item is not attributed to one. After `most_runs`
-    tests the smallest part found so far is returned. `items` as a whole must fail.
+    tests the smallest part found so far is returned. `items` as a whole must fail. `first_of` returns the index of the first of
+    several parts that fails, or None; it may test them at the same time, and tests after that one are not counted.
     """
+    first = first_of or (lambda parts: next((n for n, part in enumerate(parts) if fails(part)), None))
     left, parts, runs = list(items), 2, 0
     if left and most_runs > 0:
         runs += 1
-        if fails(()):
+        if first([()]) is not None:
             return [], True
     while len(left) > 1:
         size = -(-len(left) // parts)
-        pieces = [left[i : i + size] for i in range(0, len(left), size)]
-        for n in range(len(pieces)):
-            without = [item for m, piece in enumerate(pieces) if m != n for item in piece]
-            if not without:
-                continue
-            if runs >= most_runs:
-                return left, False
-            runs += 1
-            if fails(without):
-                left, parts = without, max(parts - 1, 2)
-                break
+        cuts = range(0, len(left), size)
+        without = [left[:i] + left[i + size :] for i in cuts[: most_runs - runs]]
+        found = first(without)
+        runs += len(without) if found is None else found + 1
+        if found is not None:
+            left, parts = without[found], max(parts - 1, 2)
+        elif len(without) < len(cuts):
+            return left, False
+        elif size == 1:
+            break
         else:
-            if size == 1:
-                break
             parts = min(2 * parts, len(left))
     return left, not left or runs > 0
 
 
 def shrunk_run(
-    items: Sequence[T], run: Callable[[Sequence[T]], RESULT], fails: Callable[[RESULT], bool]
+    items: Sequence[T], run: Callable[[Sequence[T]], RESULT], fails: Callable[[RESULT], bool], jobs: int = 1
 ) -> tuple[list[T], bool, RESULT, RESULT]:
     """Return the `smallest` part of `items` whose `run` still `fails`, whether all its items are necessary, and two results.
 
-    They are the results of the run with that part and of the run without any item. Each part is run once.
+    They are the results of the run with that part and of the run without any item. Each part is run once. `jobs` parts are run
+    at a time, in processes if there are several; the result is the same with any number.
     """
     seen: dict[str, RESULT] = {}
 
-    def ended(part: Sequence[T]) -> RESULT:
-        key = repr(list(part))
-        if key not in seen:
-            seen[key] = run(part)
-        return seen[key]
+    def ended(parts: Sequence[Sequence[T]]) -> list[RESULT]:
+        keys = [repr(list(part)) for part in parts]
+        new = {key: part for key, part in zip(keys, parts, strict=True) if key not in seen}
+        seen.update(zip(new, run_all(workers, run, new.values()), strict=True))
+        return [seen[key] for key in keys]
 
-    left, minimal = smallest(items, lambda part: fails(ended(part)))
-    return left, minimal, ended(left), ended(())
+    def first_of(parts: Sequence[Sequence[T]]) -> int | None:
+        for begin in range(0, len(parts), jobs):
+            for n, result in enumerate(ended(parts[begin : begin + jobs]), begin):
+                if fails(result):
+                    return n
+        return None
+
+    with Workers(jobs) if jobs > 1 else nullcontext() as workers:
+        left, minimal = smallest(items, lambda part: first_of([part]) is not None, first_of=first_of)
+        result, without = ended([left, ()])
+    return left, minimal, result, without
 
 
 def kind_of(error: str) -> str:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.run.campaigns.campaign import Campaign, broken_by, run_seed, schedule
+from fieldtwin.run.campaigns.campaign import Campaign, broken_by, schedule, slim_run
+from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
 from fieldtwin.run.campaigns.shrink import as_scenario, same_failure, shrunk_run
+from fieldtwin.run.processes.workers import each
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.judging.fault_effects import fault_id
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
@@ -23,7 +26,7 @@ _KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")
 class ShrunkSeed:
     """The fewest faults with which a seed still breaks the same rule.
 
-    `minimal`: all of them are necessary. `result`: the run with them, with its events. `without`: the run without
+    `minimal`: all of them are necessary. `result`: the run with them. `without`: the run without
     random faults.
     """
 
@@ -34,16 +37,33 @@ class ShrunkSeed:
     without: ScenarioResult
 
 
-def shrink_seed(campaign: Campaign, found: ScenarioResult) -> ShrunkSeed:
-    """Return the fewest random faults with which the seed of `found` still breaks the same rules."""
+def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int = 1) -> ShrunkSeed:
+    """Return the fewest random faults with which the seed of `found` still breaks the same rules; `jobs` runs at a time."""
     assert found.seed is not None
     seed, wanted = found.seed, broken_by(found)
     faults = schedule(campaign, campaign.check(), seed)
+    run = partial(slim_run, campaign, seed)
+    small = shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result)), jobs)
+    return ShrunkSeed(seed, *small)
 
-    def run(part: Sequence[dict[str, Any]]) -> ScenarioResult:
-        return run_seed(campaign, seed, part)
 
-    return ShrunkSeed(seed, *shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result))))
+def causes_of(
+    campaign: Campaign, failed: Sequence[ScenarioResult], jobs: int
+) -> tuple[list[Cause[ScenarioResult, ShrunkSeed]], list[ScenarioResult]]:
+    """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
+    return causes(
+        failed,
+        broken_by,
+        lambda one: shrink_seed(campaign, one, jobs),
+        lambda small, others: each(jobs, partial(_fails_with, campaign, shape_of(small.faults)), others),
+    )
+
+
+def _fails_with(campaign: Campaign, shape: frozenset[str], found: ScenarioResult) -> bool:
+    """Return whether the run of a seed still breaks the same rules with its faults of this shape only."""
+    assert found.seed is not None
+    faults = of_shape(schedule(campaign, campaign.check(), found.seed), shape)
+    return same_failure(broken_by(found), broken_by(slim_run(campaign, found.seed, faults)))
 
 
 def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:

@@ -48,26 +48,33 @@ def seeds_text(seeds: Sequence[int]) -> str:
     return f"{len(seeds)} failed seed{'s' if len(seeds) > 1 else ''} ({', '.join(map(str, seeds[:SEEDS_SHOWN]))}{more})"
 
 
-def find_causes(options: VirtualOptions, failed: Sequence[SeedResult], jobs: int) -> list[FoundCause]:
-    """Shrink the failed seeds by cause, and write a scenario for each cause into the working directory."""
+def find_causes(options: VirtualOptions, failed: Sequence[SeedResult], seeds: int, jobs: int) -> list[FoundCause]:
+    """Shrink the failed ones of `seeds` seeds by cause, and write a scenario for each cause into the working directory."""
     from fieldtwin.run.campaigns.causes import shape_text
     from fieldtwin.run.campaigns.many_seeds import causes_of
+    from fieldtwin.run.campaigns.shrink import FurtherRuns
 
-    stderr.print(f"shrinking the faults of {seeds_text([one.seed for one in failed])}", markup=False)
-    causes, left = causes_of(options, failed, jobs)
+    further = FurtherRuns(seeds)
+    stderr.print(shrinking_text([one.seed for one in failed], further.most), markup=False)
+    causes, left = causes_of(options, failed, jobs, further)
     found = []
     for cause in causes:
         scenario, lines = _written(options, cause.runs[0], cause.small)
-        check, seeds = next(iter(cause.runs[0].errors), ""), tuple(one.seed for one in cause.runs)
-        found.append(FoundCause(check, shape_text(cause.small.faults), seeds, scenario, tuple(lines)))
+        check, alike = next(iter(cause.runs[0].errors), ""), tuple(one.seed for one in cause.runs)
+        found.append(FoundCause(check, shape_text(cause.small.faults), alike, scenario, tuple(lines)))
     if left:
         stderr.print(not_compared_text([one.seed for one in left]), markup=False)
     return found
 
 
+def shrinking_text(seeds: Sequence[int], most: int) -> str:
+    """Return a sentence about the search for causes, with the largest number of its runs."""
+    return f"searching the causes of {seeds_text(seeds)} with at most {most} further runs"
+
+
 def not_compared_text(seeds: Sequence[int]) -> str:
-    """Return a sentence about the failed seeds that have no cause because the number of causes is limited."""
-    return f"not grouped by cause, because the number of causes is limited: {seeds_text(seeds)}"
+    """Return a sentence about the failed seeds that have no cause because the numbers of causes and runs are limited."""
+    return f"not grouped by cause, because the numbers of causes and further runs are limited: {seeds_text(seeds)}"
 
 
 def show_causes(found: Sequence[FoundCause]) -> None:

@@ -142,7 +142,7 @@ def run_many(
         reports.write([_result(what, recorded, seeds, ledger_path, untested=untested and len(left) == len(seeds))])
     has_faults = options.random_faults is not None or options.faults or options.fault_file
     finished = [r for r in failed if r.sha256]
-    found = find_causes(options, finished, jobs) if finished and has_faults and not interrupted else []
+    found = find_causes(options, finished, len(left), jobs) if finished and has_faults and not interrupted else []
     if as_json:
         json.dump(
             {

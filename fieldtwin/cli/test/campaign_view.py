@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.markup import escape
 
 from fieldtwin.cli.campaign_options import CampaignOptions
-from fieldtwin.cli.campaigns.causes import not_compared_text, seeds_text, shrunk_texts
+from fieldtwin.cli.campaigns.causes import not_compared_text, seeds_text, shrinking_text, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
@@ -20,6 +20,7 @@ from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, scenario_en
 from fieldtwin.run.campaigns.causes import shape_text
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.ledger import Ledger
+from fieldtwin.run.campaigns.shrink import FurtherRuns
 from fieldtwin.run.campaigns.shrink_failure import ShrunkSeed, causes_of, confirm, scenario_of
 from fieldtwin.run.places.place import Ended, Place, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
@@ -95,7 +96,7 @@ def run_scenario_campaign(
             _show_seed(result, show)
     failed = [result for result in results if result.verdict.bad and result.trace_hash]
     shrinks = bool(failed) and not interrupted and campaign.random_faults is not None
-    found = _find_causes(campaign, failed, options.jobs or 1, show is not None) if shrinks else []
+    found = _find_causes(campaign, failed, len(results), options.jobs or 1, show is not None) if shrinks else []
     if show is not None:
         _show_whole(whole)
     return CampaignResults(whole, results, found, interrupted)
@@ -153,13 +154,16 @@ def _show_whole(whole: ScenarioResult) -> None:
         stdout.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def _find_causes(campaign: Campaign, failed: list[ScenarioResult], jobs: int, told: bool) -> list[ScenarioResult]:
-    """Shrink the failed seeds by cause, write a scenario for each cause into the working directory, and run it to confirm it.
+def _find_causes(
+    campaign: Campaign, failed: list[ScenarioResult], seeds: int, jobs: int, told: bool
+) -> list[ScenarioResult]:
+    """Shrink the failed ones of `seeds` seeds by cause, and write a scenario for each cause into the working directory.
 
-    Return the results of the confirmed scenarios. `told`: print the findings.
+    Each scenario is run to confirm it. Return the results of the confirmed scenarios. `told`: print the findings.
     """
-    stderr.print(f"shrinking the faults of {seeds_text(_seeds(failed))}", markup=False)
-    found, left = causes_of(campaign, failed, jobs)
+    further = FurtherRuns(seeds)
+    stderr.print(shrinking_text(_seeds(failed), further.most), markup=False)
+    found, left = causes_of(campaign, failed, jobs, further)
     confirmed = []
     for cause in found:
         lines, result = _written(campaign, cause.small)

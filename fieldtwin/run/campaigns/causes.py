@@ -10,14 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from fieldtwin.run.campaigns.shrink import same_failure
+from fieldtwin.run.campaigns.shrink import FurtherRuns, same_failure
 
 FAILED = TypeVar("FAILED")
 SMALL = TypeVar("SMALL")
 MOST_CAUSES = 8
 """Largest number of failed runs of a campaign that are shrunk."""
-MOST_COMPARED = 200
-"""Largest number of runs that compare failed runs with a shrunk one."""
 _OF_ONE_RUN = ("id", "from", "until", "probability")
 """Keys of a fault that differ between runs with the same cause."""
 
@@ -35,18 +33,20 @@ def causes(
     errors_of: Callable[[FAILED], Iterable[str]],
     shrink: Callable[[FAILED], SMALL],
     suffices: Callable[[SMALL, Sequence[FAILED]], Sequence[bool]],
+    further: FurtherRuns,
 ) -> tuple[list[Cause[FAILED, SMALL]], list[FAILED]]:
-    """Return the causes of the failed runs, and the runs that the limits `MOST_CAUSES` and `MOST_COMPARED` left without a cause.
+    """Return the causes of the failed runs, and the runs that the limits `MOST_CAUSES` and `further` left without a cause.
 
     `suffices` states for each of several runs whether it fails in the same way with its faults of the shape of a shrunk schedule.
+    `shrink` counts its runs in `further`.
     """
-    left, found, compared = list(failed), list[Cause[FAILED, SMALL]](), 0
-    while left and len(found) < MOST_CAUSES:
+    left, found = list(failed), list[Cause[FAILED, SMALL]]()
+    while left and len(found) < MOST_CAUSES and further.left:
         first, *others = left
         small = shrink(first)
         alike = [n for n, one in enumerate(others) if same_failure(errors_of(first), errors_of(one))]
-        alike = alike[: MOST_COMPARED - compared]
-        compared += len(alike)
+        alike = alike[: further.left]
+        further.used(len(alike))
         same = {n for n, yes in zip(alike, suffices(small, [others[n] for n in alike]), strict=True) if yes}
         found.append(Cause(small, [first, *(one for n, one in enumerate(others) if n in same)]))
         left = [one for n, one in enumerate(others) if n not in same]

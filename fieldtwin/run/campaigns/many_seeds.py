@@ -14,7 +14,7 @@ from typing import Any
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
-from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
+from fieldtwin.run.campaigns.shrink import FurtherRuns, same_failure, shrunk_run
 from fieldtwin.run.places.bundle import files_of, profile_folders, relative
 from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.processes.workers import each
@@ -119,7 +119,7 @@ class Shrunk:
     scripted: list[Scripted]
 
 
-def shrunk(options: VirtualOptions, found: SeedResult, jobs: int = 1) -> Shrunk:
+def shrunk(options: VirtualOptions, found: SeedResult, jobs: int, further: FurtherRuns) -> Shrunk:
     """Return the fewest faults with which the run of `found`'s seed still fails in the same way; `jobs` runs at a time."""
     run = VirtualRun(replace(options, seed=found.seed))
     small = shrunk_run(
@@ -127,6 +127,7 @@ def shrunk(options: VirtualOptions, found: SeedResult, jobs: int = 1) -> Shrunk:
         partial(_with_faults, options, found.seed),
         lambda result: same_failure(found.errors, result.errors),
         jobs,
+        further,
     )
     return Shrunk(*small, run.scripted)
 
@@ -136,14 +137,15 @@ def _with_faults(options: VirtualOptions, seed: int, faults: Sequence[dict[str, 
 
 
 def causes_of(
-    options: VirtualOptions, failed: Sequence[SeedResult], jobs: int
+    options: VirtualOptions, failed: Sequence[SeedResult], jobs: int, further: FurtherRuns
 ) -> tuple[list[Cause[SeedResult, Shrunk]], list[SeedResult]]:
     """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
     return causes(
         failed,
         lambda one: one.errors,
-        lambda one: shrunk(options, one, jobs),
+        lambda one: shrunk(options, one, jobs, further),
         lambda small, others: each(jobs, partial(_fails_with, options, shape_of(small.faults)), others),
+        further,
     )
 
 

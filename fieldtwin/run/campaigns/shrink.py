@@ -13,10 +13,24 @@ from fieldtwin.run.processes.workers import Workers, run_all
 T = TypeVar("T")
 RESULT = TypeVar("RESULT")
 MOST_RUNS = 60
+"""Largest number of runs that reduce the schedule of one run."""
 BROKEN_AT = ": broken at "
 """The separator in an error message between a rule's text and the values known when it was broken."""
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+class FurtherRuns:
+    """The number of runs that a campaign may still add to its own, to find the causes of its failures."""
+
+    def __init__(self, seeds: int) -> None:
+        """Allow as many runs as the campaign has seeds, and at least `MOST_RUNS`, so that the end of a large campaign takes at
+        most as long as the campaign.
+        """
+        self.most = self.left = max(MOST_RUNS, seeds)
+
+    def used(self, count: int) -> None:
+        self.left = max(0, self.left - count)
 
 
 def smallest(
@@ -55,12 +69,17 @@ def smallest(
 
 
 def shrunk_run(
-    items: Sequence[T], run: Callable[[Sequence[T]], RESULT], fails: Callable[[RESULT], bool], jobs: int = 1
+    items: Sequence[T],
+    run: Callable[[Sequence[T]], RESULT],
+    fails: Callable[[RESULT], bool],
+    jobs: int = 1,
+    further: FurtherRuns | None = None,
 ) -> tuple[list[T], bool, RESULT, RESULT]:
     """Return the `smallest` part of `items` whose `run` still `fails`, whether all its items are necessary, and two results.
 
     They are the results of the run with that part and of the run without any item. Each part is run once. `jobs` parts are run
-    at a time, in processes if there are several; the result is the same with any number.
+    at a time, in processes if there are several; the result is the same with any number. `further` limits the number of tests
+    if it has fewer runs left than `MOST_RUNS`.
     """
     seen: dict[str, RESULT] = {}
 
@@ -77,9 +96,20 @@ def shrunk_run(
                     return n
         return None
 
+    tests = 0
+
+    def counted(parts: Sequence[Sequence[T]]) -> int | None:
+        nonlocal tests
+        found = first_of(parts)
+        tests += len(parts) if found is None else found + 1
+        return found
+
+    most = MOST_RUNS if further is None else min(MOST_RUNS, further.left)
     with Workers(jobs) if jobs > 1 else nullcontext() as workers:
-        left, minimal = smallest(items, lambda part: first_of([part]) is not None, first_of=first_of)
+        left, minimal = smallest(items, lambda part: counted([part]) is not None, most, counted)
         result, without = ended([left, ()])
+    if further is not None:
+        further.used(tests)
     return left, minimal, result, without
 
 

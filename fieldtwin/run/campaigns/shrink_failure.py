@@ -12,7 +12,7 @@ from typing import Any
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, broken_by, schedule, slim_run
 from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
-from fieldtwin.run.campaigns.shrink import as_scenario, same_failure, shrunk_run
+from fieldtwin.run.campaigns.shrink import FurtherRuns, as_scenario, same_failure, shrunk_run
 from fieldtwin.run.processes.workers import each
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.judging.fault_effects import fault_id
@@ -37,25 +37,26 @@ class ShrunkSeed:
     without: ScenarioResult
 
 
-def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int = 1) -> ShrunkSeed:
+def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int, further: FurtherRuns) -> ShrunkSeed:
     """Return the fewest random faults with which the seed of `found` still breaks the same rules; `jobs` runs at a time."""
     assert found.seed is not None
     seed, wanted = found.seed, broken_by(found)
     faults = schedule(campaign, campaign.check(), seed)
     run = partial(slim_run, campaign, seed)
-    small = shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result)), jobs)
+    small = shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result)), jobs, further)
     return ShrunkSeed(seed, *small)
 
 
 def causes_of(
-    campaign: Campaign, failed: Sequence[ScenarioResult], jobs: int
+    campaign: Campaign, failed: Sequence[ScenarioResult], jobs: int, further: FurtherRuns
 ) -> tuple[list[Cause[ScenarioResult, ShrunkSeed]], list[ScenarioResult]]:
     """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
     return causes(
         failed,
         broken_by,
-        lambda one: shrink_seed(campaign, one, jobs),
+        lambda one: shrink_seed(campaign, one, jobs, further),
         lambda small, others: each(jobs, partial(_fails_with, campaign, shape_of(small.faults)), others),
+        further,
     )
 
 

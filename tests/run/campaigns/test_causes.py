@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from tank_plant import write_plant
 
 from fieldtwin.cli.main import cli
-from fieldtwin.run.campaigns.causes import MOST_CAUSES, MOST_COMPARED, causes, of_shape, shape_of, shape_text
-from fieldtwin.run.campaigns.shrink import shrunk_run, smallest
+from fieldtwin.run.campaigns.causes import MOST_CAUSES, causes, of_shape, shape_of, shape_text
+from fieldtwin.run.campaigns.shrink import MOST_RUNS, FurtherRuns, shrunk_run, smallest
 
 PLANT = """fieldtwin: 1
 system: plant
@@ -42,13 +42,14 @@ Run = tuple[str, frozenset[str]]
 """A failed run: its error, and the faults of which each alone is enough."""
 
 
-def found(runs: Sequence[Run]) -> tuple[list[tuple[str, int]], int]:
+def found(runs: Sequence[Run], seeds: int = 1000) -> tuple[list[tuple[str, int]], int]:
     """Return the shape and the number of runs of each cause, and the number of runs without a cause."""
     grouped, left = causes(
         runs,
         lambda run: [run[0]],
         lambda run: min(run[1]),
         lambda small, others: [small in run[1] for run in others],
+        FurtherRuns(seeds),
     )
     return [(cause.small, len(cause.runs)) for cause in grouped], len(left)
 
@@ -66,9 +67,15 @@ def test_the_number_of_causes_is_limited_and_the_other_runs_are_returned() -> No
 
 
 def test_the_number_of_compared_runs_is_limited() -> None:
-    grouped, left = found([("level", frozenset({"silence"}))] * (MOST_COMPARED + MOST_CAUSES + 5))
-    assert grouped[0] == ("silence", MOST_COMPARED + 1)
-    assert (grouped[1:], left) == ([("silence", 1)] * (MOST_CAUSES - 1), 5)
+    assert found([("level", frozenset({"silence"}))] * 100, seeds=80) == ([("silence", 81)], 19)
+    assert found([("level", frozenset({"silence"}))] * 100, seeds=2) == ([("silence", MOST_RUNS + 1)], 39)
+
+
+def test_a_search_takes_only_the_runs_that_a_campaign_has_left() -> None:
+    further = FurtherRuns(0)
+    further.used(MOST_RUNS - 3)
+    left, minimal, _, _ = shrunk_run(range(12), echo, {3, 8}.issubset, further=further)
+    assert ({3, 8} < set(left), minimal, further.left) == (True, False, 0)
 
 
 def test_a_shape_has_kinds_and_targets_only() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 PROGRAM = """
 import sys
-import serial, can, mcp  # third-party libraries that choose their modules by the name of the system
+import serial, can, mcp, distributed  # third-party libraries that choose their modules by the name of the system
 HIDDEN = {"termios", "fcntl", "pty", "tty", "resource", "grp", "pwd", "crypt", "syslog", "readline", "posix_ipc"}
 
 class Hide:

@@ -59,12 +59,9 @@ def test_a_recorded_silence_becomes_a_scenario_that_passes_with_fieldtwin_test(r
     with running.client() as client:
         begun = client.post(f"{SCENARIOS}/recording")
         assert begun.json()["recording"], begun.text
-        client.put(f"{NAME}/tags/ctd.sample_period_s/set", json={"value": 7}).raise_for_status()
-        until(
-            lambda: client.get(f"{NAME}/tags").json()["ctd.sample_period_s"]["value"] == 7,
-            "the gateway reads the value",
-        )
-        client.delete(f"{NAME}/tags/ctd.sample_period_s/set").raise_for_status()
+        client.put(f"{NAME}/tags/ctd.sample_count/set", json={"value": 7}).raise_for_status()
+        until(lambda: held(running, "ctd.sample_count", 7, 1.0), "the gateway has read the value for a second")
+        client.delete(f"{NAME}/tags/ctd.sample_count/set").raise_for_status()
         fault = client.post(f"{NAME}/faults", json={"fault": {"name": "silence", "device": "ctd"}}).json()["id"]
         until(lambda: quality(running, "ctd.status") == "bad", "the status turns bad")
         until(lambda: lasted(running, "ctd.status", "bad", 1.0), "it has been bad for a second")
@@ -72,8 +69,8 @@ def test_a_recorded_silence_becomes_a_scenario_that_passes_with_fieldtwin_test(r
         until(lambda: lasted(running, "ctd.status", "good", 1.0), "the status is good again for a second")
         seen = client.get(f"{SCENARIOS}/recording").json()
         assert [said for _, said in seen["actions"]] == [
-            "set ctd.sample_period_s to 7",
-            "release ctd.sample_period_s",
+            "set ctd.sample_count to 7",
+            "release ctd.sample_count",
             "inject silence, device ctd",
             f"clear {fault}",
         ]
@@ -81,7 +78,7 @@ def test_a_recorded_silence_becomes_a_scenario_that_passes_with_fieldtwin_test(r
         saved = Path(client.post(SCENARIOS, json={"name": "silent"}).json()["path"])
     assert saved.read_text() == draft
     assert saved.parent == folder
-    assert "expect: {tag: ctd.sample_period_s, value: 7, quality: good, within:" in draft
+    assert "expect: {tag: ctd.sample_count, value: 7, quality: good, within:" in draft
     silent, _, recovered = draft.partition("- clear:")
     assert "quality(ctd.status) == 'bad' and reason(ctd.status) ==" in silent
     assert "expect: {tag: ctd.status, quality: good, within:" in recovered

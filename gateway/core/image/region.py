@@ -331,7 +331,7 @@ class RegionWriter(_Region):
         return Bug("values that do not fit their region", where=f"region {self.shape.layout.name}")
 
     def release(self) -> None:
-        beat = self._heartbeat
+        beat, self._heartbeat = self._heartbeat, None  # a second release finds nothing to store
         if beat is not None and beat.counter > beat.in_memory:  # the next writer continues from the memory
             self._store(beat.counter, beat.stamps, beat.t_ns, self._flags)
             beat.in_memory = beat.counter

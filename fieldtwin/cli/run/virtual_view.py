@@ -117,8 +117,8 @@ def run_many(
     with CampaignView(system, len(left)) as view:
 
         def ended(one: Ended[SeedResult]) -> None:
+            results.append(one.result)  # first, because Ctrl-C may come while the entry is written
             record(one)
-            results.append(one.result)
             cause = None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed"
             view.ended(one.seed, hours, cause, one.result.coverage)
 

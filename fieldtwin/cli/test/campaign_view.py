@@ -75,8 +75,8 @@ def run_scenario_campaign(
     with CampaignView(case_of(path), len(left)) as view:
 
         def ended(one: Ended[ScenarioResult]) -> None:
+            results.append(one.result)  # first, because Ctrl-C may come while the entry is written
             record(one)
-            results.append(one.result)
             passed = one.result.verdict is Verdict.PASSED
             cause = None if passed else one.result.why or one.result.verdict.value
             view.ended(one.seed, one.result.simulated_s / 3600, cause)

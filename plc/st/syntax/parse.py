@@ -79,26 +79,46 @@ def parse_all(text: str, path: str = "") -> t.SourceUnit:
     try:
         return parse(text, path)
     except FileInvalid as whole:
-        found = ErrorCollector()
         try:
-            for part in _parts(blanked(text, path)):
-                with found.collect():
-                    parse(part, path)
+            blank = blanked(text, path)
         except FileInvalid:  # a comment or a literal does not end
             raise whole from None
+        found = ErrorCollector()
+        for part, line, column in _parts(blank):
+            try:
+                parse(part, path)
+            except FileInvalid as e:
+                found.add(_moved(e, line, column))
+                if len(found.errors) > FileInvalid.MAX_OTHERS:
+                    break
         found.raise_all()
         raise
 
 
-def _parts(text: str) -> Iterator[str]:
-    """Return each POU and TYPE block of a text without comments, with blanks before it, so that its lines and columns stay."""
-    begin = 0
+def _parts(text: str) -> Iterator[tuple[str, int, int]]:
+    """Return each POU and TYPE block of a text without comments, the lines before it, and the columns before it in its line."""
+    begin = line = line_begin = 0
     for found in _ENDS.finditer(text):
-        if found["end"] is None and found.end() < len(text):
+        end = found.end()
+        if found["end"] is None and end < len(text):
             continue
-        before = text[:begin]
-        yield "\n" * before.count("\n") + " " * (begin - before.rfind("\n") - 1) + text[begin : found.end()]
-        begin = found.end()
+        yield text[begin:end], line, begin - line_begin
+        line += text.count("\n", begin, end)
+        line_begin = max(line_begin, text.rfind("\n", begin, end) + 1)
+        begin = end
+
+
+def _moved(error: FileInvalid, lines: int, columns: int) -> FileInvalid:
+    """Return an error in a part of a text with its position in the whole text."""
+    return FileInvalid(
+        error.message,
+        path=error.path,
+        line=error.line + lines,
+        column=error.column + (columns if error.line == 1 else 0),
+        expected=error.expected,
+        got=error.got,
+        hint=error.hint,
+    )
 
 
 @cache

@@ -106,6 +106,21 @@ def test_each_pou_with_a_syntax_error_is_reported(folder: Path) -> None:
     ]
 
 
+def test_errors_of_two_parts_in_one_line_have_their_columns(tmp_path: Path) -> None:
+    file = tmp_path / "p.st"
+    file.write_text("\nTYPE A : (x y); END_TYPE TYPE B : INT; END_TYPE TYPE C : (x y); END_TYPE")
+    assert [error.partition(": ")[0] for error in errors_of(file)] == [":2:13", ":2:61"]
+
+
+@pytest.mark.long
+def test_an_error_in_a_long_file_is_found_in_time_that_grows_with_its_length() -> None:
+    types = "\n".join(f"TYPE T{n} : INT; END_TYPE" for n in range(10_000))
+    text = "\n" * 700_000 + types + "\n TYPE wrong END_TYPE"
+    with pytest.raises(FileInvalid) as caught:
+        compile_text(text)
+    assert (caught.value.line, caught.value.column, caught.value.others) == (710_001, 13, ())
+
+
 def test_a_name_with_an_error_is_reported_once(tmp_path: Path) -> None:
     file = tmp_path / "p.st"
     file.write_text(

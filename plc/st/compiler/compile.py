@@ -198,10 +198,15 @@ class _Unit:
         for block in self.unit.globals:
             for v in block.variables:
                 symbol = self.env.globals.get(v.name.lower())
-                if symbol is not None and symbol.constant is None:
-                    with self.env.errors.collect():
-                        value = self.declarations.initial(symbol.type, v.initial, v.type)
-                        self.out.line(f"{symbol.code} = {value}", v.pos)
+                if symbol is not None:
+                    self._write_initial(v, symbol)
+
+    def _write_initial(self, v: t.VarDecl, symbol: Symbol) -> None:
+        """Write the assignment of a variable's initial value. A constant needs none, because its value is written at each use."""
+        if symbol.constant is None:
+            with self.env.errors.collect():
+                value = self.declarations.initial(symbol.type, v.initial, v.type)
+                self.out.line(f"{symbol.code} = {value}", v.pos)
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
@@ -266,10 +271,8 @@ class _Unit:
         for block in pou.blocks:
             for v in block.variables if block.kind in kinds else ():
                 symbol = symbols.get(v.name.lower())
-                if symbol is not None and symbol.constant is None:
-                    with self.env.errors.collect():
-                        value = self.declarations.initial(symbol.type, v.initial, v.type)
-                        self.out.line(f"{symbol.code} = {value}", v.pos)
+                if symbol is not None:
+                    self._write_initial(v, symbol)
 
     # -- functions --------------------------------------------------------------------------------------------------------
 
@@ -372,10 +375,8 @@ class _Unit:
                     continue
                 if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
                     self.out.line(f"{symbol.code} = ()", v.pos)
-                elif symbol.constant is None:
-                    with self.env.errors.collect():
-                        value = self.declarations.initial(symbol.type, v.initial, v.type)
-                        self.out.line(f"{symbol.code} = {value}", v.pos)
+                else:
+                    self._write_initial(v, symbol)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
         if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,4 +127,6 @@ class DeviceJobs(AsyncResource):
 
 async def wait_for(job: Job, seconds: float) -> None:
     """Wait for the end of a job, at most some seconds."""
-    await asyncio.wait([asyncio.ensure_future(job.wait())], timeout=seconds)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await job.wait()

@@ -9,9 +9,8 @@ from msgspec import Meta
 
 from fieldtwin.agents.device_jobs import Items, ReadDevice, wait_for
 from fieldtwin.agents.tool import Tool
-from fieldtwin.agents.tools.instances import LONGEST_WAIT_S
+from fieldtwin.agents.tools.instances import check_wait
 from fieldtwin.agents.workplace import Workplace
-from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.studio.commissioning.steps import Address, Dump, File, Identify, Numbers, Range, Scan
 
 READS_WITHIN_S = 120.0
@@ -105,8 +104,7 @@ async def start_dump(work: Workplace, given: OfDump) -> dict[str, Any]:
 
 async def get_job(work: Workplace, given: WaitForJob) -> dict[str, Any]:
     """Return the state, the messages and, at its end, the result of a job."""
-    if not 0 <= given.seconds <= LONGEST_WAIT_S:
-        raise UsageError("seconds", expected=f"0 to {LONGEST_WAIT_S:g}", got=f"{given.seconds:g}")
+    check_wait(given.seconds)
     job = work.devices.job(given.job)
     await wait_for(job, given.seconds)
     return job.whole()

@@ -23,6 +23,12 @@ LOOK_EVERY_S = 0.1
 LONGEST_WAIT_S = 30.0
 
 
+def check_wait(seconds: float) -> None:
+    """Raise `UsageError` if a call may not wait for so long."""
+    if not 0 <= seconds <= LONGEST_WAIT_S:
+        raise UsageError("seconds", expected=f"0 to {LONGEST_WAIT_S:g}", got=f"{seconds:g}")
+
+
 class OfInstance(msgspec.Struct, forbid_unknown_fields=True):
     """A running system, as list_instances names it."""
 
@@ -143,8 +149,7 @@ async def wait_for_tag(work: Workplace, given: OfWait) -> dict[str, Any]:
     attachment = await work.read(given.instance)
     await _gateway(attachment)
     _known(given.tag, attachment.present_tags())
-    if not 0 <= given.seconds <= LONGEST_WAIT_S:
-        raise UsageError("seconds", expected=f"0 to {LONGEST_WAIT_S:g}", got=f"{given.seconds:g}")
+    check_wait(given.seconds)
     end_ns = attachment.now_ns() + int(given.seconds * 1e9)
     while True:
         tag = attachment.present_tags()[given.tag]

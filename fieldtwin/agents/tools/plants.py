@@ -7,9 +7,8 @@ from typing import Any
 import msgspec
 
 from fieldtwin.agents.tool import Tool
-from fieldtwin.agents.tools.instances import LONGEST_WAIT_S
+from fieldtwin.agents.tools.instances import check_wait
 from fieldtwin.agents.workplace import Workplace
-from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.proposals.judging import as_text, number_text
 from fieldtwin.run.proposals.proposal import EXPIRES_AFTER_S
 
@@ -49,8 +48,7 @@ async def propose_write(work: Workplace, given: ProposeWrite) -> dict[str, Any]:
 
 async def get_proposal(work: Workplace, given: Decision) -> dict[str, Any]:
     """Return whether a user has decided, and the result of the write."""
-    if not 0 <= given.seconds <= LONGEST_WAIT_S:
-        raise UsageError("seconds", expected=f"0 to {LONGEST_WAIT_S:g}", got=f"{given.seconds:g}")
+    check_wait(given.seconds)
     return await work.writes.decision(given.proposal, given.seconds)
 
 

@@ -15,13 +15,12 @@ from rich.text import Text
 
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import stderr, stdout
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.proposals.folder import ProposalFolder
 from fieldtwin.run.proposals.judging import as_text, confirm, judge_again, number_text
 from fieldtwin.run.proposals.proposal import Proposal, Seen
-
-NS_PER_S = 1_000_000_000
 
 
 @click.command("approve")

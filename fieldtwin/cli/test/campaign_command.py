@@ -102,7 +102,7 @@ def _plain(runs: Runs, expected: frozenset[int]) -> dict[str, object]:
         "failed": sorted({entry.seed for entry in runs.failed}),
         "groups": [
             {"check": group.cause, "count": len(group.runs), "seeds": [run.seed for run in group.runs]}
-            for group in campaign_of(runs).groups
+            for group in campaign_of(runs, with_coverage=False).groups
         ],
         "different": runs.different,
         "missing": sorted(expected - runs.seeds),

@@ -106,7 +106,8 @@ class _Unit:
             self.env.faulty_here.clear()
             with self.env.declaring(pou.name, self.env.faulty_here), self.declarations.within(pou):
                 if pou.kind == "FUNCTION":
-                    self._write_function(pou)
+                    if pou.name.lower() in self.env.functions:  # without an error in its declaration
+                        self._write_function(pou)
                 elif pou.kind == "FUNCTION_BLOCK":
                     self._write_block(pou)
                 else:

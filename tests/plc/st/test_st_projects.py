@@ -139,6 +139,15 @@ def test_an_enumeration_with_an_error_is_reported_once(tmp_path: Path) -> None:
     assert errors_of(file) == [":1:6: T has the value a twice"]
 
 
+def test_a_function_whose_declaration_has_an_error_hides_no_other_error(tmp_path: Path) -> None:
+    file = tmp_path / "p.st"
+    file.write_text(
+        "FUNCTION f : Nowhere f := 1; END_FUNCTION\nFUNCTION g : INT VAR_INPUT a : Absent; END_VAR g := 1; END_FUNCTION\n"
+        "PROGRAM p VAR x : INT; END_VAR x := f() + g(1); x := TRUE; END_PROGRAM"
+    )
+    assert [error.partition(": ")[0] for error in errors_of(file)] == [":1:14", ":2:32", ":3:54"]
+
+
 def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert errors_of(tmp_path) == [": a folder without a program; expected files .st, .iecst, .xml"]
     monkeypatch.setattr(source_files, "MAX_FILES", 2)

@@ -103,7 +103,7 @@ class Cluster:
 def threads_that_stay() -> None:
     """Start the threads that Dask keeps until this process ends, so that no test appears to have left them."""
     called = Event()
-    with Client(processes=False, n_workers=1, dashboard_address=None, set_as_default=False) as client:
+    with Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0", set_as_default=False) as client:
         client.submit(int).add_done_callback(lambda future: called.set())
         assert called.wait(30)
 

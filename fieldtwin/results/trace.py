@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import msgspec
 
@@ -70,6 +70,14 @@ def decode_event(line: bytes) -> TraceEvent:
     return TraceEvent(t_ns, TraceKind(kind), where, data)
 
 
+class Sink(Protocol):
+    """A file for the lines of a trace."""
+
+    def write(self, data: bytes, /) -> object: ...
+
+    def close(self) -> None: ...
+
+
 class Trace:
     """The latest `capacity` events, the hash of all, and the listeners. `sink`: a file that takes every event as a JSON
     line.
@@ -77,7 +85,7 @@ class Trace:
     Hash and sink get events in blocks: `hexdigest` covers all events, the sink has all after `flush` or `close`.
     """
 
-    def __init__(self, capacity: int = CAPACITY, sink: BinaryIO | None = None) -> None:
+    def __init__(self, capacity: int = CAPACITY, sink: Sink | None = None) -> None:
         self._kept: deque[_Noted] = deque(maxlen=capacity)
         self._told: dict[str, list[Callable[[TraceEvent], None]]] = {kind.value: [] for kind in TraceKind}
         self._hash = hashlib.sha256()
@@ -189,13 +197,30 @@ def read_trace(lines: list[bytes]) -> list[TraceEvent]:
     return [TraceEvent(t, TraceKind(kind), where, data) for t, kind, where, data in map(msgspec.json.decode, lines)]
 
 
-def open_sink(path: Path) -> BinaryIO:
+class _LimitedFile:
+    """A file that discards further lines once it has more than `most_bytes` bytes. Its size then shows that it is incomplete."""
+
+    def __init__(self, file: BinaryIO, most_bytes: int) -> None:
+        self._file, self._most_bytes, self._bytes = file, most_bytes, 0
+
+    def write(self, data: bytes, /) -> None:
+        if self._bytes <= self._most_bytes:
+            self._file.write(data)
+            self._bytes += len(data)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def open_sink(path: Path, most_bytes: int | None = None) -> Sink:
     """Open the file for a trace; an older one is overwritten, and its description is removed.
 
-    Raises `FileInvalid` if it cannot be written.
+    `most_bytes`: a trace with more bytes is incomplete, and its file is larger than this limit. Raises `FileInvalid` if the file
+    cannot be written.
     """
     try:
         about_path(path).unlink(missing_ok=True)
-        return path.open("wb")
+        file = path.open("wb")
+        return file if most_bytes is None else _LimitedFile(file, most_bytes)
     except OSError as e:
         raise FileInvalid(f"cannot write the trace: {e.strerror or e}", path=str(path)) from e

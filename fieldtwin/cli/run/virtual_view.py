@@ -16,6 +16,7 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.campaigns.causes import find_causes, show_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
+from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
@@ -24,6 +25,7 @@ from fieldtwin.gateway.wallclock import WallClock
 if TYPE_CHECKING:
     from fieldtwin.reports.campaign.model import CampaignResult
     from fieldtwin.run.campaigns.coverage import Coverage
+    from fieldtwin.run.campaigns.failure_traces import KeptTraces
     from fieldtwin.run.campaigns.ledger import LedgerEntry
     from fieldtwin.run.campaigns.many_seeds import SeedResult
     from fieldtwin.run.places.place import Ended, Place
@@ -137,18 +139,23 @@ def run_many(
         and bool(results)
         and not any(struck for r in results for _, _, struck in r.faults)
     )
-    if reports.given:
-        recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
-        reports.write([_result(what, recorded, seeds, ledger_path, untested=untested and len(left) == len(seeds))])
     has_faults = options.random_faults is not None or options.faults or options.fault_file
     finished = [r for r in failed if r.sha256]
     found = find_causes(options, finished, len(left), jobs) if finished and has_faults and not interrupted else []
+    first = [one.seeds[0] for one in found]
+    hashes = {} if interrupted else {r.seed: r.sha256 for r in finished}
+    traces, _ = keep_traces(place, work, hashes, first, system)
+    if reports.given:
+        recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
+        untested_all = untested and len(left) == len(seeds)
+        reports.write([_result(what, recorded, seeds, ledger_path, traces, untested=untested_all)])
     if as_json:
         json.dump(
             {
                 "results": [_plain(r) for r in results],
                 "failed": sorted([*before, *(r.seed for r in failed)]),
                 "groups": [one.plain() for one in found],
+                "traces": traces.plain(),
                 "coverage": joined(r.coverage for r in results).counts(),
                 "repeated": repeats.count,
                 "different": sorted(different),
@@ -165,6 +172,8 @@ def run_many(
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
     show_causes(found)
+    if not interrupted:
+        show_traces(traces, [r.seed for r in finished], again)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
@@ -201,7 +210,7 @@ def run_many(
 
 
 def _result(
-    what: str, entries: Sequence[LedgerEntry], seeds: range, ledger_path: Path | None, *, untested: bool
+    what: str, entries: Sequence[LedgerEntry], seeds: range, ledger_path: Path | None, traces: KeptTraces, *, untested: bool
 ) -> CampaignResult:
     """Return the campaign for its reports."""
     from fieldtwin.run.campaigns.merging import Runs
@@ -213,6 +222,7 @@ def _result(
         [ledger_path.name] if ledger_path is not None else [],
         shlex.join(["fieldtwin", *sys.argv[1:]]),
         untested=untested,
+        traces=traces.plain(),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.markup import escape
@@ -11,6 +11,7 @@ from rich.markup import escape
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.campaigns.causes import not_compared_text, seeds_text, shrinking_text, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
+from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.console import stderr, stdout
@@ -97,9 +98,17 @@ def run_scenario_campaign(
     failed = [result for result in results if result.verdict.bad and result.trace_hash]
     shrinks = bool(failed) and not interrupted and campaign.random_faults is not None
     found = _find_causes(campaign, failed, len(results), options.jobs or 1, show is not None) if shrinks else []
+    hashes = {} if interrupted else {result.seed or 0: result.trace_hash for result in failed}
+    traces, _ = keep_traces(place, work, hashes, [one.seed or 0 for one in found], case_of(path))
     if show is not None:
+        reproduce = {result.seed or 0: result.reproduce for result in failed}
+        if not interrupted:
+            show_traces(traces, list(reproduce), reproduce.__getitem__)
         _show_whole(whole)
-    return CampaignResults(whole, results, found, interrupted)
+    files = traces.plain()
+    return CampaignResults(
+        whole, [replace(one, trace_file=files.get(one.seed or 0, "")) for one in results], found, interrupted
+    )
 
 
 def _repeats_checks(different: Collection[int], repeats: Repeats[ScenarioResult]) -> list[CheckResult]:

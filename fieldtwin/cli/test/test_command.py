@@ -371,6 +371,7 @@ def _plain(result: object) -> dict[str, object]:
         "requirements": list(result.requirements),
         "simulated_s": result.simulated_s,
         "trace": result.trace_hash,
+        "trace_file": result.trace_file,
         "reproduce": result.reproduce,
         "faults": [asdict(fault) for fault in result.faults],
         "checks": [

@@ -11,7 +11,7 @@ from fieldtwin.results.model import Verdict
 @dataclass(frozen=True, slots=True)
 class CampaignRun:
     """One run. `hours` are virtual; `ended_s` is its end in seconds since 1970 (UTC), 0 if it is not known; `took_s` is its wall
-    time in seconds.
+    time in seconds. `trace` is the file of its trace, empty if none was kept.
     """
 
     seed: int
@@ -25,6 +25,7 @@ class CampaignRun:
     ended_s: float = 0.0
     took_s: float = 0.0
     worker: str = ""
+    trace: str = ""
 
     @property
     def cause(self) -> str:
@@ -38,6 +39,11 @@ class FailureGroup:
 
     cause: str
     runs: Sequence[CampaignRun]
+
+    @property
+    def traced(self) -> list[CampaignRun]:
+        """Return the runs whose traces were kept."""
+        return [run for run in self.runs if run.trace]
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,14 +95,23 @@ def schedule(campaign: Campaign, scenario: Scenario, seed: int) -> tuple[dict[st
     return random_schedule(group_of(scenario), seed, length_s, wanted)
 
 
-def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None) -> ScenarioResult:
-    """Run the scenario with a seed; if `faults` are given, they replace the faults that the seed chooses."""
+def run_seed(
+    campaign: Campaign,
+    seed: int,
+    faults: Sequence[dict[str, Any]] | None = None,
+    trace: Path | None = None,
+    most_trace_bytes: int | None = None,
+) -> ScenarioResult:
+    """Run the scenario with a seed; if `faults` are given, they replace the faults that the seed chooses.
+
+    `trace` is a file for every event, limited by `most_trace_bytes`.
+    """
     scenario = campaign.check()
     by_chance = None
     if campaign.random_faults is not None:
         chosen = schedule(campaign, scenario, seed) if faults is None else tuple(faults)
         by_chance = ByChance(chosen, campaign.length_s(scenario))
-    result = run_virtual(scenario, seed, by_chance=by_chance)
+    result = run_virtual(scenario, seed, trace, by_chance, most_trace_bytes=most_trace_bytes)
     if by_chance is None:
         return result
     return replace(result, reproduce=reproduce(scenario, *campaign.words, "--seeds", str(seed)))
@@ -127,6 +136,9 @@ class ScenarioRuns:
 
     def run(self, seed: int) -> ScenarioResult:
         return slim_run(self.campaign, seed)
+
+    def run_traced(self, seed: int, trace: Path, most_bytes: int) -> ScenarioResult:
+        return run_seed(self.campaign, seed, trace=trace, most_trace_bytes=most_bytes)
 
     def unfinished(self, seed: int, reason: str) -> ScenarioResult:
         text = f"the run did not finish: {reason}"

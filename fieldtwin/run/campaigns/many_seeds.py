@@ -168,6 +168,9 @@ class SeedRuns:
     def run(self, seed: int) -> SeedResult:
         return run_seed(replace(self.options, seed=seed))
 
+    def run_traced(self, seed: int, trace: Path, most_bytes: int) -> SeedResult:
+        return run_seed(replace(self.options, seed=seed, trace=trace, most_trace_bytes=most_bytes))
+
     def unfinished(self, seed: int, reason: str) -> SeedResult:
         return SeedResult(seed, False, (f"the run did not finish: {reason}",), 0, 0, 0, "")
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 
 from fieldtwin.reports.campaign.model import CampaignResult, CampaignRun, FailureGroup
 from fieldtwin.results.model import Report, ScenarioResult, Verdict
@@ -24,8 +25,10 @@ def campaign_of(
     *,
     untested: bool = False,
     with_coverage: bool = True,
+    traces: Mapping[int, str] = MappingProxyType({}),
 ) -> CampaignResult:
-    """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known.
+    """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known. `traces`: the files
+    of the traces of failed runs, by seed.
 
     Raises `FileInvalid` for an invalid coverage. Without coverage a result of 100,000 runs needs a tenth of the time.
     """
@@ -33,7 +36,7 @@ def campaign_of(
         unfinished_left(runs.entries), key=lambda entry: not entry.ok
     )  # of several results, a failure is shown
     of_seed = {entry.seed: entry for entry in failures_last}
-    every = [_run(of_seed[seed]) for seed in sorted(of_seed)]
+    every = [_run(of_seed[seed], traces.get(seed, "")) for seed in sorted(of_seed)]
     return CampaignResult(
         next((entry.system for entry in runs.entries if entry.system), ""),
         runs.what,
@@ -63,7 +66,7 @@ def coverage_of(entries: Iterable[LedgerEntry]) -> list[tuple[float, int]]:
     return [*points, (hours, len(seen))] if seen else []
 
 
-def _run(entry: LedgerEntry) -> CampaignRun:
+def _run(entry: LedgerEntry, trace: str) -> CampaignRun:
     return CampaignRun(
         entry.seed,
         entry.ok,
@@ -76,6 +79,7 @@ def _run(entry: LedgerEntry) -> CampaignRun:
         entry.ended_s,
         entry.took_s,
         entry.worker,
+        trace,
     )
 
 

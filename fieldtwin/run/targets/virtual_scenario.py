@@ -37,9 +37,10 @@ def run_virtual(
     trace_file: Path | None = None,
     by_chance: ByChance | None = None,
     progress: Progress | None = None,
+    most_trace_bytes: int | None = None,
 ) -> ScenarioResult:
     """Run the scenario. `seed` takes precedence over the scenario's own seed and the prototype file's. `by_chance`: random
-    faults of a campaign.
+    faults of a campaign. `most_trace_bytes` limits the trace file (see `open_sink`).
     """
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
@@ -55,7 +56,7 @@ def run_virtual(
     result: ScenarioResult | None = None
     about: TraceAbout | None = None
     with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
-        sink = open_sink(trace_file) if trace_file is not None else None
+        sink = open_sink(trace_file, most_trace_bytes) if trace_file is not None else None
         trace = Trace(sink=sink)
         trace.listen(collector.feed)
         if progress is not None:

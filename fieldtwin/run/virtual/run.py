@@ -47,9 +47,9 @@ class VirtualOptions:
     """The options of a run. `system` names the file of one system or of several; the duration is in virtual seconds.
 
     `faults`, and those of the file `fault_file`, are injected in addition to those of `random_faults`, which the seed
-    chooses; `trace` is a file for every
-    event. `commands`: the sample periods in seconds that are commanded; None: the usual commands. `prototype_file`,
-    `recordings` and `speed` are for one system.
+    chooses; `trace` is a file for every event, and `most_trace_bytes` limits it (see `open_sink`). `commands`: the sample
+    periods in seconds that are commanded; None: the usual commands. `prototype_file`, `recordings` and `speed` are for one
+    system.
     """
 
     system: str
@@ -64,6 +64,7 @@ class VirtualOptions:
     fault_file: Path | None = None
     random_faults: RandomFaults | None = None
     trace: Path | None = None
+    most_trace_bytes: int | None = field(default=None, repr=False)  # no part of a campaign's fingerprint
 
 
 def load_one(options: VirtualOptions) -> SystemGroup:
@@ -141,7 +142,7 @@ class VirtualRun:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
             file = self.options.trace
-            self.trace = Trace(TRACE_KEPT, open_sink(file) if file else None)
+            self.trace = Trace(TRACE_KEPT, open_sink(file, self.options.most_trace_bytes) if file else None)
             stack.callback(self.trace.close)
             if watch is not None:
                 watch(self.trace)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import signal
@@ -23,6 +25,7 @@ from support import eventually, run
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.results.trace_about import read_about
 from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns
 from fieldtwin.run.campaigns.ledger import Ledger, LedgerEntry
 from fieldtwin.run.campaigns.many_seeds import SeedRuns
@@ -252,6 +255,23 @@ def test_a_campaign_of_a_scenario_is_recorded_and_resumed(cluster: Cluster, site
     nothing_new = invoke("test", "level.scenario.yaml", "--seeds", "1..3", *options)
     assert nothing_new.return_value == 0, nothing_new.output
     assert invoke("campaign", "merge", "l.jsonl", "--seeds", "1..3").return_value == 0
+
+
+def test_the_traces_of_failed_runs_reach_the_computer_of_the_user(cluster: Cluster, site: Path) -> None:
+    cluster.add("w1")
+    (site / "shed.yaml").write_text((site / "shed.yaml").read_text() + 'invariants: {never: ["tank.level > 10"]}\n')
+    words = ["simulate", "shed.yaml", "--for", "5s", "--seeds", "1..2", "--json"]
+    there = json.loads(invoke(*words, "--on", f"dask://{cluster.address}").stdout)
+    assert there["traces"] == {"1": "shed-seed1.jsonl", "2": "shed-seed2.jsonl"}
+    files = {path.name: path.read_bytes() for path in site.glob("shed-seed*.jsonl")}
+    assert [hashlib.sha256(files[f"shed-seed{n}.jsonl"]).hexdigest() for n in (1, 2)] == [
+        result["sha256"] for result in there["results"]
+    ]
+    about = read_about(site / "shed-seed1.jsonl")
+    assert about is not None
+    assert Path(about.system_path) == site / "shed.yaml"
+    here = json.loads(invoke(*words).stdout)
+    assert (here["traces"], {name: (site / name).read_bytes() for name in files}) == (there["traces"], files)
 
 
 def read(path: Path) -> list[LedgerEntry]:

@@ -46,7 +46,9 @@ def missing_texts(kept: KeptTraces, failed: Sequence[int], again: Callable[[int]
     """Return a sentence for each failed seed whose trace could not be kept, and one for all seeds beyond the limit."""
     from fieldtwin.run.campaigns.failure_traces import MOST_TRACES
 
-    texts = [f"no trace of seed {seed}: {why}; repeat its run with: {again(seed)}" for seed, why in kept.missing.items()]
+    texts = [
+        f"no trace of seed {seed}: {why}; repeat its run with: {again(seed)}" for seed, why in kept.missing.items()
+    ]
     left = [seed for seed in failed if seed not in kept.files and seed not in kept.missing]
     if left:
         texts.append(

@@ -210,7 +210,13 @@ def run_many(
 
 
 def _result(
-    what: str, entries: Sequence[LedgerEntry], seeds: range, ledger_path: Path | None, traces: KeptTraces, *, untested: bool
+    what: str,
+    entries: Sequence[LedgerEntry],
+    seeds: range,
+    ledger_path: Path | None,
+    traces: KeptTraces,
+    *,
+    untested: bool,
 ) -> CampaignResult:
     """Return the campaign for its reports."""
     from fieldtwin.run.campaigns.merging import Runs

@@ -33,7 +33,9 @@ TOO_LARGE = (
     f"its trace is larger than {MAX_TRACE_BYTES >> 20} MiB, or than {MAX_PACKED_BYTES >> 20} MiB after compression"
 )
 TOO_MANY_BYTES = f"the traces of a campaign have at most {MAX_TOTAL_BYTES >> 20} MiB in total"
-NOT_REPRODUCED = "a second run with this seed has a different trace, which is a defect: the same seed must give the same run"
+NOT_REPRODUCED = (
+    "a second run with this seed has a different trace, which is a defect: the same seed must give the same run"
+)
 
 
 class TracedWork(SeedWork[RESULT], Protocol[RESULT]):

@@ -27,8 +27,8 @@ def campaign_of(
     with_coverage: bool = True,
     traces: Mapping[int, str] = MappingProxyType({}),
 ) -> CampaignResult:
-    """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known. `traces`: the files
-    of the traces of failed runs, by seed.
+    """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known. `traces`: the
+    files of the traces of failed runs, by seed.
 
     Raises `FileInvalid` for an invalid coverage. Without coverage a result of 100,000 runs needs a tenth of the time.
     """

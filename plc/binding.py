@@ -62,21 +62,27 @@ class BoundProgram:
         return [(v, self.outputs.get(v.name, f"{self.name}.{v.name}")) for v in both]
 
 
-def load_program(source: str, python_path: Sequence[str] = (), together: dict[Any, Any] | None = None) -> Program:
+def load_program(
+    source: str,
+    python_path: Sequence[str] = (),
+    together: dict[Any, Any] | None = None,
+    dialect: str = "standard",
+) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
     All programs of one PLC are created with the same dictionary `together`, which is empty at first. Through it, the programs
     of one Structured Text file share their VAR_GLOBAL.
 
     `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``), a PLCopen export (``plant.xml``) or a
-    folder of such files (``plc``), followed by ``:NAME`` if there are several programs.
+    folder of such files (``plc``), followed by ``:NAME`` if there are several programs. `dialect` is the dialect of a text
+    (`fieldtwin.plc.st.dialects`).
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
     if language.strip() == "python":
         made = _python_class(source, rest, python_path)
     else:
-        made = partial(_text_class(source, python_path), together)
+        made = partial(_text_class(source, python_path, dialect), together)
     try:
         return made()
     except FieldtwinError:
@@ -103,15 +109,16 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
     return found
 
 
-def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
+def _text_class(source: str, folders: Sequence[str], dialect: str) -> type[StProgram]:
     name, _, program = source.strip().partition(":")
     places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
     found = next((p for p in places if p.exists()), places[0])
     if not (name.lower().endswith(_ST_SUFFIXES) or (name and found.is_dir())):
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
+    from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
-    return load_source(found, program.strip())
+    return load_source(found, program.strip(), dialect_of(dialect))
 
 
 def image_for(

@@ -246,6 +246,8 @@ class Program(ABC):
     """The file in which the program is declared, if it is not the file of its module."""
     source_files: ClassVar[tuple[str, ...]] = ()
     """All files from which the program was compiled, that one first; empty for a Python program."""
+    source_warnings: ClassVar[tuple[str, ...]] = ()
+    """The compiler's warnings about constructs that only the program's dialect accepts, each with file, line and id."""
     _lookup: Callable[[str], TagValue] | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

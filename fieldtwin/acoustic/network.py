@@ -144,6 +144,7 @@ def _renamed(program: ProgramForm, member: AcousticMember) -> ProgramForm:
     beside = member.system.path.parent / program.source
     return ProgramForm.model_construct(
         source=str(beside.resolve()) if beside.exists() else program.source,
+        dialect=program.dialect,
         task=None,
         inputs={
             n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad)

@@ -31,6 +31,14 @@ def explained(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
     return [CompletionItem(entry.id, help=f"{entry.kind}: {entry.title}") for entry in entries]
 
 
+def st_warnings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the ids of the warnings of Structured Text that begin with `incomplete`, and ``all``."""
+    from fieldtwin.plc.st.dialects import WARNINGS
+
+    known = {**WARNINGS, "all": "all of them"}
+    return [CompletionItem(id, help=title) for id, title in known.items() if id.lower().startswith(incomplete.lower())]
+
+
 def script_of(shell: str, program: click.Command) -> str:
     """Return the script that makes `shell` (bash, zsh or fish) complete the program's commands, options and arguments."""
     from click.shell_completion import get_completion_class

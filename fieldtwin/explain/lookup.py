@@ -23,9 +23,11 @@ def everything() -> tuple[Explanation, ...]:
     from fieldtwin.explain.modbus_exceptions import EXCEPTIONS
     from fieldtwin.explain.qualities import QUALITIES
     from fieldtwin.explain.sdo_aborts import ABORTS
+    from fieldtwin.explain.st_warnings import ST_WARNINGS
     from fieldtwin.explain.verdicts import VERDICTS
 
-    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *VERDICTS, *COMMISSIONING_WORDS, *CASES)
+    words = (*VERDICTS, *COMMISSIONING_WORDS, *ST_WARNINGS)
+    return (*EXCEPTIONS, *ABORTS, *QUALITIES, *ERRORS, *EXPLAINED_FAULTS, *words, *CASES)
 
 
 def explain(text: str) -> Sequence[Explanation]:
@@ -46,6 +48,6 @@ def explain(text: str) -> Sequence[Explanation]:
     raise UsageError(
         f"no explanation of {text!r}",
         expected="a test case (MB-015), a fault, `exception 02`, an SDO abort code, a quality or its reason, a verdict, "
-        "a certainty, an error, `exit 4`",
+        "a certainty, an error, a warning of Structured Text, `exit 4`",
         hint=f"similar: {', '.join(near)}" if near else "`fieldtwin explain` without a word lists all",
     )

@@ -21,6 +21,7 @@ from fieldtwin.service.journal import EventLog, Format
 from fieldtwin.service.metrics import RunState, families
 from fieldtwin.service.metrics_server import MetricsServer, parse_place
 from fieldtwin.service.notify import Notifier
+from fieldtwin.twin.plant.physical import program_warnings
 
 LOOK_S = 0.5
 STATUS_S = 5.0
@@ -93,7 +94,7 @@ class RunService:
                 self.url = await self._server.open(*parse_place(self._options.metrics))
             if self._log is not None:
                 self._log.write(self._started())
-                for warning in self._session.system.warnings:
+                for warning in (*self._session.system.warnings, *program_warnings(self._session.system)):
                     self._log.write(ServiceEvent(Priority.WARNING, "system_file", warning))
                 self._nursery.start(self._tell(), "events")
             self._nursery.start(self._reload(), "reload")

@@ -31,7 +31,7 @@ from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.scenarios.language.names import invariants_of
 from fieldtwin.site.compose.check import CommandLines, ComposeCheck
 from fieldtwin.site.compose.service import is_compose
-from fieldtwin.twin.plant.physical import image_layout
+from fieldtwin.twin.plant.physical import image_layout, program_warnings
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.group import read_group
@@ -184,6 +184,7 @@ class _Site:
             if complete and len(self._errors.errors) == before:
                 self._found.warnings += system.warnings
                 image_layout(system)
+                self._found.warnings += program_warnings(system)
 
     def _check_prototype(self, path: Path) -> None:
         file = load(path)

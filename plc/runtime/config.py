@@ -22,7 +22,7 @@ class ProgramConfig:
     """The configuration of a program.
 
     It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
-    empty), and its policy while it waits for its inputs.
+    empty), its policy while it waits for its inputs, and the dialect of its source.
     """
 
     name: str
@@ -31,10 +31,12 @@ class ProgramConfig:
     outputs: dict[str, str] = field(default_factory=dict)
     task: str = ""
     start: StartPolicy = field(default_factory=StartPolicy)
+    dialect: str = "standard"
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
         """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
-        return BoundProgram(self.name, load_program(self.source, python_path, together), self.inputs, self.outputs)
+        program = load_program(self.source, python_path, together, self.dialect)
+        return BoundProgram(self.name, program, self.inputs, self.outputs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable
+from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 
@@ -162,6 +163,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         "st_declared": found,
         "source_path": found.path,
         "source_files": files,
+        "source_warnings": tuple(map(str, unit.warnings)),
         "__module__": __name__,
     }
     for v in found.variables:
@@ -180,9 +182,9 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     return type(found.name, (StProgram,), body)
 
 
-def load_source(path: Path, name: str = "") -> type[StProgram]:
+def load_source(path: Path, name: str = "", dialect: Dialect = STANDARD) -> type[StProgram]:
     """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
-    return program_class(compile_source(path), name)
+    return program_class(compile_source(path, dialect), name)
 
 
 def _attribute(variable: ProgramVariable) -> str:

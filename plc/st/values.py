@@ -91,6 +91,12 @@ def inside(x: int, low: int, high: int) -> int:
     raise LogicError("a value outside its subrange", expected=f"{low} to {high}", got=str(x))
 
 
+def enumerated(x: int, values: tuple[int, ...], name: str) -> int:
+    if x in values:
+        return x
+    raise LogicError(f"a number that is not a value of {name}", expected=", ".join(map(str, values)), got=str(x))
+
+
 def steps(first: int, last: int, by: int) -> range:
     if by == 0:
         raise LogicError("a FOR with step 0 would never end")
@@ -183,6 +189,11 @@ def rotate_left(x: int, n: int, bits: int) -> int:
 
 def rotate_right(x: int, n: int, bits: int) -> int:
     return rotate_left(x, bits - _count(n) % bits, bits)
+
+
+def arithmetic_right(x: int, n: int) -> int:
+    """Return a signed integer shifted right, with copies of its sign from the left. A negative count is an error."""
+    return x >> min(_count(n), 64)
 
 
 def _count(n: int) -> int:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner, Result
 
 from fieldtwin.cli.run.plc_check_command import check
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.st.dialects import DIALECTS
 
 
 def checked(*arguments: str) -> Result:
@@ -53,3 +55,31 @@ def test_a_system_of_python_programs_says_so() -> None:
     done = checked("observatory")
     assert isinstance(done.exception, UsageError)
     assert "no program in Structured Text" in str(done.exception)
+
+
+def test_warnings_of_a_dialect_are_listed_and_become_errors_by_their_ids(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.st").write_text("PROGRAM p VAR_INPUT n : INT; END_VAR VAR d : DINT; END_VAR\nn := 1;\nn := d;\nEND_PROGRAM")
+    done = checked("p.st", "--dialect", "codesys")
+    assert (done.return_value, done.output.splitlines()) == (
+        0,
+        [
+            "p.st:2:1: ST001 n is an input and is assigned to",
+            "p.st:3:1: ST001 n is an input and is assigned to",
+            "p.st:3:6: ST002 DINT is converted to INT",
+            "1 file, no errors, 3 warnings: 1 program",
+        ],
+    )
+    data = json.loads(checked("p.st", "--dialect", "codesys", "--error", "st002", "--json").output)
+    assert [error["message"] for error in data["errors"]] == ["ST002 DINT is converted to INT"]
+    assert [warning["id"] for warning in data["warnings"]] == ["ST001", "ST001"]
+    done = checked("p.st", "--dialect", "codesys", "--error", "all")
+    assert (done.return_value, done.output.splitlines()[-1]) == (1, "3 errors in 1 file")
+
+
+def test_the_choices_of_the_option_are_the_dialects() -> None:
+    (option,) = (p for p in check.params if p.name == "dialect")
+    assert isinstance(option.type, click.Choice)
+    assert list(option.type.choices) == list(DIALECTS)

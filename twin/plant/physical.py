@@ -100,9 +100,18 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             dict(form.outputs),
             form.task or "",
             _start_policy(form.start or system.plc.start),
+            form.dialect,
         )
         for name, form in system.plc.programs.items()
     )
+
+
+def program_warnings(system: System) -> tuple[str, ...]:
+    """Return the compiler's warnings about the programs of a system, each once. Raises `FileInvalid`."""
+    folder = (str(system.path.parent),)
+    texts = [config for config in programs_of(system) if config.source.partition(":")[0].strip() != "python"]
+    programs = [config.bind(folder).program for config in texts]
+    return tuple(dict.fromkeys(warning for program in programs for warning in program.source_warnings))
 
 
 def _start_policy(form: StartForm) -> StartPolicy:

@@ -169,6 +169,9 @@ class ProgramForm(SiteModel):
     """A program of the PLC: its source, and the tags to which its variables are bound."""
 
     source: str = Field(examples=["control.st"])
+    dialect: Literal["standard", "codesys", "twincat", "matiec"] = Field(
+        default="standard", description="of a source in Structured Text"
+    )
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[Name, InputForm] = Field(default={})

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from fieldtwin.cli.completions import systems
+from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
@@ -20,42 +20,75 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
+    from fieldtwin.plc.st.dialects import Dialect, StWarning
 
 _OF_SYSTEMS = (".yaml", ".yml")
+_DIALECTS = ("standard", "codesys", "twincat", "matiec")
 
 
 @dataclass(frozen=True)
 class _Found:
-    """The compiled units, and the errors in those that cannot be compiled."""
+    """The compiled units, the errors in those that cannot be compiled, and warnings, also those that count as errors."""
 
     units: list[CompiledUnit]
     errors: list[FileInvalid]
+    warnings: list[StWarning]
 
 
 @click.command("check")
 @click.argument("source", shell_complete=systems)
-@group("Options", sources=TemplateSearchOptions)
+@group(
+    "Options",
+    click.option(
+        "--dialect",
+        type=click.Choice(_DIALECTS),
+        help="The dialect of a file or folder (default: standard). A system states the dialect of each program.",
+    ),
+    click.option(
+        "--error",
+        "as_errors",
+        metavar="ID",
+        multiple=True,
+        shell_complete=st_warnings,
+        help="Treat the warning ID (such as ST001), or all, as an error. Can be repeated.",
+    ),
+    sources=TemplateSearchOptions,
+)
 @json_option
-def check(source: str, sources: TemplateSearchOptions, as_json: bool) -> int:
-    """Compile SOURCE and list all errors, one per line, with file, line and column. Nothing is run.
+def check(
+    source: str, dialect: str | None, as_errors: tuple[str, ...], sources: TemplateSearchOptions, as_json: bool
+) -> int:
+    """Compile SOURCE and list all errors and warnings, one per line, with file, line and column. Nothing is run.
 
     SOURCE is a file of Structured Text or PLCopen XML, a folder of such files, which are compiled together, or a system,
     whose programs are checked. A file or folder needs no system.
 
     \b
     fieldtwin plc check pump.st
-    fieldtwin plc check plc/
+    fieldtwin plc check plc/ --dialect codesys --error ST002
     fieldtwin plc check observatory
+
+    A warning marks a construct that only the dialect accepts; `fieldtwin explain ST001` explains it.
 
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
     """
-    found = _checked([Path(source)] if _is_program(source) else list(_sources_of(source, sources)))
+    from fieldtwin.plc.st.dialects import chosen_ids, dialect_of
+
+    if _is_program(source):
+        programs = [(Path(source), dialect_of(dialect or "standard"))]
+    elif dialect is not None:
+        raise UsageError(f"--dialect for the system {source}", expected="`dialect:` of the program in the system file")
+    else:
+        programs = list(_sources_of(source, sources))
+    found = _checked(programs, chosen_ids(as_errors))
     if as_json:
         click.echo(json.dumps(_as_json(found), indent=2))
         return 1 if found.errors else 0
     for error in found.errors:
         stdout.print(str(error), soft_wrap=True, markup=False)
+    for warning in found.warnings:
+        stdout.print(f"{warning}", style="yellow", soft_wrap=True, markup=False)
     stdout.print(_summary(found), style="red" if found.errors else "green", soft_wrap=True, markup=False)
     return 1 if found.errors else 0
 
@@ -66,17 +99,20 @@ def _is_program(source: str) -> bool:
     return path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS)
 
 
-def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[Path]:
-    """Return each file or folder of programs in Structured Text that a system has, once.
+def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[tuple[Path, Dialect]]:
+    """Return each file or folder of programs in Structured Text that a system has, once, with its dialect.
 
     Raises `UsageError` if it has none.
     """
+    from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.run.template import system_file
     from fieldtwin.twin.site.system import load_system
 
     loaded = load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
-    forms = [form.source.partition(":") for form in loaded.plc.programs.values()]
-    found = dict.fromkeys(loaded.path.parent / name for name, _, _ in forms if name.strip() != "python")
+    forms = [(form.source.partition(":")[0].strip(), form.dialect) for form in loaded.plc.programs.values()]
+    found = dict.fromkeys(
+        (loaded.path.parent / name, dialect_of(dialect)) for name, dialect in forms if name != "python"
+    )
     if not found:
         raise UsageError(
             f"{system} has no program in Structured Text", hint="Python programs are checked by mypy or ruff"
@@ -84,26 +120,31 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[Path]:
     yield from found
 
 
-def _checked(paths: list[Path]) -> _Found:
+def _checked(programs: Sequence[tuple[Path, Dialect]], as_errors: frozenset[str]) -> _Found:
     from fieldtwin.plc.st.project import compile_source
 
-    found = _Found([], [])
-    for path in paths:
+    found = _Found([], [], [])
+    for path, dialect in programs:
         try:
-            found.units.append(compile_source(path))
+            unit = compile_source(path, dialect)
         except FileInvalid as e:
             found.errors.extend((e, *e.others))
+            continue
+        found.units.append(unit)
+        found.errors.extend(warning.as_error() for warning in unit.warnings if warning.id in as_errors)
+        found.warnings.extend(warning for warning in unit.warnings if warning.id not in as_errors)
     return found
 
 
 def _summary(found: _Found) -> str:
+    warned = f", {_counted(len(found.warnings), 'warning')}" if found.warnings else ""
     if found.errors:
         files = len({error.path for error in found.errors})
-        return f"{_counted(len(found.errors), 'error')} in {_counted(files, 'file')}"
+        return f"{_counted(len(found.errors), 'error')} in {_counted(files, 'file')}{warned}"
     files = sum(len(unit.files) for unit in found.units)
     names = Counter(kind for unit in found.units for kind in unit.kinds)
     parts = ", ".join(_counted(count, kind) for kind, count in sorted(names.items()))
-    return f"{_counted(files, 'file')}, no errors: {parts or 'no declarations'}"
+    return f"{_counted(files, 'file')}, no errors{warned}: {parts or 'no declarations'}"
 
 
 def _counted(count: int, what: str) -> str:
@@ -116,4 +157,5 @@ def _as_json(found: _Found) -> dict[str, object]:
         "version": 1,
         "files": sorted({file for unit in found.units for file in unit.files}),
         "errors": [error.as_data() for error in found.errors],
+        "warnings": [warning.as_data() for warning in found.warnings],
     }

@@ -262,6 +262,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, studio: str
     from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_studio
     from fieldtwin.cli.run.summary_view import print_summary
     from fieldtwin.console import show_warnings
+    from fieldtwin.twin.plant.physical import program_warnings
 
     check(service_options)
     notifier = Notifier.from_environment()
@@ -285,7 +286,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, studio: str
             started = True
             if service_options.log is None:
                 print_mapping(session)
-                show_warnings(session.system.warnings)
+                show_warnings((*session.system.warnings, *program_warnings(session.system)))
             async with RunService(session, service_options, notifier) as service:
                 if service_options.log is None:
                     print_metrics(service.url)

@@ -40,13 +40,14 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     """Run once and print the summary on stdout. Return the exit status: 0 if the run passed."""
     from fieldtwin.run.virtual.group_kinds import kind_named
     from fieldtwin.run.virtual.run import VirtualRun
+    from fieldtwin.twin.plant.physical import program_warnings
 
     run = VirtualRun(options)
     kind = kind_named(run.group.kind) if run.group.kind else None
     if kind is not None:
         kind.introduce(run.group)
     else:
-        show_warnings(run.group.whole.warnings)
+        show_warnings((*run.group.whole.warnings, *program_warnings(run.group.whole)))
     stderr.print(
         f"{run.group.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )

@@ -20,6 +20,7 @@ from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.located import without_addresses
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
 from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_all
 
@@ -64,28 +65,34 @@ class CompiledUnit:
     programs: tuple[CompiledProgram, ...]
     kinds: tuple[str, ...]
     """The kind of each declaration: program, function, function block, type or global variable."""
+    warnings: tuple[StWarning, ...] = ()
 
 
-def compile_text(text: str, path: str = "") -> CompiledUnit:
+def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
     """Compile a text. Raises `FileInvalid` with line and column for the first error, and with the others."""
-    return compile_unit(parse_all(text, path), path, (path,))
+    return compile_unit(parse_all(text, path, dialect), path, (path,), dialect)
 
 
-def compile_unit(unit: t.SourceUnit, path: str, files: tuple[str, ...]) -> CompiledUnit:
+def compile_unit(unit: t.SourceUnit, path: str, files: tuple[str, ...], dialect: Dialect = STANDARD) -> CompiledUnit:
     """Compile the declarations of `files`: one file, or the files of the folder `path`.
 
     Raises `FileInvalid` with line and column for the first error, and with the others.
     """
     try:
-        return _Unit(without_addresses(unit), path, files).compiled()
+        return _Unit(without_addresses(unit), path, files, dialect).compiled()
     except RecursionError as e:
         raise FileInvalid("nested too deep", path=path) from e
 
 
 class _Unit:
-    def __init__(self, unit: t.SourceUnit, path: str, files: tuple[str, ...]) -> None:
+    def __init__(self, unit: t.SourceUnit, path: str, files: tuple[str, ...], dialect: Dialect) -> None:
         self.path, self.files = path, files
-        self.env = Environment()
+        self.env = Environment(dialect)
+        for warning in unit.warnings:
+            self.env.warnings.add(warning)
+        self._globals: dict[tuple[str, str], Symbol] = {}
+        """The global variables by list and name, in lower case."""
+        self._lists = list(dict.fromkeys(block.list.lower() for block in unit.globals))
         self.out = CodeWriter()
         self.unit = unit
         self._outputs: dict[str, frozenset[str]] = {}
@@ -117,7 +124,8 @@ class _Unit:
         self._write_globals()
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
-        return CompiledUnit(self.path, self.files, self._code(text), text, tuple(programs), self._kinds())
+        kinds, warnings = self._kinds(), self.env.warnings.sorted()
+        return CompiledUnit(self.path, self.files, self._code(text), text, tuple(programs), kinds, warnings)
 
     def _kinds(self) -> tuple[str, ...]:
         pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous]
@@ -168,29 +176,56 @@ class _Unit:
     # -- variables --------------------------------------------------------------------------------------------------------
 
     def _declare_global_constants(self) -> None:
-        """Declare the constants whose value is known at once, because types may use them in their limits."""
-        for block in self.unit.globals:
-            for v in block.variables if "CONSTANT" in block.qualifiers else ():
-                if isinstance(v.type, t.NamedType) and v.type.name.upper() in ty.ELEMENTARY:
-                    with self.env.declaring(v.name, self.env.faulty):
-                        symbol = self.declarations.constant(v, f"_G.v_{v.name.lower()}")
-                        if symbol is not None:
-                            self.env.globals[v.name.lower()] = symbol
+        """Declare the constants whose value is known at once, because types may use them in their limits.
+
+        A constant may refer to one that is declared after it, so those with an error are tried again after the others.
+        """
+        pending = [
+            (block, v)
+            for block in self.unit.globals
+            for v in block.variables
+            if "CONSTANT" in block.qualifiers
+            and isinstance(v.type, t.NamedType)
+            and v.type.name.upper() in ty.ELEMENTARY
+        ]
+        count = len(pending) + 1
+        while len(pending) < count:
+            count, unknown = len(pending), set(self.env.faulty_here)
+            pending = [(block, v) for block, v in pending if not self._declare_constant(block, v)]
+            self.env.faulty_here = unknown
+        for block, v in pending:
+            with self.env.declaring(v.name, self.env.faulty):
+                self.declarations.constant(v, self._global_code(block, v))
+
+    def _declare_constant(self, block: t.VarBlock, v: t.VarDecl) -> bool:
+        """Declare a global constant; return False if it has an error, also one that later declarations may remove."""
+        try:
+            symbol = self.declarations.constant(v, self._global_code(block, v))
+        except FileInvalid:
+            return False
+        if symbol is not None:
+            self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
+        return True
+
+    def _global_code(self, block: t.VarBlock, v: t.VarDecl) -> str:
+        """Return the Python expression of a global variable; two lists may have variables of one name."""
+        return f"_G.v{self._lists.index(block.list.lower()) if block.list else ''}_{v.name.lower()}"
 
     def _declare_globals(self) -> None:
-        seen: set[str] = set()
         for block in self.unit.globals:
             self._no_retain(block, "a VAR_GLOBAL")
             for v in block.variables:
                 with self.env.declaring(v.name, self.env.faulty):
                     self._no_address(v)
-                    if v.name.lower() in seen:
+                    key = block.list.lower(), v.name.lower()
+                    if key in self._globals:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
-                    seen.add(v.name.lower())
-                    self.env.globals[v.name.lower()] = self._symbol(v, block, f"_G.v_{v.name.lower()}")
-        if seen:
+                    symbol = self._symbol(v, block, self._global_code(block, v))
+                    self._globals[key] = symbol
+                    self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
+        if self._globals:
             first = self.unit.globals[0].pos
-            self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
+            self.declarations.bounded(first, (symbol.type for symbol in self._globals.values()))
 
     def _write_globals(self) -> None:
         """Write the code of the global variables, after all code that they may need and before any program is created."""
@@ -198,7 +233,7 @@ class _Unit:
         self.out.line("_G = _Globals()")
         for block in self.unit.globals:
             for v in block.variables:
-                symbol = self.env.globals.get(v.name.lower())
+                symbol = self._globals.get((block.list.lower(), v.name.lower()))
                 if symbol is not None:
                     self._write_initial(v, symbol)
 
@@ -224,7 +259,8 @@ class _Unit:
     def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
         kind = self.declarations.type_of(v.type, block.kind)
         if "CONSTANT" not in block.qualifiers:
-            return Symbol(v.name, kind, code, writable=block.kind != "VAR_INPUT")
+            is_input = block.kind == "VAR_INPUT"
+            return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
     def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:

@@ -58,6 +58,8 @@ def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, t
         kind = ty.DINT
     assert code is not None
     made = _of_string(code, target) if isinstance(kind, ty.String) else _of_value(code, kind, target, cut)
+    if made is None and x.env.dialect.vendor:
+        made = _of_date(code, kind, target)
     if made is None:
         x.env.fail(call.pos, f"there is no conversion from {kind} to {target}")
     if isinstance(kind, ty.String) and isinstance(target, ty.String):
@@ -94,6 +96,19 @@ def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | Non
     if kind.kind == "dt" and target.kind in ("date", "tod"):
         return f"({code} // {ty.DAY_NS} * {ty.DAY_NS})" if target.kind == "date" else f"({code} % {ty.DAY_NS})"
     return code if kind.kind == target.kind or (kind.kind == "date" and target.kind == "dt") else None
+
+
+def _of_date(code: str, kind: ty.Type, target: ty.Type) -> str | None:
+    """Write the conversion between a date and a number: CODESYS counts seconds since 1970, and ms since midnight."""
+    if not (isinstance(kind, ty.Elementary) and isinstance(target, ty.Elementary)):
+        return None
+    unit = {"date": 1_000_000_000, "dt": 1_000_000_000, "tod": 1_000_000}
+    if kind.kind in unit and target.kind in ("int", "bits"):
+        return _between_integers(f"({code} // {unit[kind.kind]})", ty.LINT, target)
+    if kind.kind in ("int", "bits") and target.kind in unit:
+        whole = {"date": f" // {ty.DAY_NS} * {ty.DAY_NS}", "tod": f" % {ty.DAY_NS}"}.get(target.kind, "")
+        return f"_v.signed({code} * {unit[target.kind]}{whole}, 64)"
+    return None
 
 
 def _between_integers(code: str, kind: ty.Elementary, target: ty.Elementary) -> str:

@@ -8,6 +8,7 @@ from math import isfinite
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.implicit import converted
 from fieldtwin.plc.st.compiler.literals import Malformed, constant
 from fieldtwin.plc.st.compiler.operators import binary, unary
 from fieldtwin.plc.st.compiler.scope import (
@@ -21,7 +22,7 @@ from fieldtwin.plc.st.compiler.scope import (
     wrapped,
 )
 from fieldtwin.plc.st.compiler.standard import FUNCTIONS
-from fieldtwin.plc.st.compiler.variables import bit, variable
+from fieldtwin.plc.st.compiler.variables import bit, lookup, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 80
@@ -58,6 +59,9 @@ class Expressions:
         """
         source = ty.plain(value.type)
         if not ty.fits(value.type, target):
+            accepted = converted(self, value, target, pos)
+            if accepted is not None:
+                return accepted
             hint = f"{source}_TO_{ty.plain(target)}" if _convertible(source) and _convertible(ty.plain(target)) else ""
             self.env.fail(pos, what or "types differ", expected=str(target), got=str(value.type), hint=hint)
         if isinstance(target, ty.Subrange) and value.type != target and not isinstance(source, ty.AnyInt):
@@ -142,9 +146,9 @@ class Expressions:
 
     def type_of(self, ref: t.Ref) -> ty.Type | None:
         """Return the type of a variable or of its part without compiling it, or None if it has no such part."""
-        symbol = self.symbols.get(ref.name.lower()) or self.env.globals.get(ref.name.lower())
+        symbol, selectors = lookup(self, ref)
         kind = symbol.type if symbol is not None else None
-        for selector in ref.selectors:
+        for selector in selectors:
             if isinstance(selector, t.Bit):
                 kind = ty.BOOL
             elif isinstance(selector, t.Index):
@@ -279,10 +283,14 @@ class Expressions:
 
     def writable(self, ref: t.Ref) -> Value:
         target = variable(self, ref)
-        if not target.writable:
-            self.env.fail(
-                ref.pos, f"{ref.name} cannot be assigned to", hint="it is a constant, an input, or a block's output"
-            )
+        allowed = target.writable or (
+            target.is_input and self.env.accepts("ST001", ref.pos, f"{ref.name} is an input and is assigned to")
+        )
+        if not allowed:
+            hint = "it is a constant, an input, or a block's output"
+            if target.is_input:
+                hint = "it is an input; the dialects codesys, twincat and matiec accept this with a warning"
+            self.env.fail(ref.pos, f"{ref.name} cannot be assigned to", hint=hint)
         if any(control == target.code or control.startswith(f"{target.code}.") for control in self.controls):
             self.env.fail(
                 ref.pos,

@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
+from fieldtwin.plc.st.compiler.implicit import as_number, logical_type, meeting
 from fieldtwin.plc.st.compiler.scope import COMPARISONS, Compiling, Value, wrapped
 from fieldtwin.plc.st.compiler.time_arithmetic import with_time
 from fieldtwin.plc.st.syntax import tree as t
@@ -28,6 +29,9 @@ def unary(x: Compiling, expr: t.Unary) -> Value:
             return Value(f"(not {value.code})", ty.BOOL, None if value.constant is None else not value.constant)
         if isinstance(kind, ty.Elementary) and kind.kind == "bits":
             return Value(f"({value.code} ^ {kind.high})", kind)
+        integer = isinstance(kind, ty.Elementary) and kind.kind == "int"
+        if integer and x.env.accepts("ST005", expr.pos, f"NOT of {kind}"):
+            return Value(f"(~{value.code})" if kind.low else f"({value.code} ^ {kind.high})", kind)
         x.env.fail(expr.pos, "NOT", expected="BOOL or a bit string", got=str(kind))
     if not ty.is_kind(kind, "int", "real", "duration"):
         x.env.fail(expr.pos, f"the sign {expr.op}", expected="a number or a duration", got=str(kind))
@@ -66,6 +70,11 @@ def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
     if timed is not None:
         return timed
     kind = ty.common(left.type, right.type)
+    result: ty.Elementary | None = None
+    if x.env.dialect.vendor and not (kind is not None and ty.is_kind(kind, "int", "real")):
+        result = kind if isinstance(kind, ty.Elementary) and kind.kind == "bits" else None
+        left, right = as_number(x, left, expr.pos, kind), as_number(x, right, expr.pos, kind)
+        kind = meeting(x, left.type, right.type, expr.pos)
     if kind is None or not ty.is_kind(kind, "int", "real"):
         _mismatch(x, expr, left, right, "numbers of compatible types")
     if isinstance(kind, ty.AnyInt | ty.AnyReal):
@@ -76,13 +85,14 @@ def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
         power = f"_v.power({left.code}, {right.code})"
         return Value(f"_v.real({power})" if kind.bits == 32 else power, kind)
     a, b = x.coerced(left, kind, expr.pos), x.coerced(right, kind, expr.pos)
+    result = result or kind
     if expr.op == "MOD":
         if kind.kind != "int":
             _mismatch(x, expr, left, right, "integers")
-        return Value(f"_v.modulo({a}, {b})", kind)
+        return Value(f"_v.modulo({a}, {b})", result)
     if expr.op == "/":
-        return Value(wrapped(f"_v.{'divide' if kind.kind == 'int' else 'divide_real'}({a}, {b})", kind), kind)
-    return Value(wrapped(f"{a} {expr.op} {b}", kind), kind)
+        return Value(wrapped(f"_v.{'divide' if kind.kind == 'int' else 'divide_real'}({a}, {b})", kind), result)
+    return Value(wrapped(f"{a} {expr.op} {b}", kind), result)
 
 
 def _only_if_needed(
@@ -109,6 +119,8 @@ def _logic(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
         return x.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
     kind = ty.common(left.type, right.type)
     if kind is None or not ty.is_kind(kind, "bool", "bits"):
+        kind = logical_type(x, left.type, right.type, expr.pos)
+    if kind is None:
         _mismatch(x, expr, left, right, "BOOL, or bit strings (BYTE, WORD, DWORD, LWORD) of compatible types")
     a_code, b_code = x.coerced(left, kind, expr.pos), x.coerced(right, kind, expr.pos)
     if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
@@ -117,7 +129,7 @@ def _logic(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
 
 
 def _comparison(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
-    kind = ty.common(left.type, right.type)
+    kind = meeting(x, left.type, right.type, expr.pos)
     if kind is None or not isinstance(kind, ty.Elementary | ty.AnyInt | ty.AnyReal | ty.String | ty.Enum):
         _mismatch(x, expr, left, right, "two values of compatible types")
     if isinstance(kind, ty.AnyInt | ty.AnyReal | ty.String):

@@ -12,6 +12,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning, WarningCollector
 from fieldtwin.plc.st.syntax.source import shortened
 from fieldtwin.plc.st.syntax.tree import Expr, Pos
 
@@ -31,11 +32,13 @@ class Symbol:
     writable: bool = True
     constant: Any = None
     reference: str = ""
+    is_input: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A compiled expression. `place` is true if it is a variable or a part of one. `constant` is its value if it is known.
+    """A compiled expression. `place` is true if it is a variable or a part of one, `is_input` if that is an input of the POU.
+    `constant` is its value if it is known.
 
     `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
     """
@@ -46,6 +49,7 @@ class Value:
     place: bool = False
     writable: bool = False
     reference: str = ""
+    is_input: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,8 @@ def by_reference(kind: ty.Type) -> bool:
 class Environment:
     """All declarations of a unit, by names in lower case, and the errors that were found in it so far."""
 
+    dialect: Dialect = STANDARD
+    warnings: WarningCollector = field(default_factory=WarningCollector)
     errors: ErrorCollector = field(default_factory=ErrorCollector)
     faulty: set[str] = field(default_factory=set)
     """The names of the unit whose declaration has an error, so that their use is not a second error."""
@@ -86,6 +92,10 @@ class Environment:
     type_initials: dict[str, str] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
     globals: dict[str, Symbol] = field(default_factory=dict)
+    lists: dict[str, dict[str, Symbol]] = field(default_factory=dict)
+    """The variables of each global list."""
+    ambiguous: dict[str, list[str]] = field(default_factory=dict)
+    """The qualified names of variables that several global lists declare under one name."""
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
     calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
     """By POU: the POUs that it calls or contains, with the first position of each."""
@@ -109,6 +119,26 @@ class Environment:
         self.errors.add(error)
         if len(self.errors.errors) > FileInvalid.MAX_OTHERS:
             self.errors.raise_all()
+
+    def accepts(self, warning: str, pos: Pos, message: str) -> bool:
+        """Return whether the dialect accepts the construct with the id `warning`. If so, keep the warning."""
+        if warning not in self.dialect.accepts:
+            return False
+        self.warnings.add(StWarning(warning, message, pos.path, pos.line, pos.column))
+        return True
+
+    def declare_global(self, symbol: Symbol, of_list: str, *, only_qualified: bool) -> None:
+        """Add a global variable under its name, and under its qualified name if it belongs to a list."""
+        key = symbol.name.lower()
+        if of_list:
+            self.lists.setdefault(of_list.lower(), {})[key] = symbol
+        if only_qualified:
+            return
+        before = self.globals.get(key)
+        if before is not None and before.code != symbol.code:
+            lists = [name for name, variables in self.lists.items() if key in variables]
+            self.ambiguous[key] = [f"{name}.{symbol.name}" for name in lists]
+        self.globals[key] = symbol
 
     def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
         raise self.error(pos, message, expected=expected, got=got, hint=hint)

@@ -13,6 +13,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.arguments import Formals, in_order
 from fieldtwin.plc.st.compiler.conversions import Write, conversion
+from fieldtwin.plc.st.compiler.implicit import as_number, meeting
 from fieldtwin.plc.st.compiler.scope import COMPARISONS, Compiling, Value, wrapped
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -67,6 +68,8 @@ FUNCTIONS = _Library()
 
 def _number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
     value = x.value(expr)
+    if "int" in kinds and not ty.is_kind(value.type, *kinds):
+        value = as_number(x, value, expr.pos)
     if not ty.is_kind(value.type, *kinds):
         x.env.fail(expr.pos, "an argument", expected=" or ".join(kinds), got=str(value.type))
     return value
@@ -78,10 +81,10 @@ def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
     found = [x.value(e, wanted or x.declared(*exprs)) for e in exprs]
     kind = found[0].type
     for value, expr in zip(found[1:], exprs[1:], strict=True):
-        meeting = ty.common(kind, value.type)
-        if meeting is None:
+        both = meeting(x, kind, value.type, expr.pos)
+        if both is None:
             x.env.fail(expr.pos, "arguments of incompatible types", got=f"{kind} and {value.type}")
-        kind = meeting
+        kind = both
     if (
         isinstance(kind, ty.AnyInt)
         and isinstance(wanted, ty.Elementary)
@@ -232,9 +235,17 @@ def _shift(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
                 hint="write its type before it, such as WORD#16#0001",
             )  # fmt: skip
         value, kind = Value(x.coerced(value, wanted, what.pos), wanted), wanted
-    if not isinstance(kind, ty.Elementary) or kind.kind != "bits":
+    name = call.ref.name.upper()
+    integer = isinstance(kind, ty.Elementary) and kind.kind == "int"
+    if integer and not x.env.accepts("ST004", what.pos, f"{name} of {kind}"):
         x.env.fail(what.pos, "an argument", expected="bits", got=str(value.type))
-    return Value(f"_v.{_SHIFTS[call.ref.name.upper()]}({value.code}, {count.code}, {kind.bits})", kind)
+    if not isinstance(kind, ty.Elementary) or kind.kind not in ("bits", "int"):
+        x.env.fail(what.pos, "an argument", expected="bits", got=str(value.type))
+    if kind.low < 0 and name == "SHR":
+        return Value(f"_v.arithmetic_right({value.code}, {count.code})", kind)
+    operand = f"{value.code} & {kind.high - kind.low}" if kind.low < 0 else value.code
+    code = f"_v.{_SHIFTS[name]}({operand}, {count.code}, {kind.bits})"
+    return Value(f"_v.signed({code}, {kind.bits})" if kind.low < 0 else code, kind)
 
 
 # -- strings ------------------------------------------------------------------------------------------------------------

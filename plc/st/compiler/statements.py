@@ -9,6 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.expressions import Expressions
+from fieldtwin.plc.st.compiler.implicit import meeting
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, wrapped
 from fieldtwin.plc.st.compiler.variables import variable
 from fieldtwin.plc.st.syntax import tree as t
@@ -198,7 +199,7 @@ class Statements(Expressions):
         for expr in (label.low, label.high or label.low):
             value = self.value(expr)
             whole = ty.is_kind(value.type, "int", "bits") or isinstance(value.type, ty.Enum)
-            if value.constant is None or not whole or ty.common(value.type, kind) is None:
+            if value.constant is None or not whole or meeting(self, value.type, kind, expr.pos) is None:
                 self.env.fail(expr.pos, "a label of CASE", expected=f"a constant of {kind}", got=str(value.type))
             ends.append(int(value.constant))
         low, high = ends

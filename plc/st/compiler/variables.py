@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.scope import Compiling, Value
+from fieldtwin.plc.st.compiler.implicit import as_number
+from fieldtwin.plc.st.compiler.scope import Compiling, Symbol, Value
 from fieldtwin.plc.st.syntax import tree as t
+
+
+def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Member | t.Bit | t.Index, ...]]:
+    """Return the variable to which `ref` refers, and the selectors after its name, which may be qualified by a global list."""
+    name = ref.name.lower()
+    symbol = x.symbols.get(name) or x.env.globals.get(name)
+    first = ref.selectors[0] if ref.selectors else None
+    if symbol is None and name in x.env.lists and isinstance(first, t.Member):
+        return x.env.lists[name].get(first.name.lower()), ref.selectors[1:]
+    return symbol, ref.selectors
 
 
 def variable(x: Compiling, ref: t.Ref) -> Value:
     """Compile a reference to a variable or to a part of it, or a value of an enumeration."""
-    symbol = x.symbols.get(ref.name.lower()) or x.env.globals.get(ref.name.lower())
-    if symbol is None:
+    symbol, selectors = lookup(x, ref)
+    if symbol is None or (x.env.dialect.vendor and isinstance(symbol.type, ty.Enum) and selectors):
         return _enum_value(x, ref)
+    if ref.name.lower() in x.env.ambiguous and ref.name.lower() not in x.symbols:
+        expected = ", ".join(x.env.ambiguous[ref.name.lower()])
+        x.env.fail(ref.pos, f"{ref.name} is a variable of several global lists", expected=expected)
     if x.only_constants and symbol.constant is None:
         x.env.fail(ref.pos, f"{ref.name} is not a constant", expected="a constant expression")
     owner, _, own = symbol.code.rpartition(".")
     reference = symbol.reference or (f"_v.MemberReference({owner}, {own!r})" if owner else "")
-    value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference)
-    for selector in ref.selectors:
+    value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference, symbol.is_input)
+    for selector in selectors:
         if isinstance(selector, t.Member):
             value = _member(x, value, selector)
         elif isinstance(selector, t.Index):
@@ -28,6 +42,14 @@ def variable(x: Compiling, ref: t.Ref) -> Value:
 
 
 def _enum_value(x: Compiling, ref: t.Ref) -> Value:
+    first = ref.selectors[0] if ref.selectors else None
+    if len(ref.selectors) == 1 and isinstance(first, t.Member):
+        enum = x.env.types.get(ref.name.lower())
+        if isinstance(enum, ty.Enum):
+            return _qualified_value(x, enum, first)
+        if ref.name.lower() in x.env.lists:
+            known = [s.name for s in x.env.lists[ref.name.lower()].values()]
+            x.env.unknown(first.pos, f"in {ref.name}, a variable", first.name, known)
     found = x.env.enum_values.get(ref.name.lower(), [])
     if not found or ref.selectors:
         known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
@@ -39,11 +61,22 @@ def _enum_value(x: Compiling, ref: t.Ref) -> Value:
     return Value(repr(number), enum, number)
 
 
+def _qualified_value(x: Compiling, enum: ty.Enum, member: t.Member) -> Value:
+    if not x.env.dialect.vendor:
+        hint = "the dialects codesys and twincat accept the dot"
+        x.env.fail(member.pos, f"a value of {enum}", expected=f"{enum}#{member.name}", hint=hint)
+    number = {name.lower(): value for name, value in enum.values.items()}.get(member.name.lower())
+    if number is None:
+        x.env.unknown(member.pos, f"in {enum}, a value", member.name, list(enum.values))
+    return Value(repr(number), enum, number)
+
+
 def _member(x: Compiling, value: Value, member: t.Member) -> Value:
     kind, name = value.type, member.name.lower()
     if isinstance(kind, ty.Struct) and name in kind.fields:
         reference = f"_v.MemberReference({value.code}, {f'm_{name}'!r})"
-        return Value(f"{value.code}.m_{name}", kind.fields[name][1], None, True, value.writable, reference)
+        code = f"{value.code}.m_{name}"
+        return Value(code, kind.fields[name][1], None, True, value.writable, reference, value.is_input)
     if isinstance(kind, ty.Block):
         for members, writable in ((kind.inputs, True), (kind.outputs, False)):
             if name in members:
@@ -67,6 +100,8 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
     code, owner, at = value.code, "", ""
     for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
         index = x.flat(x.value(expr), expr.pos)
+        if isinstance(index.type, ty.Enum):
+            index = as_number(x, index, expr.pos)
         if not ty.is_kind(index.type, "int", "bits"):
             x.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
         if isinstance(index.constant, int):
@@ -76,7 +111,7 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
         else:
             at = f"_v.index({index.code}, {low}, {high})"
         owner, code = code, f"{code}[{at}]"
-    return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})")
+    return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})", value.is_input)
 
 
 def bit(x: Compiling, value: Value, selector: t.Bit) -> Value:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -16,6 +17,7 @@ from lark.visitors import Transformer_NonRecursive
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.source import MAX_NAME, blanked, shortened
 
@@ -58,11 +60,12 @@ _READABLE = {
 }  # fmt: skip
 
 
-def parse(text: str, path: str = "") -> t.SourceUnit:
+def parse(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
     """Return the tree of `text`. Raises `FileInvalid` with line and column."""
-    text = blanked(text, path)
+    warnings: list[StWarning] = []
+    text = blanked(text, path, dialect, warnings)
     try:
-        return _Build(path).transform(_parser().parse(text))  # type: ignore[no-any-return]
+        return replace(_Build(path).transform(_parser().parse(text)), warnings=tuple(warnings))
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
     except VisitError as e:
@@ -71,16 +74,16 @@ def parse(text: str, path: str = "") -> t.SourceUnit:
         raise e.orig_exc.at(path) from e
 
 
-def parse_all(text: str, path: str = "") -> t.SourceUnit:
+def parse_all(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
     """Return the tree of `text`. Raises `FileInvalid` for its first error, with the first errors of the other POUs and types.
 
     A parser cannot go on after an error. So after one, each POU and each TYPE block is parsed alone.
     """
     try:
-        return parse(text, path)
+        return parse(text, path, dialect)
     except FileInvalid as whole:
         try:
-            blank = blanked(text, path)
+            blank = blanked(text, path, dialect)
         except FileInvalid:  # a comment or a literal does not end
             raise whole from None
         found = ErrorCollector()
@@ -366,7 +369,8 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         return t.Unary(self._pos(meta), "-", literal) if str(items[0]) == "-" else literal
 
     def case_name(self, meta: Meta, items: list[Any]) -> t.Expr:
-        return t.Ref(self._pos(meta), str(items[0]))
+        first, *members = [name for item in items for name in str(item).split(".")]
+        return t.Ref(self._pos(meta), first, tuple(t.Member(self._pos(meta), name) for name in members))
 
     def case_enum(self, meta: Meta, items: list[Any]) -> t.Expr:
         return t.Literal(self._pos(meta), "ENUM_REF", str(items[0]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 
 MAX_CHARACTERS = 1_000_000
 """The longest file, in characters: some 30,000 lines."""
@@ -16,6 +17,9 @@ MAX_NAME = 255
 MAX_LITERAL = 4 * 65_535
 MAX_SHOWN = 60
 
+_CONDITIONAL = re.compile(r"\{\s*(IF|ELSIF|ELSE|END_IF|DEFINE|UNDEFINE)\b", re.IGNORECASE)
+_HARMLESS = re.compile(r"\{\s*(attribute|region|endregion|text|info|warning|error)\b", re.IGNORECASE)
+"""Pragmas of CODESYS without effect on what a program computes; `qualified_only` is read by `project`."""
 _MARKS = re.compile(r"""\(\*|\*\)|/\*|\*/|//[^\n]*|'|"|\{""")
 _CLOSING = {"(*": "*)", "/*": "*/"}
 _ENDS = {quote: re.compile(rf"[{quote}\n]|\$.", re.DOTALL) for quote in "'\""}
@@ -27,9 +31,12 @@ def shortened(text: str) -> str:
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}... ({len(text)} characters)"
 
 
-def blanked(text: str, path: str = "") -> str:
+def blanked(text: str, path: str = "", dialect: Dialect = STANDARD, warnings: list[StWarning] | None = None) -> str:
     """Return `text` without a byte order mark, comments and pragmas, and with line feeds as line ends. Raises
-    `FileInvalid`."""
+    `FileInvalid`.
+
+    Warnings about skipped pragmas are added to `warnings`.
+    """
     if len(text) > MAX_CHARACTERS:
         raise FileInvalid(
             "too long for a program", path=path, line=1, column=1, expected=f"at most {MAX_CHARACTERS} characters"
@@ -48,7 +55,10 @@ def blanked(text: str, path: str = "") -> str:
             end = found.end()  # the parser reports this error
             out.append(text[at:end])
         else:
-            end = found.end() if mark.startswith("//") else _end_of_comment(text, found, path)
+            if mark == "{":
+                end = _end_of_pragma(text, start, path, dialect, warnings)
+            else:
+                end = found.end() if mark.startswith("//") else _end_of_comment(text, found, path)
             out.append(text[at:start])
             out.append(_NOT_A_LINE.sub(" ", text[start:end]))
         at = end
@@ -66,12 +76,29 @@ def _end_of_literal(text: str, at: int, quote: str) -> int:
     return len(text)
 
 
+def _end_of_pragma(text: str, start: int, path: str, dialect: Dialect, warnings: list[StWarning] | None) -> int:
+    """Return the position after a pragma, which is skipped. Raises `FileInvalid` for one that must not be skipped."""
+    mark = "}}" if text.startswith("{{", start) else "}"
+    at = text.find(mark, start)
+    if at < 0:
+        raise _error(text, start, "a pragma that does not end", path)
+    end = at + len(mark)
+    pragma = text[start:end]
+    if _CONDITIONAL.match(pragma):
+        raise _error(text, start, "conditional compilation is not supported", path, shortened(pragma))
+    if mark == "}}" and dialect.name != "matiec":
+        raise _error(
+            text, start, "program text in another language is not supported", path, shortened(pragma),
+            hint="the dialect matiec skips it",
+        )  # fmt: skip
+    if warnings is not None and "ST007" in dialect.accepts and not (dialect.vendor and _HARMLESS.match(pragma)):
+        line, column = _place(text, start)
+        shown = shortened(" ".join(pragma.split()))
+        warnings.append(StWarning("ST007", f"this pragma is skipped: {shown}", path, line, column))
+    return end
+
+
 def _end_of_comment(text: str, opening: re.Match[str], path: str) -> int:
-    if opening.group() == "{":
-        end = text.find("}", opening.end())
-        if end < 0:
-            raise _error(text, opening.start(), "a pragma that does not end", path)
-        return end + 1
     mark, deep, at = opening.group(), 1, opening.end()
     marks = re.compile(f"{re.escape(mark)}|{re.escape(_CLOSING[mark])}")
     while found := marks.search(text, at):
@@ -82,6 +109,10 @@ def _end_of_comment(text: str, opening: re.Match[str], path: str) -> int:
     raise _error(text, opening.start(), "a comment that does not end", path)
 
 
-def _error(text: str, at: int, message: str, path: str) -> FileInvalid:
-    line = text.count("\n", 0, at) + 1
-    return FileInvalid(message, path=path, line=line, column=at - text.rfind("\n", 0, at))
+def _place(text: str, at: int) -> tuple[int, int]:
+    return text.count("\n", 0, at) + 1, at - text.rfind("\n", 0, at)
+
+
+def _error(text: str, at: int, message: str, path: str, got: str = "", hint: str = "") -> FileInvalid:
+    line, column = _place(text, at)
+    return FileInvalid(message, path=path, line=line, column=column, got=got, hint=hint)

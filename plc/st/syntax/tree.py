@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fieldtwin.plc.st.dialects import StWarning
+
 
 @dataclass(frozen=True, slots=True)
 class Pos:
@@ -114,12 +116,18 @@ TypeDecl = StructDecl | EnumDecl | AliasDecl
 
 @dataclass(frozen=True, slots=True)
 class VarBlock:
-    """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` are in capitals."""
+    """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` are in capitals.
+
+    `list` is the name of the global list to which a VAR_GLOBAL belongs, if the dialect has such lists. If
+    `only_qualified` is true, its variables are known only as ``list.variable``.
+    """
 
     pos: Pos
     kind: str
     qualifiers: frozenset[str]
     variables: tuple[VarDecl, ...]
+    list: str = ""
+    only_qualified: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +150,7 @@ class SourceUnit:
     types: tuple[TypeDecl, ...] = ()
     globals: tuple[VarBlock, ...] = ()
     pous: tuple[Pou, ...] = ()
+    warnings: tuple[StWarning, ...] = ()
 
 
 # -- expressions --------------------------------------------------------------------------------------------------------

@@ -1,0 +1,119 @@
+"""The dialects of Structured Text, and the warnings about constructs that only a dialect accepts.
+
+The standard's rules apply to all dialects. What a dialect accepts beyond them is named by the id of a warning, so that a
+user can find each place where a program relies on the dialect, and can turn such a warning into an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+
+MAX_WARNINGS = 1_000
+"""The largest number of warnings of one unit that are kept."""
+
+WARNINGS = {
+    "ST001": "assignment to an input",
+    "ST002": "implicit conversion that can change the value",
+    "ST003": "bit string used as a number, or number used as a bit string",
+    "ST004": "shift or rotation of an integer",
+    "ST005": "logical operation on integers",
+    "ST006": "enumeration used as a number, or number used as an enumeration",
+    "ST007": "skipped pragma",
+    "ST008": "operands of signed and unsigned types",
+}
+"""Each warning's id and title."""
+
+
+@dataclass(frozen=True, slots=True)
+class StWarning:
+    """A warning about a place in a source file. `line` and `column` count from 1."""
+
+    id: str
+    message: str
+    path: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}:{self.column}: {self.id} {self.message}"
+
+    def as_data(self) -> dict[str, str | int]:
+        """Return the warning as data for JSON."""
+        return {
+            "id": self.id,
+            "path": self.path,
+            "line": self.line,
+            "column": self.column,
+            "message": self.message,
+        }
+
+    def as_error(self) -> FileInvalid:
+        """Return the warning as an error, for users who refuse the construct."""
+        return FileInvalid(f"{self.id} {self.message}", path=self.path, line=self.line, column=self.column)
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """A dialect. `accepts`: the ids of the warnings that replace errors of the standard.
+
+    `vendor` is true for CODESYS and the systems built on it: values of enumerations and global lists are qualified by a
+    dot, operands are converted implicitly, and dates convert to numbers of seconds.
+    """
+
+    name: str
+    accepts: frozenset[str] = frozenset()
+    vendor: bool = False
+
+
+STANDARD = Dialect("standard")
+DIALECTS = {
+    dialect.name: dialect
+    for dialect in (
+        STANDARD,
+        Dialect("codesys", frozenset(WARNINGS), vendor=True),
+        Dialect("twincat", frozenset(WARNINGS), vendor=True),
+        Dialect("matiec", frozenset({"ST001", "ST004", "ST007"})),
+    )
+}
+
+
+def dialect_of(name: str) -> Dialect:
+    """Return the dialect called `name`. Raises `UsageError`."""
+    if name not in DIALECTS:
+        raise UsageError(
+            "an unknown dialect", expected=", ".join(DIALECTS), got=name, hint=did_you_mean(name, list(DIALECTS))
+        )
+    return DIALECTS[name]
+
+
+def chosen_ids(names: Iterable[str]) -> frozenset[str]:
+    """Return the ids of the warnings that `names` select: ids in any case, or ``all``. Raises `UsageError`."""
+    found: set[str] = set()
+    for name in names:
+        if name.lower() == "all":
+            found |= set(WARNINGS)
+        elif name.upper() in WARNINGS:
+            found.add(name.upper())
+        else:
+            raise UsageError("an unknown warning", expected=f"all, {', '.join(WARNINGS)}", got=name)
+    return frozenset(found)
+
+
+@dataclass
+class WarningCollector:
+    """The warnings of a unit, each place and id once."""
+
+    found: dict[tuple[str, str, int, int], StWarning] = field(default_factory=dict)
+
+    def add(self, warning: StWarning) -> None:
+        """Add a warning; beyond `MAX_WARNINGS` it is dropped."""
+        if len(self.found) < MAX_WARNINGS:
+            self.found.setdefault((warning.id, warning.path, warning.line, warning.column), warning)
+
+    def sorted(self) -> tuple[StWarning, ...]:
+        """Return the warnings by file, line and column."""
+        return tuple(sorted(self.found.values(), key=lambda w: (w.path, w.line, w.column, w.id)))

@@ -16,6 +16,7 @@ HEADINGS = {
     "exit code": "Exit codes",
     "verdict": "Verdicts of test cases",
     "certainty": "Certainty of results of commissioning",
+    "warning of Structured Text": "Warnings of Structured Text",
     "fault": "Faults",
 }
 

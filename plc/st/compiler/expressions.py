@@ -58,10 +58,10 @@ class Expressions:
         function such as REAL_TO_INT.
         """
         source = ty.plain(value.type)
+        accepted = None if ty.fits(value.type, target) else converted(self, value, target, pos)
+        if accepted is not None:
+            return accepted
         if not ty.fits(value.type, target):
-            accepted = converted(self, value, target, pos)
-            if accepted is not None:
-                return accepted
             hint = f"{source}_TO_{ty.plain(target)}" if _convertible(source) and _convertible(ty.plain(target)) else ""
             self.env.fail(pos, what or "types differ", expected=str(target), got=str(value.type), hint=hint)
         if isinstance(target, ty.Subrange) and value.type != target and not isinstance(source, ty.AnyInt):

@@ -77,8 +77,9 @@ def as_number(x: Compiling, value: Value, pos: Pos, common: ty.Type | None = Non
         return Value(value.code, _number_type(kind), value.constant)
     if isinstance(kind, ty.AnyInt) and isinstance(common, ty.Elementary) and common.kind == "bits":
         return Value(value.code, _unsigned(common), value.constant)
-    string = isinstance(kind, ty.Elementary) and kind.kind == "bits"
-    if string and x.env.accepts("ST003", pos, f"{kind} is used as a number"):
+    if not (isinstance(kind, ty.Elementary) and kind.kind == "bits"):
+        return value
+    if x.env.accepts("ST003", pos, f"{kind} is used as a number"):
         return Value(value.code, _unsigned(kind), value.constant)
     return value
 

@@ -5,7 +5,7 @@ Operands are compiled by the `Compiling` that is passed in.
 
 from __future__ import annotations
 
-from typing import NoReturn
+from typing import NoReturn, TypeGuard
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
@@ -29,8 +29,7 @@ def unary(x: Compiling, expr: t.Unary) -> Value:
             return Value(f"(not {value.code})", ty.BOOL, None if value.constant is None else not value.constant)
         if isinstance(kind, ty.Elementary) and kind.kind == "bits":
             return Value(f"({value.code} ^ {kind.high})", kind)
-        integer = isinstance(kind, ty.Elementary) and kind.kind == "int"
-        if integer and x.env.accepts("ST005", expr.pos, f"NOT of {kind}"):
+        if _is(kind, "int") and x.env.accepts("ST005", expr.pos, f"NOT of {kind}"):
             return Value(f"(~{value.code})" if kind.low else f"({value.code} ^ {kind.high})", kind)
         x.env.fail(expr.pos, "NOT", expected="BOOL or a bit string", got=str(kind))
     if not ty.is_kind(kind, "int", "real", "duration"):
@@ -41,6 +40,10 @@ def unary(x: Compiling, expr: t.Unary) -> Value:
         return Value(f"(-{value.code})", kind) if value.constant is None else x.known(expr, -value.constant)
     assert isinstance(kind, ty.Elementary)
     return Value(wrapped(f"-{value.code}", kind), kind)
+
+
+def _is(kind: ty.Type, name: str) -> TypeGuard[ty.Elementary]:
+    return isinstance(kind, ty.Elementary) and kind.kind == name
 
 
 def binary(x: Compiling, expr: t.Binary) -> Value:

@@ -65,7 +65,8 @@ def parse(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUni
     warnings: list[StWarning] = []
     text = blanked(text, path, dialect, warnings)
     try:
-        return replace(_Build(path).transform(_parser().parse(text)), warnings=tuple(warnings))
+        unit: t.SourceUnit = _Build(path).transform(_parser().parse(text))
+        return replace(unit, warnings=tuple(warnings))
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
     except VisitError as e:

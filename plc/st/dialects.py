@@ -1,7 +1,7 @@
 """The dialects of Structured Text, and the warnings about constructs that only a dialect accepts.
 
-The standard's rules apply to all dialects. What a dialect accepts beyond them is named by the id of a warning, so that a
-user can find each place where a program relies on the dialect, and can turn such a warning into an error.
+The standard's rules apply to all dialects. Each construct that a dialect accepts beyond them has the id of a warning. The
+warnings show each place where a program relies on its dialect, and a user can turn them into errors.
 """
 
 from __future__ import annotations

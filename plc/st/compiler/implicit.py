@@ -119,7 +119,7 @@ def logical_type(x: Compiling, left: ty.Type, right: ty.Type, pos: Pos) -> ty.Ty
 
 
 def _numeric(kind: ty.Type, bits: bool = False) -> ty.Elementary | None:
-    """Return the type of a number that represents values of `kind`; None if there is none. `bits` keeps bit strings."""
+    """Return the numeric type that represents values of `kind`, or None. `bits` keeps bit strings."""
     kind = ty.plain(kind)
     if isinstance(kind, ty.Enum):
         return _number_type(kind)

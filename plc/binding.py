@@ -18,14 +18,15 @@ from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.core.image.image import ImageLayout, TagKind, TagSpec, process_image
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, Role, Variable
+from fieldtwin.plc.source_files import SUFFIXES
 
 if TYPE_CHECKING:
     from fieldtwin.plc.st.program import StProgram
 
 _SOURCES = (
-    "python: module:Class, or FILE.st, FILE.xml or a folder of such files, followed by :PROGRAM if there are several"
+    "python: module:Class, or FILE.st, FILE.xml, FILE.TcPOU or a folder of such files, "
+    "followed by :PROGRAM if there are several"
 )
-_ST_SUFFIXES = (".st", ".iecst", ".xml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,7 @@ def load_program(
     python_path: Sequence[str] = (),
     together: dict[Any, Any] | None = None,
     dialect: str = "standard",
+    libraries: Sequence[str] = (),
 ) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
@@ -75,14 +77,14 @@ def load_program(
 
     `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``), a PLCopen export (``plant.xml``) or a
     folder of such files (``plc``), followed by ``:NAME`` if there are several programs. `dialect` is the dialect of a text
-    (`fieldtwin.plc.st.dialects`).
+    (`fieldtwin.plc.st.dialects`), and `libraries` are files or folders with declarations that it uses, searched like `source`.
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
     if language.strip() == "python":
         made = _python_class(source, rest, python_path)
     else:
-        made = partial(_text_class(source, python_path, dialect), together)
+        made = partial(_text_class(source, python_path, dialect, libraries), together)
     try:
         return made()
     except FieldtwinError:
@@ -109,16 +111,21 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
     return found
 
 
-def _text_class(source: str, folders: Sequence[str], dialect: str) -> type[StProgram]:
-    name, _, program = source.strip().partition(":")
+def _found(name: str, folders: Sequence[str]) -> Path:
     places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
-    found = next((p for p in places if p.exists()), places[0])
-    if not (name.lower().endswith(_ST_SUFFIXES) or (name and found.is_dir())):
+    return next((p for p in places if p.exists()), places[0])
+
+
+def _text_class(source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str]) -> type[StProgram]:
+    name, _, program = source.strip().partition(":")
+    found = _found(name, folders)
+    if not (name.lower().endswith(SUFFIXES) or (name and found.is_dir())):
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
     from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
-    return load_source(found, program.strip(), dialect_of(dialect))
+    places = tuple(_found(library, folders) for library in libraries)
+    return load_source(found, program.strip(), dialect_of(dialect), places)
 
 
 def image_for(

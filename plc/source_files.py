@@ -9,8 +9,8 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 MAX_FILES = 2_000
 """The largest number of files in a folder of a program."""
-SUFFIXES = (".st", ".iecst", ".xml")
-"""The file names' endings: Structured Text (as written here, and by other tools), and PLCopen XML."""
+SUFFIXES = (".st", ".iecst", ".exp", ".xml", ".tcpou", ".tcdut", ".tcgvl")
+"""The file names' endings in lower case: Structured Text (as written here, and by other tools), PLCopen XML, TwinCAT."""
 
 
 def source_files(path: Path) -> tuple[Path, ...]:

@@ -22,7 +22,7 @@ class ProgramConfig:
     """The configuration of a program.
 
     It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
-    empty), its policy while it waits for its inputs, and the dialect of its source.
+    empty), its policy while it waits for its inputs, and the dialect and the libraries of its source.
     """
 
     name: str
@@ -32,10 +32,11 @@ class ProgramConfig:
     task: str = ""
     start: StartPolicy = field(default_factory=StartPolicy)
     dialect: str = "standard"
+    libraries: tuple[str, ...] = ()
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
         """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
-        program = load_program(self.source, python_path, together, self.dialect)
+        program = load_program(self.source, python_path, together, self.dialect, self.libraries)
         return BoundProgram(self.name, program, self.inputs, self.outputs)
 
 

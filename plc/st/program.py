@@ -182,9 +182,11 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     return type(found.name, (StProgram,), body)
 
 
-def load_source(path: Path, name: str = "", dialect: Dialect = STANDARD) -> type[StProgram]:
+def load_source(
+    path: Path, name: str = "", dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()
+) -> type[StProgram]:
     """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
-    return program_class(compile_source(path, dialect), name)
+    return program_class(compile_source(path, dialect, libraries), name)
 
 
 def _attribute(variable: ProgramVariable) -> str:

@@ -16,7 +16,9 @@ from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
-from fieldtwin.plc.st.syntax.parse import parse_all
+from fieldtwin.plc.st.libraries import Library, with_library
+from fieldtwin.plc.st.syntax import twincat
+from fieldtwin.plc.st.syntax.parse import parse_all, parse_parts
 from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 from fieldtwin.plc.st.syntax.tree import SourceUnit
 
@@ -25,13 +27,20 @@ _QUALIFIED_ONLY = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 """The pragma of CODESYS before a list of global variables that are used only as ``LIST.variable``."""
+Texts = tuple[tuple[str, str], ...]
+"""Files with their content."""
 MAX_SOURCE_BYTES = 8 * 1024 * 1024
 """A larger source file is assumed to be a mistake."""
 
 
-def compile_source(path: Path, dialect: Dialect = STANDARD) -> CompiledUnit:
-    """Read and compile a file or a folder. Raises `FileInvalid` for the first error, with the others."""
-    return _compiled(tuple((str(file), _text(file)) for file in source_files(path)), str(path), dialect)
+def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> CompiledUnit:
+    """Read and compile a file or a folder, with the declarations of `libraries` (files or folders) that it uses.
+
+    Raises `FileInvalid` for the first error, with the others.
+    """
+    texts = tuple((str(file), _text(file)) for file in source_files(path))
+    more = tuple((str(file), _text(file)) for library in libraries for file in source_files(library))
+    return _compiled(texts, more, str(path), dialect)
 
 
 def _text(path: Path) -> str:
@@ -44,12 +53,33 @@ def _text(path: Path) -> str:
 
 
 @lru_cache(maxsize=32)
-def _compiled(texts: tuple[tuple[str, str], ...], path: str, dialect: Dialect) -> CompiledUnit:
+def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect) -> CompiledUnit:
     """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
-    return compile_unit(_parsed(texts, dialect), path, tuple(file for file, _ in texts), dialect)
+    unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
+    used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
+    files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
+    return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
 
 
-def _parsed(texts: tuple[tuple[str, str], ...], dialect: Dialect) -> SourceUnit:
+def _library(texts: Texts, dialect: Dialect) -> Library:
+    """Return the declarations of libraries. An error counts only if the program uses the part with the error."""
+    library = Library()
+    for path, text in texts:
+        try:
+            library.add(_unit(path, text, dialect))
+        except FileInvalid as whole:
+            try:
+                for unit, names, error in parse_parts(_as_st(path, text), path, dialect):
+                    library.add(_in_list(unit, path, text, dialect))
+                    library.fail(names, error or whole)
+            except (
+                FileInvalid
+            ) as e:  # a file that is not even text of the language: its name is that of its declaration
+                library.fail((Path(path).stem,), e)
+    return library
+
+
+def _parsed(texts: Texts, dialect: Dialect) -> SourceUnit:
     """Return the declarations of all files. Raises `FileInvalid` for the first syntax error, with the others."""
     units: list[SourceUnit] = []
     errors = ErrorCollector()
@@ -67,10 +97,18 @@ def _parsed(texts: tuple[tuple[str, str], ...], dialect: Dialect) -> SourceUnit:
 
 def _unit(path: str, text: str, dialect: Dialect) -> SourceUnit:
     """Return the declarations of a file. In a vendor's dialect its global variables form a list with the name of the file."""
-    if is_plcopen(text):
-        return parse_all(to_st(text, path), path, dialect)
-    unit = parse_all(text, path, dialect)
-    if not dialect.vendor:
+    return _in_list(parse_all(_as_st(path, text), path, dialect), path, text, dialect)
+
+
+def _as_st(path: str, text: str) -> str:
+    """Return the Structured Text of a file in any form."""
+    if twincat.is_twincat(text):
+        return twincat.to_st(text, path)
+    return to_st(text, path) if is_plcopen(text) else text
+
+
+def _in_list(unit: SourceUnit, path: str, text: str, dialect: Dialect) -> SourceUnit:
+    if not dialect.vendor or (is_plcopen(text) and not twincat.is_twincat(text)):
         return unit
     name, only_qualified = Path(path).stem, _QUALIFIED_ONLY.search(text) is not None
     lists = (replace(block, list=name, only_qualified=only_qualified) for block in unit.globals)

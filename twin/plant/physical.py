@@ -101,6 +101,7 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             form.task or "",
             _start_policy(form.start or system.plc.start),
             form.dialect,
+            tuple(form.libraries),
         )
         for name, form in system.plc.programs.items()
     )

@@ -172,6 +172,11 @@ class ProgramForm(SiteModel):
     dialect: Literal["standard", "codesys", "twincat", "matiec"] = Field(
         default="standard", description="of a source in Structured Text"
     )
+    libraries: list[str] = Field(
+        default=[],
+        max_length=32,
+        description="files or folders of Structured Text, from which used declarations are taken",
+    )
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[Name, InputForm] = Field(default={})

@@ -91,7 +91,8 @@ def collect(system: System, profiles: Iterable[Path] = (), prototype: Path | Non
         _profile(got, system.path, form["profile"], device.profile)
         if dcf := form.get("dcf"):
             got.add(_place("devices", dcf, system.path), Item("dcf", find("devices", dcf, system.path, profiles)))
-    for source in dict.fromkeys(program.source for program in system.plc.programs.values()):
+    texts = [name for program in system.plc.programs.values() for name in (program.source, *program.libraries)]
+    for source in dict.fromkeys(texts):
         _program(got, system.path, source)
     if prototype is not None:
         _prototype(got, system, prototype)

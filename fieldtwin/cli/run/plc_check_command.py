@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
     from fieldtwin.plc.st.dialects import Dialect, StWarning
 
+    _Program = tuple[Path, Dialect, tuple[Path, ...]]
+    """A file or folder of programs, its dialect, and its libraries."""
+
 _OF_SYSTEMS = (".yaml", ".yml")
 _DIALECTS = ("standard", "codesys", "twincat", "matiec")
 
@@ -52,15 +55,27 @@ class _Found:
         shell_complete=st_warnings,
         help="Treat the warning ID (such as ST001), or all, as an error. Can be repeated.",
     ),
+    click.option(
+        "--library",
+        "libraries",
+        type=click.Path(path_type=Path, exists=True),
+        multiple=True,
+        help="A file or folder whose declarations SOURCE may use; only those that it uses are compiled. Can be repeated.",
+    ),
     sources=TemplateSearchOptions,
 )
 @json_option
 def check(
-    source: str, dialect: str | None, as_errors: tuple[str, ...], sources: TemplateSearchOptions, as_json: bool
+    source: str,
+    dialect: str | None,
+    as_errors: tuple[str, ...],
+    libraries: tuple[Path, ...],
+    sources: TemplateSearchOptions,
+    as_json: bool,
 ) -> int:
     """Compile SOURCE and list all errors and warnings, one per line, with file, line and column. Nothing is run.
 
-    SOURCE is a file of Structured Text or PLCopen XML, a folder of such files, which are compiled together, or a system,
+    SOURCE is a file of Structured Text, PLCopen XML or TwinCAT, a folder of such files, which are compiled together, or a system,
     whose programs are checked. A file or folder needs no system.
 
     \b
@@ -76,9 +91,10 @@ def check(
     from fieldtwin.plc.st.dialects import chosen_ids, dialect_of
 
     if _is_program(source):
-        programs = [(Path(source), dialect_of(dialect or "standard"))]
-    elif dialect is not None:
-        raise UsageError(f"--dialect for the system {source}", expected="`dialect:` of the program in the system file")
+        programs = [(Path(source), dialect_of(dialect or "standard"), libraries)]
+    elif dialect is not None or libraries:
+        expected = "`dialect:` and `libraries:` of the program in the system file"
+        raise UsageError(f"--dialect or --library for the system {source}", expected=expected)
     else:
         programs = list(_sources_of(source, sources))
     found = _checked(programs, chosen_ids(as_errors))
@@ -99,8 +115,8 @@ def _is_program(source: str) -> bool:
     return path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS)
 
 
-def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[tuple[Path, Dialect]]:
-    """Return each file or folder of programs in Structured Text that a system has, once, with its dialect.
+def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[_Program]:
+    """Return each file or folder of programs in Structured Text that a system has, once, with dialect and libraries.
 
     Raises `UsageError` if it has none.
     """
@@ -109,9 +125,12 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[tuple[P
     from fieldtwin.twin.site.system import load_system
 
     loaded = load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
-    forms = [(form.source.partition(":")[0].strip(), form.dialect) for form in loaded.plc.programs.values()]
+    folder = loaded.path.parent
+    forms = [(form.source.partition(":")[0].strip(), form) for form in loaded.plc.programs.values()]
     found = dict.fromkeys(
-        (loaded.path.parent / name, dialect_of(dialect)) for name, dialect in forms if name != "python"
+        (folder / name, dialect_of(form.dialect), tuple(folder / library for library in form.libraries))
+        for name, form in forms
+        if name != "python"
     )
     if not found:
         raise UsageError(
@@ -120,13 +139,13 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[tuple[P
     yield from found
 
 
-def _checked(programs: Sequence[tuple[Path, Dialect]], as_errors: frozenset[str]) -> _Found:
+def _checked(programs: Sequence[_Program], as_errors: frozenset[str]) -> _Found:
     from fieldtwin.plc.st.project import compile_source
 
     found = _Found([], [], [])
-    for path, dialect in programs:
+    for path, dialect, libraries in programs:
         try:
-            unit = compile_source(path, dialect)
+            unit = compile_source(path, dialect, libraries)
         except FileInvalid as e:
             found.errors.extend((e, *e.others))
             continue

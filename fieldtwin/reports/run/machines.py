@@ -15,7 +15,8 @@ def machines_of(system: System) -> tuple[Machine, ...]:
     """
     found = []
     for name, form in system.plc.programs.items():
-        program = load_program(form.source, [str(system.path.parent)], dialect=form.dialect)
+        folder = [str(system.path.parent)]
+        program = load_program(form.source, folder, dialect=form.dialect, libraries=form.libraries)
         table = getattr(program, "table", None)
         if isinstance(table, StateTable) and "state" in program.variables:
             steps = [(state, t.target) for state in table.states for t in table.leaving(state) if t.target != state]

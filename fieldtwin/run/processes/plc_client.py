@@ -106,8 +106,10 @@ def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:
 def programs(system: System) -> dict[str, Program]:
     """Load each program of a system by name, without running it. Raises `FileInvalid`."""
     folder = str(system.path.parent)
-    forms = system.plc.programs.items()
-    return {name: load_program(form.source, (folder,), dialect=form.dialect) for name, form in forms}
+    return {
+        name: load_program(form.source, (folder,), dialect=form.dialect, libraries=form.libraries)
+        for name, form in system.plc.programs.items()
+    }
 
 
 def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:

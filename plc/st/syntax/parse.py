@@ -50,6 +50,8 @@ _ENDS = re.compile(
 )
 """The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped."""
 
+_DECLARED = re.compile(r"\b(?:FUNCTION_BLOCK|FUNCTION|TYPE)\s+([A-Za-z_]\w*)", re.IGNORECASE)
+
 _READABLE = {
     "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
     "DURATION": "a duration", "DATE": "a date", "TIME_OF_DAY": "a time of day", "DATE_AND_TIME": "a date",
@@ -60,12 +62,16 @@ _READABLE = {
 }  # fmt: skip
 
 
-def parse(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
-    """Return the tree of `text`. Raises `FileInvalid` with line and column."""
+def parse(text: str, path: str = "", dialect: Dialect = STANDARD, before: tuple[int, int] = (0, 0)) -> t.SourceUnit:
+    """Return the tree of `text`. Raises `FileInvalid` with line and column.
+
+    `before`: for a part of a file, the lines before it, and the columns before it in its first line. Positions in the tree are
+    those in the file; an error has its position in the part.
+    """
     warnings: list[StWarning] = []
     text = blanked(text, path, dialect, warnings)
     try:
-        unit: t.SourceUnit = _Build(path).transform(_parser().parse(text))
+        unit: t.SourceUnit = _Build(path, before).transform(_parser().parse(text))
         return replace(unit, warnings=tuple(warnings))
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
@@ -97,6 +103,20 @@ def parse_all(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.Sourc
                     break
         found.raise_all()
         raise
+
+
+def parse_parts(
+    text: str, path: str = "", dialect: Dialect = STANDARD
+) -> Iterator[tuple[t.SourceUnit, tuple[str, ...], FileInvalid | None]]:
+    """Parse each POU and TYPE block of `text` alone. Yield its tree; or an empty tree, the names that it declares, and its error.
+
+    Raises `FileInvalid` if a comment or a pragma makes the whole text unusable.
+    """
+    for part, line, column in _parts(blanked(text, path, dialect)):
+        try:
+            yield parse(part, path, dialect, (line, column)), (), None
+        except FileInvalid as e:
+            yield t.SourceUnit(), tuple(found[1] for found in _DECLARED.finditer(part)), _moved(e, line, column)
 
 
 def _parts(text: str) -> Iterator[tuple[str, int, int]]:
@@ -191,12 +211,14 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     It is not recursive, so the nesting depth has no limit."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, before: tuple[int, int]) -> None:
         super().__init__()
         self._path = path
+        self._lines, self._columns = before
 
     def _pos(self, where: Meta | Token) -> t.Pos:
-        return t.Pos(where.line or 1, where.column or 1, self._path)
+        line, column = where.line or 1, where.column or 1
+        return t.Pos(line + self._lines, column + (self._columns if line == 1 else 0), self._path)
 
     def NAME(self, token: Token) -> Token:
         if len(token) > MAX_NAME:
@@ -452,4 +474,4 @@ def _integer(token: Token) -> int:
         raise _Bad(token, "not a whole number that any type holds") from e
 
 
-__all__ = ["parse", "parse_all"]
+__all__ = ["parse", "parse_all", "parse_parts"]

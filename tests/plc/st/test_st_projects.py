@@ -149,7 +149,9 @@ def test_a_function_whose_declaration_has_an_error_hides_no_other_error(tmp_path
 
 
 def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert errors_of(tmp_path) == [": a folder without a program; expected files .st, .iecst, .xml"]
+    assert errors_of(tmp_path) == [
+        ": a folder without a program; expected files .st, .iecst, .exp, .xml, .tcpou, .tcdut, .tcgvl"
+    ]
     monkeypatch.setattr(source_files, "MAX_FILES", 2)
     for n in range(3):
         (tmp_path / f"{n}.st").write_text("")

@@ -1,0 +1,110 @@
+"""Libraries: folders of Structured Text from which a program takes the declarations that it uses, by their names.
+
+Other declarations of a library are not compiled, so an error in one of them does not concern the program. The program's own
+declarations have precedence over those of libraries, and a library over those that are named after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.plc.st.syntax import tree as t
+
+Declaration = t.TypeDecl | t.VarBlock | t.Pou
+
+
+@dataclass
+class Library:
+    """The declarations of libraries by each name, in lower case, that refers to them; `broken` has those with a syntax error."""
+
+    found: dict[str, Declaration] = field(default_factory=dict)
+    broken: dict[str, FileInvalid] = field(default_factory=dict)
+    warnings: list[t.SourceUnit] = field(default_factory=list)
+
+    def add(self, unit: t.SourceUnit) -> None:
+        """Add the declarations of a file; PROGRAMs are left out."""
+        self.warnings.append(unit)
+        for pou in unit.pous:
+            if pou.kind != "PROGRAM":
+                self._name(pou.name, pou)
+        for declared in unit.types:
+            self._name(declared.name, declared)
+            for value, _ in declared.values if isinstance(declared, t.EnumDecl) else ():
+                self._name(value, declared)
+        for block in unit.globals:
+            for name in (block.list, *(v.name for v in block.variables)):
+                self._name(name, block)
+
+    def _name(self, name: str, declared: Declaration) -> None:
+        if name and name.lower() not in self.broken:
+            self.found.setdefault(name.lower(), declared)
+
+    def fail(self, names: Iterable[str], error: FileInvalid) -> None:
+        """Add the names of a part of a file that cannot be parsed."""
+        for name in names:
+            if name.lower() not in self.found:
+                self.broken.setdefault(name.lower(), error)
+
+
+def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
+    """Return `unit` with the declarations of `library` that it uses, directly or through others.
+
+    Raises `FileInvalid` for a used declaration with a syntax error, with the others.
+    """
+    errors = ErrorCollector()
+    own = {declared.name.lower() for declared in (*unit.types, *unit.pous)}
+    own |= {v.name.lower() for block in unit.globals for v in block.variables}
+    taken: dict[int, Declaration] = {}
+    waiting = list(_names(unit))
+    seen = set(own)
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        declared = library.found.get(name)
+        if name in library.broken:
+            errors.add(library.broken[name])
+        elif declared is not None and id(declared) not in taken:
+            taken[id(declared)] = declared
+            waiting += _names(declared)
+    errors.raise_all()
+    files = {declared.pos.path for declared in taken.values()}
+    return t.SourceUnit(
+        (*unit.types, *(d for d in taken.values() if isinstance(d, t.TypeDecl))),
+        (*unit.globals, *(d for d in taken.values() if isinstance(d, t.VarBlock))),
+        (*unit.pous, *(d for d in taken.values() if isinstance(d, t.Pou))),
+        (*unit.warnings, *(w for one in library.warnings for w in one.warnings if w.path in files)),
+    )
+
+
+def _names(root: Any) -> Iterator[str]:
+    """Yield the names, in lower case, of types, variables and POUs to which a declaration may refer."""
+    pous = root.pous if isinstance(root, t.SourceUnit) else ()
+    parts = [*root.types, *root.globals] if isinstance(root, t.SourceUnit) else [root]
+    for part in (*parts, *pous):
+        local = set()
+        if isinstance(part, t.Pou):
+            local = {v.name.lower() for b in part.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+            yield from (v.name.lower() for b in part.blocks if b.kind == "VAR_EXTERNAL" for v in b.variables)
+        yield from _references(part, local)
+
+
+def _references(root: Any, local: set[str]) -> Iterator[str]:
+    stack = [root]
+    while stack:
+        node = stack.pop()
+        if isinstance(node, tuple):
+            stack.extend(node)
+        elif is_dataclass(node):
+            if isinstance(node, t.NamedType | t.SubrangeType) or (
+                isinstance(node, t.Ref) and node.name.lower() not in local
+            ):
+                yield node.name.lower()
+            elif isinstance(node, t.Literal) and node.kind == "ENUM_REF":
+                yield node.text.partition("#")[0].lower()
+            stack.extend(getattr(node, one.name) for one in fields(node))

@@ -1,0 +1,122 @@
+"""Convert the files of a TwinCAT project (.TcPOU, .TcDUT, .TcGVL) to Structured Text, line for line and column for column.
+
+Such a file is XML with the declaration and the ST body of one object as text in CDATA sections; outside of these, an entity
+moves the columns after it. Methods, properties, actions, transitions and
+bodies in graphical languages are refused by name. Document types are refused, which excludes all attacks with entities.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from xml.parsers import expat
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+
+_ROOT = re.compile(r"\s*(<\?xml[^>]*\?>)?\s*<TcPlcObject\b")
+_KIND = re.compile(
+    r"(?:\s|\(\*.*?\*\)|//[^\n]*|\{[^}]*\})*(FUNCTION_BLOCK|FUNCTION|PROGRAM)\b", re.DOTALL | re.IGNORECASE
+)
+"""The first word of a declaration; comments and pragmas are skipped."""
+_UNSUPPORTED = {
+    "Method": "methods", "Property": "properties", "Action": "actions", "Transition": "transitions", "Itf": "interfaces",
+}  # fmt: skip
+_PARTS = ("POU", "DUT", "GVL")
+
+
+def is_twincat(text: str) -> bool:
+    return _ROOT.match(text.removeprefix("\ufeff")) is not None
+
+
+def to_st(text: str, path: str = "") -> str:
+    """Return the Structured Text of a TwinCAT file. Raises `FileInvalid` for an unsupported part, with the others."""
+    reader = _Reader(path)
+    reader.read(text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n"))
+    return reader.text()
+
+
+@dataclass(slots=True)
+class _Object:
+    """A POU, type or list: the pieces of its texts, each with its line and column in the file, and where it ends."""
+
+    name: str
+    declaration: list[tuple[int, int, str]] = field(default_factory=list)
+    body: list[tuple[int, int, str]] = field(default_factory=list)
+    end: tuple[int, int] = (1, 0)
+
+
+class _Reader:
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._errors = ErrorCollector()
+        self._open: list[str] = []
+        self._objects: list[_Object] = []
+        self._parser = expat.ParserCreate()
+
+    def read(self, text: str) -> None:
+        parser = self._parser
+        parser.buffer_text = False
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.CharacterDataHandler = self._characters
+        parser.StartDoctypeDeclHandler = self._doctype
+        try:
+            parser.Parse(text.encode(), True)
+        except expat.ExpatError as e:
+            message = f"not XML: {expat.ErrorString(e.code)}"
+            raise FileInvalid(message, path=self._path, line=e.lineno, column=e.offset + 1) from e
+        self._errors.raise_all()
+
+    def text(self) -> str:
+        lines: list[str] = []
+        for found in self._objects:
+            for pieces in (found.declaration, found.body):
+                if pieces:  # the parser delivers a text in pieces, one for each line or entity
+                    line, column, _ = pieces[0]
+                    _put(lines, line, column, "".join(piece for _, _, piece in pieces))
+            kind = _KIND.match("".join(piece for _, _, piece in found.declaration))
+            if kind is not None:
+                _put(lines, *found.end, f"END_{kind[1].upper()}")
+        return "\n".join(lines)
+
+    def _fail(self, message: str, *, expected: str = "", got: str = "") -> None:
+        line, column = self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber + 1
+        self._errors.add(FileInvalid(message, path=self._path, line=line, column=column, expected=expected, got=got))
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._open.append(tag)
+        name = attributes.get("Name", "")
+        if self._open[1:] == [tag] and tag in _PARTS:
+            self._objects.append(_Object(name))
+        elif tag in _UNSUPPORTED and len(self._open) <= 3:
+            of = f" of {self._objects[-1].name}" if self._objects else ""
+            self._fail(f"{name}{of}: {_UNSUPPORTED[tag]} are not supported")
+        elif self._open[2:] == ["Implementation", tag] and tag != "ST":
+            self._fail(f"the body of {self._objects[-1].name} is not Structured Text", expected="ST", got=tag)
+
+    def _end(self, tag: str) -> None:
+        if self._open[1:] == [tag] and self._objects:
+            self._objects[-1].end = self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber
+        self._open.pop()
+
+    def _characters(self, data: str) -> None:
+        piece = self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber, data
+        if not self._objects:
+            return
+        places = {"Declaration": self._objects[-1].declaration, "Implementation/ST": self._objects[-1].body}
+        pieces = places.get("/".join(self._open[2:]))
+        if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is no part of the text
+            pieces.append(piece)
+
+    def _doctype(self, *_: object) -> None:
+        line = self._parser.CurrentLineNumber
+        raise FileInvalid("a document type declaration is not allowed", path=self._path, line=line)
+
+
+def _put(lines: list[str], line: int, column: int, text: str) -> None:
+    """Write `text` at its place: `line` from 1, `column` from 0."""
+    for offset, part in enumerate(text.split("\n")):
+        lines.extend([""] * (line + offset - len(lines)))
+        at = line + offset - 1
+        lines[at] = lines[at].ljust(column if offset == 0 else 0) + part

@@ -1,0 +1,98 @@
+"""Libraries of Structured Text, of which a program takes only what it uses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from st_bench import scan
+
+from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.binding import BoundProgram, load_program
+from fieldtwin.plc.runtime.sources import sources
+
+GOOD = """FUNCTION scaled : INT VAR_INPUT x : INT; END_VAR scaled := limited(x * FACTOR); END_FUNCTION
+FUNCTION limited : INT VAR_INPUT x : INT; END_VAR limited := MIN(x, 100); END_FUNCTION
+FUNCTION wrong : INT wrong := TRUE; END_FUNCTION
+TYPE Colour : (red, green); END_TYPE
+PROGRAM demo END_PROGRAM
+VAR_GLOBAL CONSTANT FACTOR : INT := 7; END_VAR
+"""
+BROKEN = """FUNCTION unusable : INT
+unusable := ;
+END_FUNCTION
+FUNCTION usable : INT usable := 11; END_FUNCTION FUNCTION bad : INT bad := TRUE; END_FUNCTION
+"""
+MAIN = "PROGRAM p VAR n, limited : INT; c : Colour; END_VAR n := scaled(3); c := green; {} END_PROGRAM"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A program in `main.st` and two libraries: one with an error of meaning, one with an error of syntax."""
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "good.st").write_text(GOOD)
+    (tmp_path / "lib2").mkdir()
+    (tmp_path / "lib2" / "broken.st").write_text(BROKEN)
+    (tmp_path / "lib2" / "unused.st").write_text("FUNCTION nothing : INT nothing := 1; END_FUNCTION")
+    (tmp_path / "lib2" / "comment.st").write_text("(* a comment that does not end")
+    (tmp_path / "main.st").write_text(MAIN.format(""))
+    return tmp_path
+
+
+def loaded(folder: Path) -> Any:
+    return load_program("main.st", (str(folder),), libraries=("lib", "lib2"))
+
+
+def errors_of(folder: Path) -> list[str]:
+    with pytest.raises(FileInvalid) as caught:
+        loaded(folder)
+    return [str(error).removeprefix(str(folder)) for error in (caught.value, *caught.value.others)]
+
+
+def test_used_declarations_are_taken_and_others_are_not_compiled(folder: Path) -> None:
+    made = loaded(folder)
+    scan(made)
+    assert (made.n, made.c) == (21, 1)
+
+
+def test_the_files_of_used_declarations_belong_to_the_program(folder: Path) -> None:
+    assert [Path(s.path).name for s in sources([BoundProgram("p", loaded(folder))])] == ["main.st", "good.st"]
+
+
+def test_a_part_beside_a_part_with_a_syntax_error_can_be_used(folder: Path) -> None:
+    (folder / "main.st").write_text(MAIN.format("n := usable();"))
+    made = loaded(folder)
+    scan(made)
+    assert made.n == 11
+
+
+def test_errors_in_used_declarations_are_reported_at_their_place(folder: Path) -> None:
+    (folder / "main.st").write_text(MAIN.format("n := unusable();"))
+    (error,) = errors_of(folder)
+    assert error.startswith("/lib2/broken.st:2:13: not Structured Text")
+    (folder / "main.st").write_text(MAIN.format("n := wrong() + bad();"))
+    assert [error.partition(": ")[0] for error in errors_of(folder)] == ["/lib/good.st:3:31", "/lib2/broken.st:4:76"]
+
+
+def test_declarations_of_the_program_have_precedence(folder: Path) -> None:
+    (folder / "main.st").write_text(
+        MAIN.format("") + " FUNCTION limited : INT VAR_INPUT x : INT; END_VAR limited := -x; END_FUNCTION"
+    )
+    made = loaded(folder)
+    scan(made)
+    assert made.n == -21
+
+
+def test_a_library_that_does_not_exist_is_named(folder: Path) -> None:
+    with pytest.raises(FileInvalid, match="absent: cannot read"):
+        load_program("main.st", (str(folder),), libraries=("absent",))
+
+
+def test_the_command_takes_libraries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    done = CliRunner().invoke(check, ["main.st", "--library", "lib", "--library", "lib2"], standalone_mode=False)
+    assert done.output == "2 files, no errors: 2 functions, 1 global variable, 1 program, 1 type\n"
+    assert CliRunner().invoke(check, ["main.st"], standalone_mode=False).return_value == 1

@@ -1,0 +1,137 @@
+"""Files of a TwinCAT project as the source of a program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from st_bench import scan
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.binding import load_program
+from fieldtwin.plc.st.syntax.twincat import is_twincat, to_st
+
+HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<TcPlcObject Version="1.1.0.1" ProductVersion="3.1.4024.0">\n'
+MAIN = f"""{HEAD}  <POU Name="MAIN" Id="{{1}}" SpecialFunc="None">
+    <Declaration><![CDATA[// FUNCTION in a comment
+PROGRAM MAIN
+VAR
+  ramp : FB_Ramp;
+  n : INT;
+  mode : E_Mode := E_Mode.Up;
+END_VAR
+]]></Declaration>
+    <Implementation>
+      <ST><![CDATA[ramp(step := GVL.STEP, mode := mode);
+n := ramp.level;
+IF n > 5 AND mode = E_Mode.Up THEN mode := E_Mode.Down; END_IF]]></ST>
+    </Implementation>
+  </POU>
+</TcPlcObject>"""
+RAMP = f"""{HEAD}<POU Name="FB_Ramp" Id="{{2}}"><Declaration>
+FUNCTION_BLOCK FB_Ramp
+VAR_INPUT step : INT; mode : E_Mode; END_VAR
+VAR_OUTPUT level : INT; END_VAR
+</Declaration><Implementation><ST>IF mode = E_Mode.Up THEN level := level + step; END_IF
+IF level &gt; 100 THEN level := 100; END_IF
+</ST></Implementation></POU></TcPlcObject>"""
+MODE = f"""{HEAD}<DUT Name="E_Mode" Id="{{3}}"><Declaration><![CDATA[{{attribute 'qualified_only'}}
+TYPE E_Mode : (Down, Up); END_TYPE
+]]></Declaration></DUT></TcPlcObject>"""
+GVL = f"""{HEAD}<GVL Name="GVL" Id="{{4}}"><Declaration><![CDATA[{{attribute 'qualified_only'}}
+VAR_GLOBAL CONSTANT
+  STEP : INT := 3;
+END_VAR]]></Declaration></GVL></TcPlcObject>"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A TwinCAT project: a program, a function block, an enumeration and a list of global variables, each in a file."""
+    for name, text in (("MAIN.TcPOU", MAIN), ("FB_Ramp.TcPOU", RAMP), ("E_Mode.TcDUT", MODE), ("GVL.TcGVL", GVL)):
+        folder = tmp_path / name.rpartition(".")[2]
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_text("\ufeff" + text.replace("\n", "\r\n"), encoding="utf-8", newline="")
+    (tmp_path / "plc.plcproj").write_text("<Project/>")
+    return tmp_path
+
+
+def test_a_project_of_several_files_runs(project: Path) -> None:
+    made: Any = load_program(str(project), dialect="twincat")
+    for number in range(1, 5):
+        scan(made, number)
+    assert (made.n, made.mode) == (6, 0)
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "place"),
+    [
+        ("TcPOU/MAIN.TcPOU", "n := ramp", "n := rampe", "14:6"),
+        ("TcPOU/MAIN.TcPOU", "ramp(step", "rampe(step", "13:20"),
+        ("TcPOU/MAIN.TcPOU", "  n : INT", "  n : INTT", "8:7"),
+        ("TcPOU/FB_Ramp.TcPOU", "level := 100;", "level := 100", "8:34"),
+        ("TcDUT/E_Mode.TcDUT", "(Down, Up)", "(Down, Down)", "4:6"),
+        ("TcGVL/GVL.TcGVL", ":= 3", ":= TRUE", "5:17"),
+    ],
+)
+def test_errors_have_line_and_column_of_the_file(project: Path, file: str, before: str, after: str, place: str) -> None:
+    path = project / file
+    path.write_bytes(path.read_bytes().replace(before.encode(), after.encode()))
+    with pytest.raises(FileInvalid) as caught:
+        load_program(str(project), dialect="twincat")
+    places = [f"{Path(error.path).name}:{error.line}:{error.column}" for error in (caught.value, *caught.value.others)]
+    assert f"{path.name}:{place}" in places
+
+
+def test_parts_that_are_not_supported_are_named() -> None:
+    parts = (
+        '<Method Name="Start" Id="{5}"><Declaration>METHOD Start</Declaration></Method>\n'
+        '<Property Name="Level" Id="{6}"><Get Name="Get"/></Property><Action Name="Reset"/>\n</POU>'
+    )
+    with pytest.raises(FileInvalid) as caught:
+        to_st(MAIN.replace("</POU>", parts), "MAIN.TcPOU")
+    assert [str(error) for error in (caught.value, *caught.value.others)] == [
+        "MAIN.TcPOU:17:3: Start of MAIN: methods are not supported",
+        "MAIN.TcPOU:18:1: Level of MAIN: properties are not supported",
+        "MAIN.TcPOU:18:61: Reset of MAIN: actions are not supported",
+    ]
+    with pytest.raises(FileInvalid, match="the body of MAIN is not Structured Text; expected ST; got NWL"):
+        to_st(MAIN.replace("<ST>", "<NWL>").replace("</ST>", "</NWL>"))
+    with pytest.raises(FileInvalid, match="I_Motor: interfaces are not supported"):
+        to_st(f'{HEAD}<Itf Name="I_Motor"/></TcPlcObject>')
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MAIN[:-5], "not XML"),
+        (
+            MAIN.replace("<TcPlc", '<!DOCTYPE x [<!ENTITY a "b">]><TcPlc', 1),
+            "a document type declaration is not allowed",
+        ),
+        (f"{HEAD}</TcPlcObject>", ""),
+    ],
+)
+def test_a_damaged_file_is_refused(text: str, message: str) -> None:
+    if message:
+        with pytest.raises(FileInvalid, match=message):
+            to_st(text, "MAIN.TcPOU")
+    else:
+        assert not to_st(text).strip()
+
+
+@given(st.integers(0, len(MAIN)), st.integers(0, 40), st.text(max_size=8))
+def test_a_file_with_random_damage_is_read_or_refused(at: int, removed: int, inserted: str) -> None:
+    text = MAIN[:at] + inserted + MAIN[at + removed :]
+    try:
+        found = to_st(text)
+    except FileInvalid:
+        return
+    assert found.count("\n") <= text.count("\n") + text.count("\r")
+
+
+def test_a_file_of_twincat_is_known_by_its_root() -> None:
+    assert is_twincat("\ufeff" + MAIN)
+    assert not is_twincat("<project/>")

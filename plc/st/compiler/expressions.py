@@ -30,6 +30,9 @@ MAX_DEEP = 80
 MAX_OPEN = 40
 """How deep brackets may be nested in one line of Python: a deeper part is computed on a line before it."""
 
+_OF_ADDRESSES = frozenset({"ADR", "BITADR", "INDEXOF", "REF", "SIZEOF", "XSIZEOF", "__NEW", "__DELETE"})
+"""Functions of other tools that need the memory of a controller."""
+
 
 class Expressions:
     """The compiler of expressions in the scope of one POU: names are looked up in `symbols` (in lower case), then in the
@@ -210,6 +213,9 @@ class Expressions:
             standard = FUNCTIONS.find(name.upper())
             if standard is not None:
                 return standard(self, call)
+            if name.upper() in _OF_ADDRESSES:
+                message = "addresses and sizes of variables are not supported"
+                self.env.fail(call.pos, message, got=call.ref.name)
             known = (
                 [s.name for s in self.env.functions.values()]
                 + FUNCTIONS.names()

@@ -8,6 +8,7 @@ from operator import attrgetter
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.cycle import Cycle
 
 EPOCH_UTC_NS = 1_767_225_600 * NS_PER_S
 """2026-01-01T00:00:00Z: the start of every virtual run, so that the times in its trace are reproducible."""
@@ -31,3 +32,9 @@ class VirtualClock:
         if deadline_ns <= self._loop.now_ns:
             return
         await self._loop.sleeper(deadline_ns)
+
+    async def sleep_cycle_ns(self, deadline_ns: int, cycle: Cycle) -> None:
+        """Sleep until the next run of `cycle`; see `fieldtwin.gateway.core.concurrency.cycle`."""
+        if deadline_ns <= self._loop.now_ns:
+            return
+        await self._loop.cycle_sleeper(deadline_ns, cycle)

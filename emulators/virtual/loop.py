@@ -20,14 +20,17 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
+from fieldtwin.emulators.virtual.cycles import CycleSleep, skip_runs
 from fieldtwin.emulators.virtual.interrupts import Interrupts
 from fieldtwin.emulators.virtual.scheduled_call import ScheduledCall
 from fieldtwin.emulators.virtual.waiting import waits_at
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.cycle import Cycle
 from fieldtwin.gateway.core.errors import Bug
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
+Due = ScheduledCall | CycleSleep | asyncio.Future[None]
 
 START_NS = 1_000 * NS_PER_S
 """The start of monotonic time. It is not 0, because 0 means "never" in many places."""
@@ -68,7 +71,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.callbacks = 0
         """The number of callbacks that have run."""
         self._ready: deque[ScheduledCall] = deque()
-        self._timers: list[tuple[int, int, ScheduledCall | asyncio.Future[None]]] = []
+        self._timers: list[tuple[int, int, Due]] = []
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
         self._tasks = 0
@@ -116,6 +119,12 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._set_timer(when_ns, future)
         return future
 
+    def cycle_sleeper(self, when_ns: int, cycle: Cycle) -> asyncio.Future[None]:
+        """Return a future that is done at the next run of `cycle`. That is `when_ns`, unless runs are skipped."""
+        future: asyncio.Future[None] = asyncio.Future(loop=self)
+        self._set_timer(when_ns, CycleSleep(future, cycle))
+        return future
+
     def timer(self, delay_s: float) -> asyncio.Future[None]:
         """Return a future that is done after a delay in seconds, see `fieldtwin.gateway.core.concurrency.timeout`.
 
@@ -123,7 +132,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
-    def _set_timer(self, when_ns: int, due: ScheduledCall | asyncio.Future[None]) -> None:
+    def _set_timer(self, when_ns: int, due: Due) -> None:
         self._sequence += 1
         heappush(self._timers, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, due))
         if self._sequence >= self._compact_at:
@@ -221,6 +230,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _advance(self) -> None:
         timers, ready = self._timers, self._ready
+        if timers and type(timers[0][2]) is CycleSleep:
+            skip_runs(timers)
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
@@ -349,7 +360,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     remove_signal_handler: Any = _way_out("remove_signal_handler")
 
 
-def _is_over(due: ScheduledCall | asyncio.Future[None]) -> bool:
+def _is_over(due: Due) -> bool:
     """Return whether the timer is no longer needed."""
     return due.is_cancelled if isinstance(due, ScheduledCall) else due.done()
 

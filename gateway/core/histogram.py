@@ -42,17 +42,18 @@ class Histogram:
         self.count = self.min_ns = self.max_ns = self.total_ns = 0
         self._recent: deque[int] = deque(maxlen=recent)
 
-    def record(self, duration_ns: int) -> None:
-        """Count one duration."""
+    def record(self, duration_ns: int, times: int = 1) -> None:
+        """Count one duration, or the same duration several `times`."""
         ns = duration_ns if duration_ns > 0 else 0
         if not self.count or ns < self.min_ns:
             self.min_ns = ns
         if ns > self.max_ns:
             self.max_ns = ns
-        self.count += 1
-        self.total_ns += ns
-        self.counts[bisect_left(self.limits_ns, ns) if ns else 0] += 1  # in virtual time every scan takes 0 ns
-        self._recent.append(ns)
+        self.count += times
+        self.total_ns += ns * times
+        self.counts[bisect_left(self.limits_ns, ns) if ns else 0] += times  # in virtual time every scan takes 0 ns
+        if self._recent.maxlen:
+            self._recent.extend([ns] * min(times, self._recent.maxlen))
 
     @property
     def recent_longest_ns(self) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.cycle import sleep_cycle
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector, Listen
@@ -143,6 +144,9 @@ class Gateway:
         self.exchange = ImageExchange(image, self.tags, sources)
         self.plc_alive = False
         self.plc_losses = 0
+        self.period_ns = config.cycle_ms * NS_PER_MS
+        self._next_ns = 0
+        """The time of the next exchange with the PLC."""
         self._stopping = False
 
     def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
@@ -256,21 +260,44 @@ class Gateway:
             await nursery.wait()
 
     async def _cycle(self) -> None:
-        period_ns = self.config.cycle_ms * NS_PER_MS
-        next_ns = self.clock.monotonic_ns()
+        self._next_ns = self.clock.monotonic_ns()
         while True:
             now_ns = self.clock.monotonic_ns()
             self.tick(now_ns)
-            next_ns = max(next_ns + period_ns, now_ns)  # missed cycles are skipped, and not made up for in a burst
-            await self.clock.sleep_until_ns(next_ns)
+            # missed cycles are skipped, and not made up for in a burst
+            self._next_ns = max(self._next_ns + self.period_ns, now_ns)
+            await sleep_cycle(self.clock, self._next_ns, self)
+
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether every `tick` before `until_ns` would only repeat the last one, see `Cycle`."""
+        lost_ns = self.config.plc_lost_ms * NS_PER_MS
+        return (
+            self.plc_alive
+            and not self._stopping
+            and self.exchange.repeats_until(until_ns)
+            and until_ns - self.exchange.plc_heard_ns <= lost_ns
+            and self.outputs.is_idle
+            and all(pump.is_idle for pump in self.pumps)
+            and self._undelivered() == self.exchange.undelivered
+        )
+
+    def skip(self, count: int, last_ns: int) -> None:
+        """Count ticks that do not take place, see `Cycle`."""
+        self._next_ns += count * self.period_ns
+        self.exchange.skip(count, last_ns)
+
+    def _undelivered(self) -> dict[str, int]:
+        """Return, by tag, how many messages of the PLC have not reached their mailbox or the exchange log."""
+        undelivered = {pump.driver.outbox_tag: pump.undelivered for pump in self.pumps}
+        for tag in self.config.log_tags:
+            undelivered[tag] = self.log.pending(tag)
+        return undelivered
 
     def tick(self, now_ns: int) -> None:
         """Exchange data with the PLC once, and act on its outputs. Never waits."""
         for pump in self.pumps:
             pump.refuse_when_local()
-            self.exchange.undelivered[pump.driver.outbox_tag] = pump.undelivered
-        for tag in self.config.log_tags:
-            self.exchange.undelivered[tag] = self.log.pending(tag)
+        self.exchange.undelivered = self._undelivered()
         self.exchange.exchange(now_ns)
         for tag, messages in self.exchange.new_messages.items():
             for pump in self.pumps:

@@ -60,7 +60,7 @@ class ImageExchange:
         self.new_messages: Mapping[str, tuple[Message, ...]] = {}
         self.plc_counter = 0
         self.plc_stopped = False
-        self._plc_heard_ns = 0
+        self.plc_heard_ns = 0
         self._resume(image)
 
     def _resume(self, image: Image) -> None:
@@ -76,7 +76,7 @@ class ImageExchange:
         snapshot = self._reader.snapshot()
         if snapshot.counter != self.plc_counter:
             self.plc_counter = snapshot.counter
-            self._plc_heard_ns = snapshot.t_ns
+            self.plc_heard_ns = snapshot.t_ns
         self.plc_stopped = snapshot.stopped
         self.new_messages = snapshot.messages
         if snapshot.counter and not self._seen_before(snapshot):
@@ -85,6 +85,26 @@ class ImageExchange:
                 value = self.outputs[consumed_name(tag)].value
                 self._consumed[tag] = int(value) if value is not None else 0
         self._publish(now_ns)
+
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether each exchange before `until_ns` would read and publish what the last one did, apart from counters and
+        times. See `fieldtwin.gateway.core.concurrency.cycle.Cycle`.
+        """
+        return (
+            self._reader.repeats
+            and self._writer.repeats
+            and not self.plc_stopped
+            and not self.new_messages
+            and self._columns.repeats_until(until_ns)
+            and not any(source.queue for source in self._sources.values())
+        )
+
+    def skip(self, count: int, last_ns: int) -> None:
+        """Count exchanges that would have repeated the last one, and publish the last of them, which was at `last_ns`."""
+        times_ns = self._columns.times_ns
+        for at, _ in self._taken:
+            times_ns[at] = last_ns
+        self._writer.skip(count, times_ns, last_ns)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
         """Return whether values, qualities and reasons are the same as at the last call.
@@ -97,7 +117,7 @@ class ImageExchange:
 
     def plc_age_ms(self, now_ns: int) -> float:
         """Return the milliseconds since the PLC last published; infinite if it never did."""
-        return (now_ns - self._plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
+        return (now_ns - self.plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
 
     def all_consumed(self, tag: str) -> bool:
         """Return whether the PLC has consumed every message of `tag` that was published; always False if no program reads this
@@ -177,6 +197,10 @@ class _Columns:
         self.changed = True
         if until_ns < self._earliest_ns and value.quality is not _BAD:
             self._earliest_ns = until_ns
+
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether `refresh` finds nothing new before `until_ns`."""
+        return until_ns <= self._earliest_ns and not self._tags.has_changes
 
     def put(self, at: int, value: int, now_ns: int) -> None:
         """Set the number at position `at`, which the exchange itself provides. Its quality is good."""

@@ -176,6 +176,11 @@ class TagTable:
         held = self._held.get(name)
         return FOREVER_NS if held is None else held.fresh_until_ns
 
+    @property
+    def has_changes(self) -> bool:
+        """Return whether `take_changes` would return any tag."""
+        return bool(self._news)
+
     def take_changes(self) -> Collection[Held]:
         """Return the tags that were stored since the last call. Only one reader, which mirrors the table, may call this."""
         if not self._news:

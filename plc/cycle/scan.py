@@ -215,6 +215,28 @@ class Scan:
             settling.disturbed()
         return settling.settled
 
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether every scan before `until_ns` would skip the logic, and publish what the last scan did, see
+        `fieldtwin.gateway.core.concurrency.cycle.Cycle`.
+        """
+        latest = self._reader.latest
+        return (
+            self._settling.settled
+            and not self._not_run
+            and self.gateway_alive
+            and until_ns - latest.t_ns <= self._limit_ns
+            and latest.values is self._columns
+            and self._reader.repeats
+            and self.output_image.repeats
+            and not self.output_image.forces.inputs
+        )
+
+    def skip(self, count: int, last_ns: int) -> None:
+        """Count scans that do not take place, see `Cycle`."""
+        self.number += count
+        self.skipped += count
+        self.output_image.skip(count, last_ns)
+
     def _execute_started(self, now_ns: int) -> None:
         """Execute a scan while some programs have not started, or just have started. Only started programs run."""
         waiting = self._read_for_started(now_ns)

@@ -24,6 +24,7 @@ from enum import Enum
 from typing import Any, Protocol
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.cycle import Cycle, sleep_cycle
 from fieldtwin.gateway.core.errors import Bug, CheckFailed, FieldtwinError
 from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
@@ -38,6 +39,10 @@ class Executable(Protocol):
 
     def stop(self, now_ns: int) -> None: ...
 
+    def repeats_until(self, until_ns: int) -> bool: ...
+
+    def skip(self, count: int, last_ns: int) -> None: ...
+
     @property
     def waiting(self) -> bool: ...
 
@@ -50,7 +55,7 @@ class Guard(Protocol):
     def disarm(self) -> None: ...
 
 
-class Driven(Protocol):
+class Driven(Cycle, Protocol):
     """The interface through which a clock runs one task (`CyclicTask`) or several (`fieldtwin.plc.runtime.runner.TaskRunner`)."""
 
     @property
@@ -188,6 +193,22 @@ class CyclicTask:
         else:
             self._overruns_in_a_row = 0
 
+    @property
+    def period_ns(self) -> int:
+        return self._cycle_ns
+
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether every scan before `until_ns` would only repeat the last one, see `Cycle`."""
+        return self.running and not self.paused and not self._scan.waiting and self._scan.repeats_until(until_ns)
+
+    def skip(self, count: int, last_ns: int) -> None:
+        """Count scans that do not take place, see `Cycle`. They would have been punctual, and would have taken no time."""
+        self._scan.skip(count, last_ns)
+        self.scans += count
+        self.deadline_ns += count * self._cycle_ns
+        self.lateness.record(0, count)
+        self.duration.record(0, count)
+
     def _guarded(self, guard: Guard, now_ns: int) -> None:
         try:
             guard.arm()
@@ -256,7 +277,7 @@ async def run_on_clock(task: Driven, clock: Clock) -> None:
     task.start()
     try:
         while task.running:
-            await clock.sleep_until_ns(task.deadline_ns)
+            await sleep_cycle(clock, task.deadline_ns, task)
             if task.running:
                 task.run_once()
     finally:

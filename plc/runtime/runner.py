@@ -240,6 +240,24 @@ class TaskRunner:
             entry.task.stop()
             self._on_stopped(entry)
 
+    @property
+    def period_ns(self) -> int:
+        """Return the time in ns between two scans of the first task."""
+        return self.entries[0].task.period_ns
+
+    def repeats_until(self, until_ns: int) -> bool:
+        """Return whether every scan before `until_ns` would only repeat the last one, see `Cycle`."""
+        return (
+            len(self.entries) == 1
+            and self._stopped is None
+            and not self.starts.waiting
+            and self.entries[0].task.repeats_until(until_ns)
+        )
+
+    def skip(self, count: int, last_ns: int) -> None:
+        """Count scans of the only task that do not take place, see `Cycle`."""
+        self.entries[0].task.skip(count, last_ns)
+
     def _look_for_delay(self, entry: TaskEntry) -> None:
         """Record which task was still running when `entry` became due, because it may have caused the late scan."""
         before = self._ran

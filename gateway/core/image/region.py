@@ -255,6 +255,18 @@ class RegionWriter(_Region):
         beat.t_ns, beat.stamps = now_ns, stamps
         return self.counter
 
+    @property
+    def repeats(self) -> bool:
+        """Return whether a publication of the same values stays outside of the memory, so that `skip` can count it."""
+        return self._heartbeat is not None and self._packed and not self._flags
+
+    def skip(self, count: int, times_ns: Sequence[int], last_ns: int) -> None:
+        """Count `count` publications that repeat the values of the last one. The last of them was made at `last_ns`, with the
+        times `times_ns`. `repeats` must be true.
+        """
+        self.counter += count - 1
+        self._repeat(self._stamps(times_ns), last_ns, _UNFLAGGED)
+
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
         """Publish the columns packed in `_body`. `stamps` holds the packed time of each tag, `now_ns` is the heartbeat."""
         self._store(self.counter + 1, stamps, now_ns, flags)
@@ -380,6 +392,11 @@ class RegionReader(_Region):
     def latest(self) -> Snapshot:
         """Return the result of the last `snapshot` without reading again; its counter is 0 before the first."""
         return self._latest
+
+    @property
+    def repeats(self) -> bool:
+        """Return whether the last snapshot has all values that were published since; only counter and times may be newer."""
+        return self._heartbeat is not None and bool(self._columns) and self._latest.counter >= self._heartbeat.in_memory
 
     def snapshot(self) -> Snapshot:
         """Return the latest complete publication. Never waits: after at most `MAX_LOOKS` attempts, it returns the last

@@ -150,6 +150,14 @@ class MailboxPump:
                 self._sending = 1
                 self._boxes.send(now_ns)
 
+    @property
+    def is_idle(self) -> bool:
+        """Return whether there is no message to pass on, to acknowledge or to refuse, so that `tick` does nothing."""
+        driver = self.driver
+        return not (
+            driver.to_acknowledge or driver.consumer.queue or self.inbox.queue or self._taken.of(driver.config.name)
+        )
+
     def _keep(self, all_consumed: bool) -> None:
         """Store whether the message in the inbox was consumed, so that it is not delivered again.
 

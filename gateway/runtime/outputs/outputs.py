@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.devices.driver import DeviceDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.outputs.first_reading import is_known, waits_for_reading
@@ -224,6 +224,22 @@ class OutputWriter:
             if unread.isdisjoint(output.tag for output in group.outputs):
                 self._tick_group(group)
 
+    @property
+    def is_idle(self) -> bool:
+        """Return whether `tick` does nothing, whatever the time is, until a command, a device or a value changes."""
+        return all(output.wanted is None or output.pending or self._rests(output) for output in self.outputs)
+
+    def _rests(self, output: Output) -> bool:
+        """Return whether the device holds the wanted value, and nothing that it reported since then has to be compared."""
+        if output.untouched or output.held != output.wanted:
+            return False
+        current = self._tags.held(output.tag)
+        return current is output.compared or self._says_nothing(output, current)
+
+    def _says_nothing(self, output: Output, current: TagValue) -> bool:
+        """Return whether a reading does not show which value the device holds after the last write."""
+        return current.t_ns <= output.held_since_ns + output.settle_ns or current.quality is Quality.BAD
+
     def _waits_for_reading(self, output: Output) -> bool:
         """Return whether the first write has to wait until the device was read. A value that the device already holds
         is not written again."""
@@ -330,11 +346,7 @@ class OutputWriter:
         current = self._tags.current(output.tag, now_ns)
         if current is output.compared:
             return  # the device has reported nothing new about it
-        if (
-            output.held is None
-            or current.t_ns <= output.held_since_ns + output.settle_ns
-            or current.quality is Quality.BAD
-        ):
+        if output.held is None or self._says_nothing(output, current):
             return
         if int.from_bytes(current.raw) != int.from_bytes(as_sent(output)):
             output.held = None

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from fieldtwin.cli.campaigns.ending import ends_early
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.console import stderr, stdout
 
 if TYPE_CHECKING:
+    from fieldtwin.results.model import ScenarioResult
+    from fieldtwin.run.campaigns.causes import Cause
     from fieldtwin.run.campaigns.many_seeds import SeedResult, Shrunk
+    from fieldtwin.run.campaigns.shrink import FurtherRuns
     from fieldtwin.run.virtual.run import VirtualOptions
 
+FAILED = TypeVar("FAILED")
+SMALL = TypeVar("SMALL")
 SEEDS_SHOWN = 10
+SEARCH_INTERRUPTED = "interrupted: the search for causes has not ended; repeat a seed to search its cause"
 
 
 @dataclass(frozen=True)
 class FoundCause:
-    """Failed seeds with the same cause. `faults` names the faults that suffice. `scenario` is empty if none was written."""
+    """Failed seeds with the same cause. `faults` names the faults that suffice. `scenario` is empty if none was written, and
+    `confirmed` is the result of its run if that fails like the seeds.
+    """
 
     check: str
     faults: str
     seeds: tuple[int, ...]
     scenario: str
     lines: tuple[str, ...]
+    confirmed: ScenarioResult | None = None
 
     @property
     def title(self) -> str:
@@ -48,23 +58,47 @@ def seeds_text(seeds: Sequence[int]) -> str:
     return f"{len(seeds)} failed seed{'s' if len(seeds) > 1 else ''} ({', '.join(map(str, seeds[:SEEDS_SHOWN]))}{more})"
 
 
-def find_causes(options: VirtualOptions, failed: Sequence[SeedResult], seeds: int, jobs: int) -> list[FoundCause]:
-    """Shrink the failed ones of `seeds` seeds by cause, and write a scenario for each cause into the working directory."""
-    from fieldtwin.run.campaigns.causes import shape_text
-    from fieldtwin.run.campaigns.many_seeds import causes_of
+def find_causes(
+    failed: Sequence[int],
+    seeds: int,
+    causes: Callable[[FurtherRuns], Iterable[Cause[FAILED, SMALL]]],
+    written: Callable[[Cause[FAILED, SMALL]], FoundCause],
+) -> tuple[list[FoundCause], bool]:
+    """Return the causes of the failed ones of `seeds` seeds, and whether Ctrl-C ended the search early.
+
+    `written` writes the scenario of a cause and confirms it, as soon as the cause is found.
+    """
     from fieldtwin.run.campaigns.shrink import FurtherRuns
 
-    further = FurtherRuns(seeds)
-    stderr.print(shrinking_text([one.seed for one in failed], further.most), markup=False)
-    causes, left = causes_of(options, failed, jobs, further)
-    found = []
-    for cause in causes:
+    further, found = FurtherRuns(seeds), list[FoundCause]()
+
+    def search() -> None:
+        stderr.print(shrinking_text(failed, further.most), markup=False)
+        found.extend(map(written, causes(further)))
+
+    interrupted = ends_early(search)
+    known = {seed for one in found for seed in one.seeds}
+    left = [seed for seed in failed if seed not in known]
+    if left and not interrupted:
+        stderr.print(not_compared_text(left), markup=False)
+    return found, interrupted
+
+
+def simulated_causes(
+    options: VirtualOptions, failed: Sequence[SeedResult], seeds: int, jobs: int
+) -> tuple[list[FoundCause], bool]:
+    """Return the causes of failed runs of `fieldtwin simulate`, and whether Ctrl-C ended the search early."""
+    from fieldtwin.run.campaigns.causes import shape_text
+    from fieldtwin.run.campaigns.many_seeds import causes_of
+
+    def written(cause: Cause[SeedResult, Shrunk]) -> FoundCause:
         scenario, lines = _written(options, cause.runs[0], cause.small)
         check, alike = next(iter(cause.runs[0].errors), ""), tuple(one.seed for one in cause.runs)
-        found.append(FoundCause(check, shape_text(cause.small.faults), alike, scenario, tuple(lines)))
-    if left:
-        stderr.print(not_compared_text([one.seed for one in left]), markup=False)
-    return found
+        return FoundCause(check, shape_text(cause.small.faults), alike, scenario, tuple(lines))
+
+    return find_causes(
+        [one.seed for one in failed], seeds, lambda further: causes_of(options, failed, jobs, further), written
+    )
 
 
 def shrinking_text(seeds: Sequence[int], most: int) -> str:

@@ -30,8 +30,12 @@ def keep_traces(
     if not hashes:
         return kept, False
     chosen = {seed: hashes[seed] for seed in choose(list(hashes), first)}
-    stderr.print(f"running {seeds_text(list(chosen))} again to keep the traces", soft_wrap=True, markup=False)
-    return kept, ends_early(lambda: fetch(place, work, chosen, Path(), stem, kept))
+
+    def keep() -> None:
+        stderr.print(f"running {seeds_text(list(chosen))} again to keep the traces", soft_wrap=True, markup=False)
+        fetch(place, work, chosen, Path(), stem, kept)
+
+    return kept, ends_early(keep)
 
 
 def show_traces(kept: KeptTraces, failed: Sequence[int], again: Callable[[int], str]) -> None:

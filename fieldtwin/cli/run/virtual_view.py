@@ -14,7 +14,7 @@ from rich.table import Table
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_reports import CampaignReports
-from fieldtwin.cli.campaigns.causes import find_causes, show_causes
+from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, show_causes, simulated_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
 from fieldtwin.cli.run.campaign_progress import CampaignView
@@ -142,10 +142,13 @@ def run_many(
     )
     has_faults = options.random_faults is not None or options.faults or options.fault_file
     finished = [r for r in failed if r.sha256]
-    found = find_causes(options, finished, len(left), jobs) if finished and has_faults and not interrupted else []
-    first = [one.seeds[0] for one in found]
-    hashes = {} if interrupted else {r.seed: r.sha256 for r in finished}
-    traces, _ = keep_traces(place, work, hashes, first, system)
+    found, search_interrupted = list[FoundCause](), False
+    if finished and has_faults and not interrupted:
+        found, search_interrupted = simulated_causes(options, finished, len(left), jobs)
+    ends_now = interrupted or search_interrupted
+    hashes = {} if ends_now else {r.seed: r.sha256 for r in finished}
+    traces, traces_interrupted = keep_traces(place, work, hashes, [one.seeds[0] for one in found], system)
+    ended_early = ends_now or traces_interrupted
     if reports.given:
         recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
         untested_all = untested and len(left) == len(seeds)
@@ -160,20 +163,20 @@ def run_many(
                 "coverage": joined(r.coverage for r in results).counts(),
                 "repeated": repeats.count,
                 "different": sorted(different),
-                "interrupted": interrupted,
+                "interrupted": ended_early,
             },
             sys.stdout,
             indent=2,
         )
         sys.stdout.write("\n")
-        return INTERRUPTED if interrupted else 1 if failed or before or untested or different else 0
+        return INTERRUPTED if ended_early else 1 if failed or before or untested or different else 0
     for result in failed:
         stdout.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
         for error in result.errors:
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
     show_causes(found)
-    if not interrupted:
+    if not ends_now:
         show_traces(traces, [r.seed for r in finished], again)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
@@ -199,6 +202,8 @@ def run_many(
     if interrupted:
         stdout.print(interrupted_text(len(results), len(left)), soft_wrap=True)
         return INTERRUPTED
+    if search_interrupted:
+        stdout.print(SEARCH_INTERRUPTED, soft_wrap=True)
     if untested and not failed and not before and not different:
         stdout.print(
             "no fault took effect in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True
@@ -207,7 +212,7 @@ def run_many(
         return 1
     bad = bool(failed or before or different)
     stdout.print("[bold red]not ok[/bold red]" if bad else "[bold green]ok[/bold green]")
-    return 1 if bad else 0
+    return INTERRUPTED if ended_early else 1 if bad else 0
 
 
 def _result(

@@ -9,19 +9,18 @@ from pathlib import Path
 from rich.markup import escape
 
 from fieldtwin.cli.campaign_options import CampaignOptions
-from fieldtwin.cli.campaigns.causes import not_compared_text, seeds_text, shrinking_text, shrunk_texts
+from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, find_causes, show_causes, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
-from fieldtwin.console import stderr, stdout
+from fieldtwin.console import stdout
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
-from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, scenario_entry, verdict_of, what_tests
-from fieldtwin.run.campaigns.causes import shape_text
+from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, broken_by, scenario_entry, verdict_of, what_tests
+from fieldtwin.run.campaigns.causes import Cause, shape_text
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.ledger import Ledger
-from fieldtwin.run.campaigns.shrink import FurtherRuns
 from fieldtwin.run.campaigns.shrink_failure import ShrunkSeed, causes_of, confirm, scenario_of
 from fieldtwin.run.places.place import Ended, Place, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
@@ -97,17 +96,27 @@ def run_scenario_campaign(
             _show_seed(result, show)
     failed = [result for result in results if result.verdict.bad and result.trace_hash]
     shrinks = bool(failed) and not interrupted and campaign.random_faults is not None
-    found = _find_causes(campaign, failed, len(results), options.jobs or 1, show is not None) if shrinks else []
-    hashes = {} if interrupted else {result.seed or 0: result.trace_hash for result in failed}
-    traces, _ = keep_traces(place, work, hashes, [one.seed or 0 for one in found], case_of(path))
+    found, search_interrupted = list[FoundCause](), False
+    if shrinks:
+        found, search_interrupted = _causes(campaign, failed, len(results), options.jobs or 1)
+    if show is not None:
+        show_causes(found)
+    ends_now = interrupted or search_interrupted
+    hashes = {} if ends_now else {result.seed or 0: result.trace_hash for result in failed}
+    traces, traces_interrupted = keep_traces(place, work, hashes, [one.seeds[0] for one in found], case_of(path))
     if show is not None:
         reproduce = {result.seed or 0: result.reproduce for result in failed}
-        if not interrupted:
+        if not ends_now:
             show_traces(traces, list(reproduce), reproduce.__getitem__)
+        if search_interrupted:
+            stdout.print(SEARCH_INTERRUPTED, soft_wrap=True)
         _show_whole(whole)
     files = traces.plain()
     return CampaignResults(
-        whole, [replace(one, trace_file=files.get(one.seed or 0, "")) for one in results], found, interrupted
+        whole,
+        [replace(one, trace_file=files.get(one.seed or 0, "")) for one in results],
+        [one.confirmed for one in found if one.confirmed is not None],
+        ends_now or traces_interrupted,
     )
 
 
@@ -163,38 +172,31 @@ def _show_whole(whole: ScenarioResult) -> None:
         stdout.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def _find_causes(
-    campaign: Campaign, failed: list[ScenarioResult], seeds: int, jobs: int, told: bool
-) -> list[ScenarioResult]:
-    """Shrink the failed ones of `seeds` seeds by cause, and write a scenario for each cause into the working directory.
+def _causes(
+    campaign: Campaign, failed: Sequence[ScenarioResult], seeds: int, jobs: int
+) -> tuple[list[FoundCause], bool]:
+    """Return the causes of failed runs, each with its scenario, and whether Ctrl-C ended the search early."""
 
-    Each scenario is run to confirm it. Return the results of the confirmed scenarios. `told`: print the findings.
-    """
-    further = FurtherRuns(seeds)
-    stderr.print(shrinking_text(_seeds(failed), further.most), markup=False)
-    found, left = causes_of(campaign, failed, jobs, further)
-    confirmed = []
-    for cause in found:
-        lines, result = _written(campaign, cause.small)
-        confirmed += [result] if result is not None else []
-        if told:
-            title = f"{shape_text(cause.small.faults)}: {seeds_text(_seeds(cause.runs))}"
-            stdout.print(f"[bold]cause[/bold]  {escape(title)}", soft_wrap=True, highlight=False)
-        for line in lines if told else ():
-            stdout.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
-    if left:
-        stderr.print(not_compared_text(_seeds(left)), markup=False)
-    return confirmed
+    def written(cause: Cause[ScenarioResult, ShrunkSeed]) -> FoundCause:
+        scenario, lines, confirmed = _written(campaign, cause.small)
+        check = next(iter(broken_by(cause.runs[0])), "")
+        return FoundCause(
+            check, shape_text(cause.small.faults), tuple(_seeds(cause.runs)), scenario, tuple(lines), confirmed
+        )
+
+    return find_causes(_seeds(failed), seeds, lambda further: causes_of(campaign, failed, jobs, further), written)
 
 
 def _seeds(results: Sequence[ScenarioResult]) -> list[int]:
     return [result.seed for result in results if result.seed is not None]
 
 
-def _written(campaign: Campaign, small: ShrunkSeed) -> tuple[list[str], ScenarioResult | None]:
-    """Write the shrunk schedule as a scenario and run it. Return sentences about it, and its result if it is confirmed."""
+def _written(campaign: Campaign, small: ShrunkSeed) -> tuple[str, list[str], ScenarioResult | None]:
+    """Write the shrunk schedule as a scenario and run it. Return its path, sentences about it, and its result if it is
+    confirmed.
+    """
     if not small.result.verdict.bad:
-        return [f"seed {small.seed} does not fail again with the same faults, so no scenario is written"], None
+        return "", [f"seed {small.seed} does not fail again with the same faults, so no scenario is written"], None
     path = Path(f"{case_of(campaign.path)}-seed{small.seed}{SUFFIX}")
     write_text(path, scenario_of(campaign, small, Path()))
     confirmed = confirm(path, campaign, small)
@@ -205,4 +207,4 @@ def _written(campaign: Campaign, small: ShrunkSeed) -> tuple[list[str], Scenario
     lines.append(
         CONFIRMED if confirmed else f"not confirmed: this scenario has a different result; use {small.result.reproduce}"
     )
-    return lines, confirmed
+    return str(path), lines, confirmed

@@ -6,7 +6,7 @@ kinds and targets of the shrunk schedule, which one further run shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -34,23 +34,23 @@ def causes(
     shrink: Callable[[FAILED], SMALL],
     suffices: Callable[[SMALL, Sequence[FAILED]], Sequence[bool]],
     further: FurtherRuns,
-) -> tuple[list[Cause[FAILED, SMALL]], list[FAILED]]:
-    """Return the causes of the failed runs, and the runs that the limits `MOST_CAUSES` and `further` left without a cause.
+) -> Iterator[Cause[FAILED, SMALL]]:
+    """Yield each cause of the failed runs as soon as it is found. The limits `MOST_CAUSES` and `further` leave runs without one.
 
     `suffices` states for each of several runs whether it fails in the same way with its faults of the shape of a shrunk schedule.
     `shrink` counts its runs in `further`.
     """
-    left, found = list(failed), list[Cause[FAILED, SMALL]]()
-    while left and len(found) < MOST_CAUSES and further.left:
+    left, found = list(failed), 0
+    while left and found < MOST_CAUSES and further.left:
         first, *others = left
         small = shrink(first)
         alike = [n for n, one in enumerate(others) if same_failure(errors_of(first), errors_of(one))]
         alike = alike[: further.left]
         further.used(len(alike))
         same = {n for n, yes in zip(alike, suffices(small, [others[n] for n in alike]), strict=True) if yes}
-        found.append(Cause(small, [first, *(one for n, one in enumerate(others) if n in same)]))
+        found += 1
         left = [one for n, one in enumerate(others) if n not in same]
-    return found, left
+        yield Cause(small, [first, *(one for n, one in enumerate(others) if n in same)])
 
 
 def shape_of(faults: Iterable[Mapping[str, Any]]) -> frozenset[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -138,8 +138,8 @@ def _with_faults(options: VirtualOptions, seed: int, faults: Sequence[dict[str, 
 
 def causes_of(
     options: VirtualOptions, failed: Sequence[SeedResult], jobs: int, further: FurtherRuns
-) -> tuple[list[Cause[SeedResult, Shrunk]], list[SeedResult]]:
-    """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
+) -> Iterator[Cause[SeedResult, Shrunk]]:
+    """Yield the causes of the failed runs (see `fieldtwin.run.campaigns.causes.causes`)."""
     return causes(
         failed,
         lambda one: one.errors,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,8 +49,8 @@ def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int, further: F
 
 def causes_of(
     campaign: Campaign, failed: Sequence[ScenarioResult], jobs: int, further: FurtherRuns
-) -> tuple[list[Cause[ScenarioResult, ShrunkSeed]], list[ScenarioResult]]:
-    """Return the causes of the failed runs, and the runs that were not compared (see `fieldtwin.run.campaigns.causes.causes`)."""
+) -> Iterator[Cause[ScenarioResult, ShrunkSeed]]:
+    """Yield the causes of the failed runs (see `fieldtwin.run.campaigns.causes.causes`)."""
     return causes(
         failed,
         broken_by,

@@ -17,7 +17,7 @@ from fieldtwin.run.places.unit_processes import UnitLost, UnitProcesses
 
 @dataclass(frozen=True, slots=True)
 class LocalPlace:
-    """`jobs` processes of this computer; with one job, this process itself.
+    """`jobs` processes of this computer. One job has a process too, because only a process can be ended at the time limit.
 
     No unit is repeated: all processes have the same interpreter and the same packages. At most two units for each process are
     in progress.
@@ -34,10 +34,6 @@ class LocalPlace:
     def run(
         self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]
     ) -> None:
-        if self.jobs <= 1:
-            for seed in seeds:
-                on_ended(Ended(seed, work.run(seed)))
-            return
         processes = UnitProcesses(pickle.dumps(work), Path.cwd(), unit_limit_s(work))
         pool = ThreadPoolExecutor(self.jobs)  # a process ends with the thread that started it, so the threads stay
         try:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,14 +48,15 @@ Run = tuple[str, frozenset[str]]
 
 def found(runs: Sequence[Run], seeds: int = 1000) -> tuple[list[tuple[str, int]], int]:
     """Return the shape and the number of runs of each cause, and the number of runs without a cause."""
-    grouped, left = causes(
+    grouped = causes(
         runs,
         lambda run: [run[0]],
         lambda run: min(run[1]),
         lambda small, others: [small in run[1] for run in others],
         FurtherRuns(seeds),
     )
-    return [(cause.small, len(cause.runs)) for cause in grouped], len(left)
+    counts = [(cause.small, len(cause.runs)) for cause in grouped]
+    return counts, len(runs) - sum(count for _, count in counts)
 
 
 def test_runs_with_the_same_check_and_shape_have_one_cause() -> None:
@@ -115,6 +120,33 @@ def test_processes_find_the_same_faults_as_one() -> None:
     alone = shrunk_run(range(12), echo, {3, 8}.issubset)
     assert shrunk_run(range(12), echo, {3, 8}.issubset, jobs=2) == alone
     assert alone == ([3, 8], True, frozenset({3, 8}), frozenset())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_ctrl_c_during_the_search_ends_the_campaign_with_the_failures_that_are_known(tmp_path: Path, jobs: str) -> None:
+    write_plant(tmp_path, PLANT)
+    (tmp_path / "pump.st").write_text(CRASHES_ON_BAD_LEVEL)
+    words = ["plant.yaml", "--for", "1h", "--faults", "random", "--fault-kinds", "silence", "--seeds", "1..2"]
+    campaign = subprocess.Popen(
+        [sys.executable, "-m", "fieldtwin", "simulate", *words, "--jobs", jobs],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    assert campaign.stdout is not None
+    said = ""
+    while "searching the causes of 2 failed seeds" not in said:
+        said += (line := campaign.stdout.readline())
+        assert line, said
+    os.killpg(campaign.pid, signal.SIGINT)
+    rest, _ = campaign.communicate(timeout=120)  # it ends when the last process with this output has ended
+    assert campaign.returncode == 130, rest
+    assert "seeds         2, 2 failed" in rest
+    assert "interrupted: the search for causes has not ended" in rest
+    assert "Traceback" not in rest
 
 
 @pytest.mark.long

@@ -152,6 +152,8 @@ class ScenarioResult:
     """Lines about the traffic on the bus: before the failed check, or if the traffic is not in `trace`."""
     system: System | None = None
     """The system that it ran against; None: the system of its report."""
+    coverage: str = ""
+    """The situations that a run of a campaign reached: the text of a `fieldtwin.run.campaigns.coverage.Coverage`."""
 
     @property
     def why(self) -> str:

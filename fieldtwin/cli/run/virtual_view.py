@@ -193,7 +193,9 @@ def run_many(
         failures = (
             f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
         )
-        table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{failures}")
+        table.add_row(
+            "the ledger", f"{shown_time(ledger.hours * 3600)} of virtual time in {len(ledger.entries)} runs{failures}"
+        )
     stdout.print(table)
     for seed in before:
         stdout.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)

@@ -8,19 +8,25 @@ from pathlib import Path
 
 from rich.markup import escape
 
+from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, find_causes, show_causes, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
+from fieldtwin.cli.run.virtual_view import coverage_text
 from fieldtwin.console import stdout
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.reports.campaign.model import CampaignResult
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, broken_by, scenario_entry, verdict_of, what_tests
 from fieldtwin.run.campaigns.causes import Cause, shape_text
 from fieldtwin.run.campaigns.confirming import CONFIRMED
-from fieldtwin.run.campaigns.ledger import Ledger
+from fieldtwin.run.campaigns.coverage import Coverage
+from fieldtwin.run.campaigns.ledger import Ledger, LedgerEntry
+from fieldtwin.run.campaigns.merging import Runs
+from fieldtwin.run.campaigns.reporting import campaign_of
 from fieldtwin.run.campaigns.shrink_failure import ShrunkSeed, causes_of, confirm, scenario_of
 from fieldtwin.run.places.place import Ended, Place, Repeats
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
@@ -35,13 +41,14 @@ INTERRUPTED_CHECK = "interrupted"
 class CampaignResults:
     """The results of the whole campaign, of each seed that ran, and of the scenario that the first failing seed was shrunk to.
 
-    `interrupted`: Ctrl-C ended the campaign early.
+    `interrupted`: Ctrl-C ended the campaign early. `report`: the campaign for its HTML report, without waivers.
     """
 
     whole: ScenarioResult
     seeds: list[ScenarioResult]
     shrunk: list[ScenarioResult]
     interrupted: bool
+    report: CampaignResult
 
     @property
     def all(self) -> list[ScenarioResult]:
@@ -58,19 +65,20 @@ def run_scenario_campaign(
     """Run a scenario with each seed that the ledger does not have yet. `show` None: nothing is printed to stdout."""
     seeds = options.chosen()
     campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
-    work, ledger, what = ScenarioRuns(campaign), None, ""
-    if options.ledger is not None:
-        ledger, what = Ledger(options.ledger), what_tests(campaign)
+    work, what = ScenarioRuns(campaign), what_tests(campaign)
+    ledger = Ledger(options.ledger) if options.ledger is not None else None
     before = ledger.recorded(what, seeds) if ledger is not None else []
     done = {entry.seed for entry in before}
     left = [seed for seed in seeds if seed not in done]
     campaign.check()
     repeats = Repeats(work)
     results: list[ScenarioResult] = []
+    entries: list[LedgerEntry] = []
 
     def record(one: Ended[ScenarioResult]) -> None:
+        entries.append(scenario_entry(what, one, WallClock().utc_ns() / 1e9))
         if ledger is not None:
-            ledger.record(scenario_entry(what, one, WallClock().utc_ns() / 1e9))
+            ledger.record(entries[-1])
 
     with CampaignView(case_of(path), len(left)) as view:
 
@@ -79,7 +87,7 @@ def run_scenario_campaign(
             record(one)
             passed = one.result.verdict is Verdict.PASSED
             cause = None if passed else one.result.why or one.result.verdict.value
-            view.ended(one.seed, one.result.simulated_s / 3600, cause)
+            view.ended(one.seed, one.result.simulated_s / 3600, cause, one.result.coverage)
 
         interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
     results.sort(key=lambda result: result.seed or 0)
@@ -112,11 +120,24 @@ def run_scenario_campaign(
             stdout.print(SEARCH_INTERRUPTED, soft_wrap=True)
         _show_whole(whole)
     files = traces.plain()
+    report = campaign_of(
+        Runs(what, __version__, tuple(entries if ledger is None else ledger.entries_of(what, seeds))),
+        frozenset(seeds),
+        [options.ledger.name] if options.ledger is not None else [],
+        whole.reproduce,
+        traces=files,
+        inconclusive=[
+            f"{check.number}: {check.text}: {check.got}"
+            for check in whole.checks
+            if check.verdict is Verdict.INCONCLUSIVE
+        ],
+    )
     return CampaignResults(
         whole,
         [replace(one, trace_file=files.get(one.seed or 0, "")) for one in results],
         [one.confirmed for one in found if one.confirmed is not None],
         ends_now or traces_interrupted,
+        report,
     )
 
 
@@ -170,6 +191,7 @@ def _show_whole(whole: ScenarioResult) -> None:
     for check in whole.checks:
         text = f"  {check.number}: {check.text}: {check.got}"
         stdout.print(text, soft_wrap=True, markup=False, highlight=False)
+    stdout.print(f"  coverage: {coverage_text(Coverage.parse(whole.coverage))}", soft_wrap=True, highlight=False)
 
 
 def _causes(

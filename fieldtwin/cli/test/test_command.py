@@ -8,7 +8,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
+from fieldtwin.cli.test.plain_result import plain_result
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
 from fieldtwin.conformance.core.case import Impact
@@ -33,6 +34,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.language.file_name import SUFFIX
 
 if TYPE_CHECKING:
+    from fieldtwin.reports.campaign.model import CampaignResult
     from fieldtwin.results.model import Machine, ScenarioResult, SystemKey
     from fieldtwin.twin.site.system import System
 
@@ -172,6 +174,7 @@ def command(
     shown = Progress(Path(progress)) if progress else None
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
+    campaigns: list[CampaignResult] = []
     interrupted = False
     with campaign.place() as place:
         for scenario, file in zip(scenarios, events, strict=True):
@@ -182,6 +185,7 @@ def command(
                 today = datetime.now(UTC).date()
                 judged = [waive(replace(one, system=scenario.system), waived, today) for one in found.all]
                 results += judged
+                campaigns.append(found.report)
                 seeds += judged[1 : 1 + len(found.seeds)]
                 interrupted = found.interrupted
                 if interrupted:
@@ -194,7 +198,8 @@ def command(
                 _show(results[-1])
     if shown is not None:
         shown.close()
-    machines = _machines([one.system for one in scenarios]) if html else {}
+    draws = html is not None and not campaign.seeds
+    machines = _machines([one.system for one in scenarios]) if draws else {}
     report = Report(
         "scenarios",
         results,
@@ -203,7 +208,7 @@ def command(
         seed,
         reproduce=shlex.join(["fieldtwin", *sys.argv[1:]]),
         versions={"fieldtwin": __version__},
-        machines=machines[key_of(scenarios[0].system)] if html else (),
+        machines=machines[key_of(scenarios[0].system)] if draws else (),
         machines_of=machines,
         served=(),
     )
@@ -212,15 +217,19 @@ def command(
 
         write_junit(report, junit.junit, Flavour(junit.junit_flavour))
     if html:
+        from fieldtwin.reports.campaign.html import write_campaign
         from fieldtwin.reports.run.html import write_html
         from fieldtwin.results.trace_about import note_report
 
-        write_html(report, Path(html))
+        if campaign.seeds:
+            write_campaign(campaigns, Path(html))
+        else:
+            write_html(report, Path(html))
         for result in results:
             if result.trace_file:
                 note_report(Path(result.trace_file), Path(html))
     if as_json:
-        json.dump([_plain(result) for result in results], sys.stdout, indent=2)
+        json.dump([plain_result(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
@@ -351,44 +360,6 @@ def _tell_how_to_see_more(results: Sequence[ScenarioResult]) -> None:
     else:
         return  # a second run in real time has different events
     stderr.print(text, soft_wrap=True, markup=False, highlight=False)
-
-
-def _plain(result: object) -> dict[str, object]:
-    from fieldtwin.results.model import ScenarioResult
-
-    assert isinstance(result, ScenarioResult)
-    return {
-        "name": result.name,
-        "case": result.case,
-        "role": result.role,
-        "impact": result.impact,
-        "verdict": result.verdict.value,
-        "seed": result.seed,
-        "target": result.target,
-        "reason": result.reason,
-        "attempts": result.attempts,
-        "inconclusive_attempts": list(result.earlier),
-        "requirements": list(result.requirements),
-        "simulated_s": result.simulated_s,
-        "trace": result.trace_hash,
-        "trace_file": result.trace_file,
-        "reproduce": result.reproduce,
-        "faults": [asdict(fault) for fault in result.faults],
-        "checks": [
-            {
-                "number": c.number,
-                "text": c.text,
-                "verdict": c.verdict.value,
-                "t_s": None if c.t_ns is None else c.t_ns / 1e9,
-                "expected": c.expected,
-                "got": c.got,
-                "reason": c.reason,
-                "where": c.where,
-            }
-            for c in result.checks
-        ],
-        "on_the_wire": list(result.evidence),
-    }
 
 
 def _machines(systems: list[System]) -> dict[SystemKey, tuple[Machine, ...]]:

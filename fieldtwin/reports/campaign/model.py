@@ -51,8 +51,9 @@ class CampaignResult:
     """The runs of one campaign, ordered by seed, each seed once. `what` is the fingerprint of files and options.
 
     `missing`: seeds of the campaign without a run. `different`: seeds with several results. `untested`: faults were chosen, and
-    none took effect. `coverage`: virtual hours, rising, each with the number of different situations that the runs until then
-    reached; empty if it is not known. `reproduce`: the command of the campaign, empty if it is not known.
+    none took effect. `inconclusive`: further reasons why passed runs prove nothing. `coverage`: virtual hours, rising, each with
+    the number of different situations that the runs until then reached; empty if it is not known. `reproduce`: the command of the
+    campaign, empty if it is not known.
     """
 
     system: str
@@ -66,6 +67,7 @@ class CampaignResult:
     ledgers: Sequence[str] = ()
     reproduce: str = ""
     coverage: Sequence[tuple[float, int]] = ()
+    inconclusive: Sequence[str] = ()
 
     @property
     def failed(self) -> list[CampaignRun]:
@@ -85,4 +87,5 @@ class CampaignResult:
         """Return FAILED if a run failed or was not reproduced, INCONCLUSIVE if something was not tested, else PASSED."""
         if self.failed or self.different:
             return Verdict.FAILED
-        return Verdict.INCONCLUSIVE if self.missing or self.untested or not self.runs else Verdict.PASSED
+        untested = self.missing or self.untested or self.inconclusive or not self.runs
+        return Verdict.INCONCLUSIVE if untested else Verdict.PASSED

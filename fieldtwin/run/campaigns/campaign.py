@@ -16,6 +16,8 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.run.campaigns.coverage import joined
+from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
 from fieldtwin.run.campaigns.ledger import LedgerEntry
 from fieldtwin.run.campaigns.many_seeds import fingerprint
 from fieldtwin.run.places.bundle import files_of, profile_folders, relative
@@ -111,7 +113,9 @@ def run_seed(
     if campaign.random_faults is not None:
         chosen = schedule(campaign, scenario, seed) if faults is None else tuple(faults)
         by_chance = ByChance(chosen, campaign.length_s(scenario))
-    result = run_virtual(scenario, seed, trace, by_chance, most_trace_bytes=most_trace_bytes)
+    seen = CoverageCollector()
+    result = run_virtual(scenario, seed, trace, by_chance, most_trace_bytes=most_trace_bytes, watch=seen.listen)
+    result = replace(result, coverage=seen.coverage.text())
     if by_chance is None:
         return result
     return replace(result, reproduce=reproduce(scenario, *campaign.words, "--seeds", str(seed)))
@@ -185,6 +189,7 @@ def scenario_entry(what: str, ended: Ended[ScenarioResult], ended_s: float) -> L
         ended_s=round(ended_s, 3),
         took_s=round(result.took_s, 3),
         worker=ended.worker,
+        coverage=result.coverage,
         verdict=result.verdict.value,
         judged=tuple(check.number for check in checks if not check.number.isdigit()),
         struck=sum(fault.struck for fault in result.faults),
@@ -219,6 +224,7 @@ def verdict_of(
         reproduce=reproduce(scenario, *campaign.words, *chosen),
         simulated_s=sum(result.simulated_s for result in results),
         took_s=sum(result.took_s for result in results),
+        coverage=joined([*(one.coverage for one in results), *(one.coverage for one in before)]).text(),
     )
 
 

@@ -26,9 +26,10 @@ def campaign_of(
     untested: bool = False,
     with_coverage: bool = True,
     traces: Mapping[int, str] = MappingProxyType({}),
+    inconclusive: Sequence[str] = (),
 ) -> CampaignResult:
     """Return the result of a campaign. `expected`: the seeds that it should have, empty if they are not known. `traces`: the
-    files of the traces of failed runs, by seed.
+    files of the traces of failed runs, by seed. `inconclusive`: reasons why passed runs prove nothing.
 
     Raises `FileInvalid` for an invalid coverage. Without coverage a result of 100,000 runs needs a tenth of the time.
     """
@@ -49,6 +50,7 @@ def campaign_of(
         ledgers,
         reproduce,
         coverage_of(of_seed.values()) if with_coverage else (),
+        inconclusive,
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,9 +39,11 @@ def run_virtual(
     by_chance: ByChance | None = None,
     progress: Progress | None = None,
     most_trace_bytes: int | None = None,
+    watch: Callable[[Trace], None] | None = None,
 ) -> ScenarioResult:
     """Run the scenario. `seed` takes precedence over the scenario's own seed and the prototype file's. `by_chance`: random
-    faults of a campaign. `most_trace_bytes` limits the trace file (see `open_sink`).
+    faults of a campaign. `most_trace_bytes` limits the trace file (see `open_sink`). `watch` gets the trace before its
+    first event, to listen to it.
     """
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
@@ -59,6 +62,8 @@ def run_virtual(
         sink = open_sink(trace_file, most_trace_bytes) if trace_file is not None else None
         trace = Trace(sink=sink)
         trace.listen(collector.feed)
+        if watch is not None:
+            watch(trace)
         if progress is not None:
             progress.begin(scenario, "virtual", trace)
 

@@ -71,10 +71,18 @@ def test_each_failed_run_of_a_system_leaves_its_trace(site: Path, jobs: str) -> 
 @pytest.mark.long
 def test_each_failed_run_of_a_scenario_leaves_its_trace(site: Path) -> None:
     words = ["test", "low.scenario.yaml", "--seeds", "1..2"]
-    found = json.loads(invoke(*words, "--json").stdout)
+    found = json.loads(invoke(*words, "--json", "--html", "c.html").stdout)
+    page = (site / "c.html").read_text()
+    assert "<h1>Campaign of low</h1>" in page
+    assert "low-seed2.jsonl" in page
+    assert "different situations" in page
+    assert found[0]["coverage"] == found[1]["coverage"] == found[2]["coverage"]
+    assert sum(found[0]["coverage"].values()) > 0
     assert [one["trace_file"] for one in found] == ["", "low-seed1.jsonl", "low-seed2.jsonl"]
     assert read_trace((site / "low-seed2.jsonl").read_bytes().splitlines())
-    assert "trace of seed 2: low-seed2.jsonl" in invoke(*words).stdout
+    said = invoke(*words).stdout
+    assert "trace of seed 2: low-seed2.jsonl" in said
+    assert f"coverage: {sum(found[0]['coverage'].values())} different situations" in said
 
 
 @pytest.mark.long

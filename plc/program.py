@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from types import CodeType
@@ -28,6 +28,7 @@ import msgspec
 from fieldtwin.gateway.core.errors import Blame, Bug, FieldtwinError
 from fieldtwin.gateway.core.image.image import Message, TagKind
 from fieldtwin.gateway.core.values import Scalar, TagValue
+from fieldtwin.plc.blocks import FunctionBlock
 
 MESSAGE_BYTES = 256
 MESSAGE_DEPTH = 16
@@ -189,6 +190,18 @@ class Outbox:
 
 
 @dataclass(frozen=True, slots=True)
+class InternalVariable:
+    """A variable of a program that is not a tag, as users see it: a member of a block, an array or its element, a string.
+
+    `name` is the path inside the program, such as ``delay.ET`` or ``levels[3]``; `type` the IEC type; a time is a number of ns.
+    """
+
+    name: str
+    type: str
+    value: Scalar | str
+
+
+@dataclass(frozen=True, slots=True)
 class SourceLine:
     """A line of a program's source.
 
@@ -292,6 +305,24 @@ class Program(ABC):
         """Set a variable from outside the logic, for example for a force."""
         self.__dict__[name] = value
         self._assigned.pop(name, None)
+
+    def internal_names(self) -> Iterator[str]:
+        """Return the paths of the variables that are not tags. In this class: the inputs and outputs of function blocks that are
+        attributes of the program.
+        """
+        for name, block in vars(self).items():
+            if isinstance(block, FunctionBlock):
+                yield from (f"{name}.{member}" for member, _, _ in block.members())
+
+    def internal(self, path: str) -> InternalVariable | None:
+        """Return a variable that is not a tag, by its path; None if no block has it."""
+        name, _, wanted = path.partition(".")
+        block = vars(self).get(name)
+        if isinstance(block, FunctionBlock):
+            for member, kind, value in block.members():
+                if member == wanted:
+                    return InternalVariable(path, kind, value)
+        return None
 
     def retained(self) -> dict[str, Any]:
         """Return the values that a warm start needs, by variable: numbers, strings, and lists and maps of them."""

@@ -13,6 +13,7 @@ tag or the program that contains it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
@@ -32,6 +33,11 @@ class FunctionBlock(ABC):
     @abstractmethod
     def execute(self, now_ns: int) -> None:
         """Execute one call at `now_ns`: set the outputs from the inputs and the state."""
+
+    def members(self) -> Iterator[tuple[str, str, Any]]:
+        """Return name, IEC type and present value of each input, then of each output."""
+        for name, kind in (self.inputs | self.outputs).items():
+            yield name, kind, getattr(self, name)
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
         """Return the state on which the next calls depend, as a hashable value.

@@ -154,7 +154,7 @@ class PlcProcess:
 
     async def _tags(self, args: dict[str, Any]) -> dict[str, Any]:
         if "tags" not in args:
-            return {"names": self._view.names()}
+            return {"names": self._view.names(), "internal": self._view.internal_names()}
         names = args["tags"]
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise UsageError("which tags", expected='a list such as ["ctd.pressure"]', got=repr(names))

@@ -1,6 +1,7 @@
-"""The process image as users see it.
+"""The process image as users see it, and the variables of programs that are not tags.
 
-Each tag has value, quality, source time, age, unit, limits, force, and the value that programs see.
+Each tag has value, quality, source time, age, unit, limits, force, and the value that programs see. A variable that is not a
+tag, such as ``control.delay.ET``, has the same keys, the side ``internal``, its IEC type, and no quality.
 
 The values are read between scans, from the image itself, so that they are those that the gateway reads. This module must not
 depend on how requests arrive, and must not change anything.
@@ -11,18 +12,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
+from itertools import islice
 from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.cycle.forces import Force
+from fieldtwin.plc.program import InternalVariable
 from fieldtwin.plc.runtime.runner import TaskRunner
 
 MAX_AT_ONCE = 64
 """The largest number of tags in one answer: a request between two scans must not delay the next one. Such an answer takes about
 1 ms, including the encoding.
 """
+
+MAX_INTERNAL = 1_000
+"""The largest number of variables that are not tags in the list of names, for each program. Every other one can be named."""
 
 
 def matches(tag: str, pattern: str) -> bool:
@@ -41,6 +47,21 @@ class TagView:
     def names(self) -> list[str]:
         """Return every tag once, inputs first."""
         return list(self._specs[INPUTS] | self._specs[OUTPUTS])
+
+    def internal_names(self) -> list[str]:
+        """Return the variables that are not tags, at most `MAX_INTERNAL` of each program."""
+        return [
+            f"{bound.name}.{path}"
+            for bound in self._runner.programs
+            for path in islice(bound.program.internal_names(), MAX_INTERNAL)
+        ]
+
+    def _internal(self, name: str) -> dict[str, Any] | None:
+        program, _, path = name.partition(".")
+        for bound in self._runner.programs:
+            if bound.name == program and (found := bound.program.internal(path)) is not None:
+                return _internal_row(name, found)
+        return None
 
     def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
         """Return the tags as data for JSON, in the order of `names`. A tag that is in both regions has two entries, the input
@@ -67,8 +88,30 @@ class TagView:
                 )
                 rows.append({**row, "side": "output", "seen": {}})
             if not row:
-                raise UsageError(f"no tag {name!r} in the process image", expected="one that `image` lists")
+                row = self._internal(name) or {}
+                if not row:
+                    raise UsageError(f"no tag or variable {name!r}", expected="one that `fieldtwin plc watch` lists")
+                rows.append(row)
         return rows
+
+
+def _internal_row(name: str, found: InternalVariable) -> dict[str, Any]:
+    return {
+        "tag": name,
+        "kind": found.type,
+        "value": found.value,
+        "quality": None,
+        "reason": "none",
+        "age_s": None,
+        "time": None,
+        "unit": "ns" if found.type in ("TIME", "LTIME") else "",
+        "words": {},
+        "value_names": {},
+        "limits": None,
+        "forced": None,
+        "side": "internal",
+        "seen": {},
+    }
 
 
 def _row(spec: TagSpec, value: TagValue, force: Force | None, now_ns: int, utc_ns: int) -> dict[str, Any]:

@@ -8,19 +8,29 @@ their two's complement.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Scalar
-from fieldtwin.plc.program import Program, Role, ScanInfo, SourceLine, Variable, message_input, message_output
+from fieldtwin.plc.program import (
+    InternalVariable,
+    Program,
+    Role,
+    ScanInfo,
+    SourceLine,
+    Variable,
+    message_input,
+    message_output,
+)
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 
@@ -32,6 +42,7 @@ class StProgram(Program):
 
     st_unit: CompiledUnit
     st_declared: CompiledProgram
+    st_inspection: Inspection
 
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
@@ -100,6 +111,12 @@ class StProgram(Program):
         except values.LogicError as e:
             raise UsageError(f"{name} cannot be forced to that", expected=e.expected, got=repr(value)) from e
 
+    def internal_names(self) -> Iterator[str]:
+        return self.st_inspection.names(self.st_body)
+
+    def internal(self, path: str) -> InternalVariable | None:
+        return self.st_inspection.find(self.st_body, path)
+
     # -- retained variables -----------------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
@@ -161,6 +178,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     body: dict[str, Any] = {
         "st_unit": unit,
         "st_declared": found,
+        "st_inspection": Inspection(unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None]),
         "source_path": found.path,
         "source_files": files,
         "source_warnings": tuple(map(str, unit.warnings)),

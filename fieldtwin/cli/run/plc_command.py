@@ -127,7 +127,9 @@ def status(instance: str, as_json: bool) -> int:
 def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
     """Show live values of TAGS (default: all) with unit, limits, quality, age and forces. Ctrl-C ends it.
 
-    Each TAG is a tag, a device or program (all of its tags), or a pattern such as '*.state'.
+    Each TAG is a tag, a device or program (all of its tags), or a pattern such as '*.state'. Variables of programs
+    that are not tags are shown with their type: members of function blocks and structures, arrays and strings,
+    such as control.delay.ET. Name an element of an array as in the source: 'control.levels[3]'.
     """
     import asyncio
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtwin.console import stderr, stdout
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.prove import Proof, SearchResult
@@ -30,6 +31,7 @@ _WHOLE_TYPES = {
     for span in ((0, 2**bits - 1), (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1), (0, 2.0**bits))
 }
 
+_SIDES = ("input", "output", "internal")
 AT_TIMEOUT = {
     "wait": "reported as an error after {:g} s",
     "stop": "the PLC stops after {:g} s",
@@ -42,15 +44,18 @@ Row = dict[str, Any]
 
 async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[str]:
     """Return the names that match. Raises `UsageError` for a pattern without a match."""
-    names: list[str] = (await client.call("image"))["names"]
+    answer = await client.call("image")
+    names: list[str] = [*answer["names"], *answer["internal"]]
+    elements = [pattern for pattern in patterns if "[" in pattern]  # not listed, and no pattern
     for pattern in patterns:
-        if not any(matches(name, pattern) for name in names):
+        if pattern not in elements and not any(matches(name, pattern) for name in names):
             if pattern in running_instances():
                 raise UsageError(
                     f"{pattern!r} is a running instance, not a tag", expected=f"--instance {pattern}, and tags"
                 )
             raise UsageError(f"no tag {pattern!r}", expected=", ".join(names[:12]) + (", ..." if names[12:] else ""))
-    return [name for name in names if not patterns or any(matches(name, p) for p in patterns)]
+    listed = [name for name in names if not patterns or any(matches(name, p) for p in patterns)]
+    return listed + [element for element in elements if element not in listed]
 
 
 async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
@@ -60,7 +65,7 @@ async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
     rows: list[Row] = []
     for at in range(0, len(names), MAX_AT_ONCE):
         rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
-    return sorted(rows, key=lambda row: row["side"])  # names in the same region keep their order
+    return sorted(rows, key=lambda row: _SIDES.index(row["side"]))  # names of the same side keep their order
 
 
 async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
@@ -90,15 +95,16 @@ def tag_table(rows: list[Row]) -> Table:
         table.add_column(name, justify=justify, no_wrap=name not in ("quality", "limits"))
     for row in rows:
         forced = row["forced"]
+        is_time = row["unit"] == "ns" and row["value"] is not None
         style = "yellow" if forced else "red" if row["quality"] == "bad" else ""
         cells = {
             "tag": row["tag"],
-            "value": _named(row, row["value"]),
-            "unit": row["unit"],
+            "value": _named(row, row["value"] / NS_PER_S if is_time else row["value"]),
+            "unit": "s" if is_time else row["unit"],
             "limits": _limits(row["limits"]),
             "quality": _quality(row),
             "age": "-" if row["age_s"] is None else _age(row["age_s"] * 1000),
-            "": f"FORCED {row['side']}" if forced else row["side"],
+            "": f"FORCED {row['side']}" if forced else row["kind"] if row["side"] == "internal" else row["side"],
         }
         table.add_row(*(Text(cells[name]) for name in names), style=style)
     return table
@@ -120,7 +126,7 @@ def _limits(limits: list[float] | None) -> str:
 
 def _quality(row: Row) -> str:
     """Return the quality with its reason, and the substitute value that programs see."""
-    text = str(row["quality"]) + ("" if row["reason"] == "none" else f": {row['reason']}")
+    text = str(row["quality"] or "") + ("" if row["reason"] == "none" else f": {row['reason']}")
     for variable, seen in row["seen"].items():
         text += f"; {variable} sees {value_text(seen['value'])} ({seen['quality']})"
     return text

@@ -40,6 +40,15 @@ async def get_transitions(request: Request) -> dict[str, list[StateChange]]:
     return {name: list(changes) for name, changes in (await attached(request)).state_history.changes.items()}
 
 
+async def get_internal_variables(request: Request) -> Any:
+    """Return the variables of programs that are not tags: at most 256 of them, and the number of the others as `more`.
+
+    The PLC answers between two scans, 64 variables at a time.
+    """
+    attachment = await attached(request)
+    return await attachment.read_internal_variables()
+
+
 async def get_why(request: Request) -> Any:
     """Return which program last changed a tag, when, and what it had read. `now_ns` is the time to which the ages refer."""
     attachment = await attached(request)
@@ -95,6 +104,7 @@ OPERATIONS = (
     Operation("GET", PLC, get_plc, "Read the PLC's status and variables"),
     Operation("GET", f"{PLC}/programs", get_programs, "Describe the programs: variables, states, transitions, source"),
     Operation("GET", f"{PLC}/transitions", get_transitions, "Read the last transitions of the programs"),
+    Operation("GET", f"{PLC}/internal", get_internal_variables, "Read the variables of programs that are not tags"),
     Operation("GET", PLC + "/why/{tag}", get_why, "Explain the value of a tag"),
     Operation("POST", f"{PLC}/forces", force_tag, "Force a tag", body=Force, changes=True),
     Operation("DELETE", f"{PLC}/forces", unforce_all, "Remove all forces", changes=True),

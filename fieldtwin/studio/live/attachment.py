@@ -23,6 +23,7 @@ from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, TagStatus
 from fieldtwin.plc.runtime.about import STATE
+from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.run.processes.run_record import SYSTEM_FILE, RunRecord, read_record
 from fieldtwin.studio.live.frame_log import FrameLog
@@ -56,6 +57,8 @@ FRAME_COUNT_EVERY_S = 0.04
 RECORD_EVERY_S = 0.5
 AGAIN_AFTER_S = 1.0
 """Pause in seconds before a process that did not answer is queried again."""
+MOST_INTERNAL = 256
+"""The largest number of variables that are not tags in one answer."""
 NONE_OF_THEM = 1 << 62
 """The number after which refused writes are requested. It excludes all of them, because the status already contains them."""
 
@@ -211,6 +214,15 @@ class Attachment:
             self.programs = await self._read_programs()
             self._described = (brief.pid, brief.restarts)
         return whole_plc_status(self._image, brief, self.programs, self.secrets, self.now_ns())
+
+    async def read_internal_variables(self) -> dict[str, Any]:
+        """Return name, type, value and unit of program variables that are not tags, and how many there are `more`."""
+        names: list[str] = (await self.plc_channel.call("image"))["internal"]
+        rows: list[dict[str, Any]] = []
+        for at in range(0, min(len(names), MOST_INTERNAL), MAX_AT_ONCE):
+            rows += (await self.plc_channel.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
+        shown = [{"name": row["tag"], "type": row["kind"], "value": row["value"], "unit": row["unit"]} for row in rows]
+        return {"variables": shown, "more": len(names) - len(rows)}
 
     async def _read_plc(self) -> None:
         known, buckets = self.plc, self.plc is None or self.now_ns() - self._buckets_ns >= BUCKETS_EVERY_S * NS_PER_S

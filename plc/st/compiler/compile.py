@@ -9,6 +9,7 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 from __future__ import annotations
 
 import ast
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import CodeType
 
@@ -63,6 +64,8 @@ class CompiledUnit:
     code: tuple[CodeType, ...]
     python: str
     programs: tuple[CompiledProgram, ...]
+    blocks: Mapping[str, tuple[tuple[str, ty.Type], ...]]
+    """By the name of a FUNCTION_BLOCK in lower case: its variables that keep their values, with their types."""
     kinds: tuple[str, ...]
     """The kind of each declaration: program, function, function block, type or global variable."""
     warnings: tuple[StWarning, ...] = ()
@@ -97,6 +100,8 @@ class _Unit:
         self.unit = unit
         self._outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs."""
+        self._kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
+        """By function block: its variables that keep their values."""
         self._check_names()
         self.declarations = Declarations(self.env, unit, self.out)
         self._declare_global_constants()
@@ -125,7 +130,8 @@ class _Unit:
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings = self._kinds(), self.env.warnings.sorted()
-        return CompiledUnit(self.path, self.files, self._code(text), text, tuple(programs), kinds, warnings)
+        code, declared = self._code(text), tuple(programs)
+        return CompiledUnit(self.path, self.files, code, text, declared, self._kept, kinds, warnings)
 
     def _kinds(self) -> tuple[str, ...]:
         pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous]
@@ -355,7 +361,10 @@ class _Unit:
     def _write_block(self, pou: t.Pou) -> None:
         symbols = self._symbols(pou, "self.")
         self._note_parts(pou, symbols)
-        kept = [s.code.split(".")[1] for s in symbols.values() if s.code.startswith("self.")]
+        held = [s for s in symbols.values() if s.code.startswith("self.")]
+        kept = [s.code.split(".")[1] for s in held]
+        references = {v.name.lower() for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables}
+        self._kept[pou.name.lower()] = tuple((s.name, s.type) for s in held if s.name.lower() not in references)
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
             self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
             in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]

@@ -312,7 +312,7 @@ def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path)
             assert (commanded["quality"], commanded["forced"]["by"]) == ("simulated", "test")
             with pytest.raises(RemoteError, match="which tags"):
                 await client.call("image", tags="ctd.*")
-            with pytest.raises(RemoteError, match=r"no tag 'no\.such'"):
+            with pytest.raises(RemoteError, match=r"no tag or variable 'no\.such'"):
                 await client.call("image", tags=["no.such"])
             assert "outputs" not in await client.call("get", brief=True)
             for args in ({"tag": "no.such", "value": 1}, {"value": 1}, {"tag": "ctd.sample_period_s", "value": "x"}):

@@ -83,7 +83,7 @@ def test_every_tag_has_the_details_for_an_engineer(tmp_path: Path) -> None:
     assert rig.view.names() == ["tank.level", "pump.speed", "pump.load"]
     with pytest.raises(UsageError, match="at most 64"):
         rig.view.describe(["tank.level"] * 65, 0, 0)
-    with pytest.raises(UsageError, match=r"no tag 'tank\.\*'"):
+    with pytest.raises(UsageError, match=r"no tag or variable 'tank\.\*'"):
         rig.view.describe(["tank.*"], 0, 0)
 
 

@@ -1,6 +1,6 @@
 // The PLC: states, cycle time, variables, forces, and the source of its programs with live values.
 
-import { html, useState } from "../vendor/preact.js";
+import { html, useEffect, useState } from "../vendor/preact.js";
 import { get, post } from "../lib/api.js";
 import { number } from "../lib/format.js";
 import { Failure, Quality, useAction, useFetched } from "../lib/parts.js";
@@ -34,7 +34,7 @@ export function Plc({ store }) {
     <div class="columns plc">
       <div class="stack">
         ${programs.map((name) => html`<${Program} key=${name} store=${store} name=${name} plc=${plc} changes=${transitions?.[name] ?? []} />`)}
-        ${!store.isTrace && tags}
+        ${!store.isTrace && html`${tags}<${Internal} store=${store} />`}
         ${store.isTrace &&
         programs.length > 0 &&
         !store.about.programs_described &&
@@ -112,6 +112,40 @@ function Tags({ store, plc, onOpen }) {
       </tbody>
     </table>
   </div>`;
+}
+
+/** Variables of programs that are not tags. The PLC answers for them itself, so it is asked once a second, and only while they are shown. */
+function Internal({ store }) {
+  const [open, setOpen] = useState(false);
+  const [second, setSecond] = useState(0);
+  useEffect(() => {
+    if (!open) return undefined;
+    const timer = setInterval(() => setSecond((n) => n + 1), 1000);
+    return () => clearInterval(timer);
+  }, [open]);
+  const [found, error] = useFetched(() => (open ? get(`${store.path}/plc/internal`) : Promise.resolve(null)), [open, second]);
+  return html`<details class="card" open=${open} onToggle=${(event) => setOpen(event.target.open)}>
+    <summary>Variables that are not tags: members of blocks, arrays, strings</summary>
+    <${Failure} text=${error} />
+    ${found && found.variables.length === 0 && html`<p class="soft">The programs have none.</p>`}
+    ${found &&
+    found.variables.length > 0 &&
+    html`<div class="scroll">
+      <table class="list one-line">
+        <thead><tr><th>Variable</th><th>Type</th><th class="number">Value</th></tr></thead>
+        <tbody>
+          ${found.variables.map((v) => {
+            const [value, unit] = v.unit === "ns" ? [v.value / 1e9, "s"] : [v.value, v.unit];
+            return html`<tr key=${v.name} data-variable=${v.name}>
+              <td title=${v.name}>${v.name}</td><td class="soft">${v.type}</td>
+              <td class="number" title=${v.value}>${number(value)}${unit && html` <span class="soft">${unit}</span>`}</td>
+            </tr>`;
+          })}
+        </tbody>
+      </table>
+    </div>`}
+    ${found?.more > 0 && html`<p class="soft note">${found.more} more: fieldtwin plc watch shows them.</p>`}
+  </details>`;
 }
 
 const PERCENTILES = { p50: "median", p99: "99 % within", p999: "99.9 % within", max: "longest" };

@@ -1,0 +1,140 @@
+"""The variables of a running program that are not tags, by their paths: members of blocks and structures, arrays, strings.
+
+A path is written as in the source: ``delay.ET``, ``levels[3]``, ``pumps[2].hours``, in any case of letters.
+Nothing is changed, and only the wanted variables are read, because this happens between two scans.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from typing import Any
+
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.plc.program import InternalVariable
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
+
+SHOWN_ELEMENTS = 6
+"""How many elements of an array are shown in one text."""
+_STEP = re.compile(r"\.(\w+)|\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\]")
+_DATES: dict[str, Callable[[int], str]] = {
+    "date": values.date_text,
+    "tod": values.tod_text,
+    "dt": values.moment_text,
+}
+
+Typed = tuple[ty.Type, Any]
+"""A type and a value of it."""
+
+
+class Inspection:
+    """The types of a unit's function blocks, and the variables of a program: its top level, by the name as declared."""
+
+    def __init__(self, unit: CompiledUnit, variables: Sequence[tuple[str, ty.Type]]) -> None:
+        self._blocks = unit.blocks
+        self._variables = variables
+
+    def names(self, body: Any) -> Iterator[str]:
+        """Return the path of every variable of `body`; an array of simple values has one path."""
+        for name, kind in self._variables:
+            yield from self._below(name, kind, _of(body, name))
+
+    def find(self, body: Any, path: str) -> InternalVariable | None:
+        """Return the variable with this path in `body`, and None for a path that names no variable, or one with members."""
+        name, rest = _first(path)
+        top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
+        if top is None:
+            return None
+        found: Typed | None = (top[1], _of(body, top[0]))
+        at = 0
+        while found is not None and at < len(rest):
+            step = _STEP.match(rest, at)
+            if step is None:
+                return None
+            at = step.end()
+            found = self._member(found, step[1]) if step[1] else _element(found, step[2])
+        if found is None or isinstance(found[0], ty.Struct | ty.Block):
+            return None
+        return InternalVariable(path, str(found[0]), _shown(*found))
+
+    def _below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
+        if isinstance(kind, ty.Struct | ty.Block):
+            for member, of, inside in self._members(kind, value):
+                yield from self._below(f"{name}.{member}", of, inside)
+        elif isinstance(kind, ty.Array) and isinstance(kind.of, ty.Struct | ty.Block | ty.Array):
+            for at in product(*(range(low, high + 1) for low, high in kind.ranges)):
+                index = ",".join(map(str, at))
+                yield from self._below(f"{name}[{index}]", kind.of, _at(kind, value, at))
+        else:
+            yield name
+
+    def _members(self, kind: ty.Struct | ty.Block, value: Any) -> Iterator[tuple[str, ty.Type, Any]]:
+        if isinstance(kind, ty.Struct):
+            for field, (name, of) in kind.fields.items():
+                yield name, of, getattr(value, f"m_{field}")
+        elif kind.standard is not None:
+            for name, of in (*kind.inputs.values(), *kind.outputs.values()):
+                yield name, of, getattr(value, name)
+        else:
+            for name, of in self._blocks[kind.name.lower()]:
+                yield name, of, _of(value, name)
+
+    def _member(self, found: Typed, name: str) -> Typed | None:
+        kind, value = found
+        if not isinstance(kind, ty.Struct | ty.Block):
+            return None
+        members = self._members(kind, value)
+        return next(((of, inside) for member, of, inside in members if member.lower() == name.lower()), None)
+
+
+def _first(path: str) -> tuple[str, str]:
+    """Return the name with which a path begins, and the rest."""
+    end = next((at for at, letter in enumerate(path) if letter in ".["), len(path))
+    return path[:end], path[end:]
+
+
+def _of(body: Any, name: str) -> Any:
+    return getattr(body, f"v_{name.lower()}")
+
+
+def _element(found: Typed, index: str) -> Typed | None:
+    kind, value = found
+    at = tuple(int(part) for part in index.split(","))
+    if not isinstance(kind, ty.Array) or len(at) != len(kind.ranges):
+        return None
+    if not all(low <= i <= high for i, (low, high) in zip(at, kind.ranges, strict=True)):
+        return None
+    return kind.of, _at(kind, value, at)
+
+
+def _at(kind: ty.Array, value: Any, at: Sequence[int]) -> Any:
+    for i, (low, _) in zip(at, kind.ranges, strict=True):
+        value = value[i - low]
+    return value
+
+
+def _shown(kind: ty.Type, value: Any) -> Scalar | str:
+    """Return a value for display: an enumerated value by its name, a date as a literal, an array with its first elements."""
+    if isinstance(kind, ty.Array):
+        return _elements(kind, value)
+    if isinstance(kind, ty.Enum):
+        return next((word for word, number in kind.values.items() if number == value), str(value))
+    if isinstance(kind, ty.String):
+        return f"'{value}'"
+    if isinstance(kind, ty.Elementary) and kind.kind in _DATES:
+        return _DATES[kind.kind](value)
+    return value if isinstance(value, bool | int | float | str) else str(value)
+
+
+def _elements(kind: ty.Array, value: list[Any]) -> str:
+    count = ty.elements(ty.Array(kind.ranges, ty.INT))
+    chosen = product(*(range(low, high + 1) for low, high in kind.ranges))
+    texts = [_text(_shown(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)]
+    return f"[{', '.join(texts)}{f', ... {count} elements' if count > SHOWN_ELEMENTS else ''}]"
+
+
+def _text(value: Scalar | str) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

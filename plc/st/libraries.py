@@ -79,7 +79,13 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
         (*unit.globals, *(d for d in taken.values() if isinstance(d, t.VarBlock))),
         (*unit.pous, *(d for d in taken.values() if isinstance(d, t.Pou))),
         (*unit.warnings, *(w for one in library.warnings for w in one.warnings if w.path in files)),
+        (*unit.missing, *(m for one in library.warnings for m in one.missing if _owner(m) in seen)),
     )
+
+
+def _owner(missing: t.Missing) -> str:
+    """Return the name of a missing declaration, or of the POU to which a missing action belongs, in lower case."""
+    return missing.name.lower().partition(".")[0]
 
 
 def _names(root: Any) -> Iterator[str]:

@@ -163,11 +163,14 @@ class _Input:
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`."""
-    names = [p.name for p in unit.programs]
-    found = next((p for p in unit.programs if p.name.lower() == name.lower()), None) if name else None
-    if not name and len(unit.programs) == 1:
-        found = unit.programs[0]
+    missing = {m.name: m for m in unit.missing if m.kind == "program"}
+    names = [*(p.name for p in unit.programs), *missing]
+    wanted = name or (names[0] if len(names) == 1 else "")
+    found = next((p for p in unit.programs if p.name.lower() == wanted.lower()), None)
     if found is None:
+        for m in missing.values():
+            if m.name.lower() == wanted.lower():
+                raise FileInvalid(m.reason, path=m.pos.path, line=m.pos.line, column=m.pos.column)
         raise FileInvalid(
             f"no PROGRAM {name}" if name else "which PROGRAM is meant",
             path=unit.path,

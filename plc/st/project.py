@@ -17,9 +17,10 @@ from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.libraries import Library, with_library
+from fieldtwin.plc.st.plcopen.elements import is_plcopen
+from fieldtwin.plc.st.plcopen.read import read_parts, read_plcopen
 from fieldtwin.plc.st.syntax import twincat
 from fieldtwin.plc.st.syntax.parse import parse_all, parse_parts
-from fieldtwin.plc.st.syntax.plcopen import is_plcopen, to_st
 from fieldtwin.plc.st.syntax.tree import SourceUnit
 
 _QUALIFIED_ONLY = re.compile(
@@ -69,7 +70,9 @@ def _library(texts: Texts, dialect: Dialect) -> Library:
             library.add(_unit(path, text, dialect))
         except FileInvalid as whole:
             try:
-                for unit, names, error in parse_parts(_as_st(path, text), path, dialect):
+                parts = read_parts if _is_export(text) else parse_parts
+                source = text if _is_export(text) else _as_st(path, text)
+                for unit, names, error in parts(source, path, dialect):
                     library.add(_in_list(unit, path, text, dialect))
                     library.fail(names, error or whole)
             except (
@@ -92,23 +95,28 @@ def _parsed(texts: Texts, dialect: Dialect) -> SourceUnit:
         tuple(block for unit in units for block in unit.globals),
         tuple(pou for unit in units for pou in unit.pous),
         tuple(warning for unit in units for warning in unit.warnings),
+        tuple(missing for unit in units for missing in unit.missing),
     )
 
 
 def _unit(path: str, text: str, dialect: Dialect) -> SourceUnit:
     """Return the declarations of a file. In a vendor's dialect its global variables form a list with the name of the file."""
+    if _is_export(text):
+        return read_plcopen(text, path, dialect)
     return _in_list(parse_all(_as_st(path, text), path, dialect), path, text, dialect)
 
 
+def _is_export(text: str) -> bool:
+    return is_plcopen(text) and not twincat.is_twincat(text)
+
+
 def _as_st(path: str, text: str) -> str:
-    """Return the Structured Text of a file in any form."""
-    if twincat.is_twincat(text):
-        return twincat.to_st(text, path)
-    return to_st(text, path) if is_plcopen(text) else text
+    """Return the Structured Text of a file that is not an export of PLCopen XML."""
+    return twincat.to_st(text, path) if twincat.is_twincat(text) else text
 
 
 def _in_list(unit: SourceUnit, path: str, text: str, dialect: Dialect) -> SourceUnit:
-    if not dialect.vendor or (is_plcopen(text) and not twincat.is_twincat(text)):
+    if not dialect.vendor or _is_export(text):
         return unit
     name, only_qualified = Path(path).stem, _QUALIFIED_ONLY.search(text) is not None
     lists = (replace(block, list=name, only_qualified=only_qualified) for block in unit.globals)

@@ -146,7 +146,7 @@ class Struct:
 @dataclass(frozen=True, slots=True)
 class Block:
     """A function block: a block of the standard, whose class is `standard`, or a block of the user. The mappings give for each
-    name in lower case the name as declared and the type."""
+    name in lower case the name as declared and the type; `actions` are the names of its actions in lower case."""
 
     name: str
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -155,6 +155,7 @@ class Block:
     standard: type[FunctionBlock] | None = None
     elements: int = 8
     nested: int = 1
+    actions: frozenset[str] = frozenset()
 
     def __str__(self) -> str:
         return self.name

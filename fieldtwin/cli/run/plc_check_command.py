@@ -21,6 +21,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
     from fieldtwin.plc.st.dialects import Dialect, StWarning
+    from fieldtwin.plc.st.syntax.tree import Missing
 
     _Program = tuple[Path, Dialect, tuple[Path, ...]]
     """A file or folder of programs, its dialect, and its libraries."""
@@ -36,6 +37,10 @@ class _Found:
     units: list[CompiledUnit]
     errors: list[FileInvalid]
     warnings: list[StWarning]
+
+    def missing(self) -> list[Missing]:
+        """Return the declarations that were not imported and that no program uses."""
+        return [each for unit in self.units for each in unit.missing]
 
 
 @click.command("check")
@@ -84,6 +89,7 @@ def check(
     fieldtwin plc check observatory
 
     A warning marks a construct that only the dialect accepts; `fieldtwin explain ST001` explains it.
+    Parts of a PLCopen XML file that are not supported are listed too; they are errors only where a program uses them.
 
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
@@ -105,6 +111,9 @@ def check(
         stdout.print(str(error), soft_wrap=True, markup=False)
     for warning in found.warnings:
         stdout.print(f"{warning}", style="yellow", soft_wrap=True, markup=False)
+    for missing in found.missing():
+        where = f"{missing.pos.path}:{missing.pos.line}:{missing.pos.column}"
+        stdout.print(f"{where}: not imported: {missing.reason}", soft_wrap=True, markup=False)
     stdout.print(_summary(found), style="red" if found.errors else "green", soft_wrap=True, markup=False)
     return 1 if found.errors else 0
 
@@ -163,7 +172,8 @@ def _summary(found: _Found) -> str:
     files = sum(len(unit.files) for unit in found.units)
     names = Counter(kind for unit in found.units for kind in unit.kinds)
     parts = ", ".join(_counted(count, kind) for kind, count in sorted(names.items()))
-    return f"{_counted(files, 'file')}, no errors{warned}: {parts or 'no declarations'}"
+    missing = f", {len(found.missing())} not imported" if found.missing() else ""
+    return f"{_counted(files, 'file')}, no errors{warned}: {parts or 'no declarations'}{missing}"
 
 
 def _counted(count: int, what: str) -> str:
@@ -175,6 +185,10 @@ def _as_json(found: _Found) -> dict[str, object]:
         "kind": "fieldtwin plc check",
         "version": 1,
         "files": sorted({file for unit in found.units for file in unit.files}),
+        "not_imported": [
+            {"kind": m.kind, "name": m.name, "reason": m.reason, "path": m.pos.path, "line": m.pos.line}
+            for m in found.missing()
+        ],
         "errors": [error.as_data() for error in found.errors],
         "warnings": [warning.as_data() for warning in found.warnings],
     }

@@ -69,6 +69,8 @@ class CompiledUnit:
     kinds: tuple[str, ...]
     """The kind of each declaration: program, function, function block, type or global variable."""
     warnings: tuple[StWarning, ...] = ()
+    missing: tuple[t.Missing, ...] = ()
+    """The declarations that were not imported and are not used."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -102,6 +104,8 @@ class _Unit:
         """By class of a PROGRAM: the attributes that hold its outputs."""
         self._kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
         """By function block: its variables that keep their values."""
+        declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
+        self.env.missing = {m.name.lower(): m for m in unit.missing if m.name.lower() not in declared}
         self._check_names()
         self.declarations = Declarations(self.env, unit, self.out)
         self._declare_global_constants()
@@ -129,9 +133,9 @@ class _Unit:
         self._write_globals()
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
-        kinds, warnings = self._kinds(), self.env.warnings.sorted()
+        kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
         code, declared = self._code(text), tuple(programs)
-        return CompiledUnit(self.path, self.files, code, text, declared, self._kept, kinds, warnings)
+        return CompiledUnit(self.path, self.files, code, text, declared, self._kept, kinds, warnings, missing)
 
     def _kinds(self) -> tuple[str, ...]:
         pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous]
@@ -271,7 +275,7 @@ class _Unit:
 
     def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
         """Return all variables of a POU. `prefix` comes before their names in Python, such as ``self.``; a VAR_TEMP has none,
-        because it is local to a call.
+        because it is local to a call, unless the POU has actions, which use it too.
         """
         symbols: dict[str, Symbol] = {}
         for block in pou.blocks:
@@ -282,7 +286,8 @@ class _Unit:
                     self._no_address(v)
                     if v.name.lower() in symbols:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
-                    symbols[v.name.lower()] = self._variable(v, block, prefix)
+                    before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
+                    symbols[v.name.lower()] = self._variable(v, block, before)
         own = (
             symbols[v.name.lower()].type
             for b in pou.blocks
@@ -296,7 +301,7 @@ class _Unit:
     def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str) -> Symbol:
         if block.kind == "VAR_EXTERNAL":
             return self._external(v)
-        code = f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{v.name.lower()}"
+        code = f"{prefix}v_{v.name.lower()}"
         symbol = self._symbol(v, block, code)
         if block.kind == "VAR_IN_OUT" and not by_reference(symbol.type):
             return replace(symbol, code=f"{code}.v", reference=code)
@@ -370,7 +375,7 @@ class _Unit:
             in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
             self.out.line(f"in_outs = {tuple(in_outs)}")
             with self.out.block("def __init__(self):"):
-                self._initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
+                self._initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou)))
                 for block in pou.blocks:
                     if block.kind == "VAR_IN_OUT":
                         for v in block.variables:
@@ -378,7 +383,32 @@ class _Unit:
             with self.out.block("def execute(self, now_ns):"):
                 self.out.step(pou.pos)
                 self._initialise(pou, symbols, ("VAR_TEMP",))
-                Statements(self.env, symbols, self.out, pou.name.lower()).body(pou.body)
+                self._body(pou, symbols, pou.name.lower()).body(pou.body)
+            self._write_actions(pou, symbols)
+
+    def _body(self, pou: t.Pou, symbols: dict[str, Symbol], name: str) -> Statements:
+        """Return the compiler of a body of a POU. `name` is that of the POU, or of an action with the POU before it."""
+        body = Statements(self.env, symbols, self.out, name)
+        body.owner = pou.name.lower()
+        body.actions = frozenset(action.name.lower() for action in pou.actions)
+        return body
+
+    def _write_actions(self, pou: t.Pou, symbols: dict[str, Symbol], inputs: frozenset[str] = frozenset()) -> None:
+        seen: set[str] = set()
+        for action in pou.actions:
+            key = action.name.lower()
+            if key in seen or key in symbols:
+                self.env.collected(self.env.error(action.pos, f"{action.name} is declared twice"))
+            seen.add(key)
+            with self.out.block(f"def a_{key}(self):", action.pos):
+                self.out.step(action.pos)
+                body = self._body(pou, symbols, f"{pou.name.lower()}.{key}")
+                body.program_inputs = set(inputs)
+                body.body(action.body)
+
+    def _kept_temporaries(self, pou: t.Pou) -> tuple[str, ...]:
+        """Return VAR_TEMP if the POU has actions: one may be called before the POU, so the variables have to exist."""
+        return ("VAR_TEMP",) if pou.actions else ()
 
     def _write_program(self, pou: t.Pou) -> CompiledProgram:
         symbols = self._symbols(pou, "self.")
@@ -407,9 +437,11 @@ class _Unit:
                 self._initialise_program(pou, symbols)
             with self.out.block("def execute(self):"):
                 self._initialise(pou, symbols, ("VAR_TEMP",))
-                body = Statements(self.env, symbols, self.out, pou.name.lower())
-                body.program_inputs = {v.name for v in variables if v.role == "input"}
+                inputs = frozenset(v.name for v in variables if v.role == "input")
+                body = self._body(pou, symbols, pou.name.lower())
+                body.program_inputs = set(inputs)
                 body.body(pou.body)
+            self._write_actions(pou, symbols, inputs)
         return CompiledProgram(pou.name, pou.pos.path, tuple(variables))
 
     def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:

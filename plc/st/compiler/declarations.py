@@ -173,6 +173,7 @@ class Declarations:
             return self._declared(self._types[key])
         if key in self._blocks:
             return self._block(self._blocks[key])
+        self.env.refuse_missing(key, pos)
         if key in _STANDARD:
             return _STANDARD[key]
         known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
@@ -255,7 +256,8 @@ class Declarations:
                         members[block.kind][v.name.lower()] = (v.name, kind)
         total, nested = self.bounded(pou.pos, held)
         inputs, outputs, in_outs = members.values()
-        return ty.Block(pou.name, inputs, outputs, in_outs, elements=total, nested=nested + 1)
+        actions = frozenset(action.name.lower() for action in pou.actions)
+        return ty.Block(pou.name, inputs, outputs, in_outs, elements=total, nested=nested + 1, actions=actions)
 
     def _constant(self, expr: t.Expr, what: str) -> int:
         return self._expressions().constant_integer(expr, what)

@@ -208,6 +208,8 @@ class Expressions:
             if self.only_constants:
                 self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
             return self._user_function(call, self.env.functions[name])
+        if not call.ref.selectors:
+            self.env.refuse_missing(name, call.pos)
         own = self.symbols.get(name)
         if not call.ref.selectors and (own is None or not isinstance(own.type, ty.Block)):
             standard = FUNCTIONS.find(name.upper())

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning, WarningCollector
 from fieldtwin.plc.st.syntax.source import shortened
-from fieldtwin.plc.st.syntax.tree import Expr, Pos
+from fieldtwin.plc.st.syntax.tree import Expr, Missing, Pos
 
 COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 """Operators of Structured Text and their Python form."""
@@ -97,10 +97,14 @@ class Environment:
     ambiguous: dict[str, list[str]] = field(default_factory=dict)
     """The qualified names of variables that several global lists declare under one name."""
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
+    missing: dict[str, Missing] = field(default_factory=dict)
+    """The declarations that were not imported, because a part of them is not supported."""
     calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
     """By POU: the POUs that it calls or contains, with the first position of each."""
 
     def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
+        if pos.element:
+            message = f"{pos.element}: {message}"
         return FileInvalid(
             message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
         )
@@ -142,6 +146,11 @@ class Environment:
 
     def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
         raise self.error(pos, message, expected=expected, got=got, hint=hint)
+
+    def refuse_missing(self, key: str, pos: Pos) -> None:
+        """Raise `FileInvalid` if the declaration `key`, a name in lower case, was not imported, with the reason."""
+        if key in self.missing:
+            self.fail(pos, str(self.missing[key]))
 
     def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
         if name.lower() in self.faulty | self.faulty_here:

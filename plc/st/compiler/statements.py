@@ -34,6 +34,9 @@ class Statements(Expressions):
         self._loops: list[t.Expr | None] = []  # the loops around the statement; for a REPEAT its condition
         self._continues: dict[int, int] = {}
         self._inside = 0
+        self.actions: frozenset[str] = frozenset()
+        """The names of the actions of the POU `owner`, in lower case."""
+        self.owner = pou
 
     def body(self, statements: tuple[t.Statement, ...]) -> None:
         if self._inside >= MAX_DEEP and statements:
@@ -54,20 +57,83 @@ class Statements(Expressions):
     def _assign(self, s: t.Assign) -> None:
         self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
+    def _hold(self, s: t.Hold) -> None:
+        code = "w_" + s.name.replace(".", "_")
+        with self.env.declaring(s.name, self.env.faulty_here):
+            kept = self._kept(s, code)
+            self.symbols[s.name] = Symbol(s.name, kept.type, code, writable=False, constant=kept.constant)
+
+    def _kept(self, s: t.Hold, code: str) -> Value:
+        if s.enabled is None:
+            return self._held(s, code)
+        with self.out.block(f"if {self.condition(s.enabled, 'EN')}:", s.pos):
+            kept = self._held(s, code)
+        with self.out.block("else:", s.pos):
+            self.out.line(f"{code} = {self._initial(kept.type, s)}", s.pos)
+        return kept
+
+    def _held(self, s: t.Hold, code: str) -> Value:
+        value = self.value(s.value)
+        if s.boolean:
+            value = Value(self.coerced(value, ty.BOOL, s.pos, f"the state of {s.boolean}"), ty.BOOL)
+        self.out.line(f"{code} = {value.code}", s.pos)
+        return value
+
+    def _initial(self, kind: ty.Type, s: t.Hold) -> str:
+        """Return the value of the result of a function with EN while it is not executed."""
+        plain = ty.plain(kind)
+        if isinstance(plain, ty.Struct | ty.Array):
+            self.env.fail(s.pos, "the result of a function with EN", expected="an elementary type", got=str(kind))
+        if isinstance(plain, ty.Enum):
+            return str(plain.initial)
+        return "''" if isinstance(plain, ty.String) else "False" if ty.is_kind(plain, "bool") else "0"
+
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call
-        known = call.ref.name.lower() in self.symbols or call.ref.name.lower() in self.env.globals
-        if call.ref.selectors or known:
-            instance = variable(self, call.ref)
+        name = call.ref.name.lower()
+        known = name in self.symbols or name in self.env.globals
+        if not call.ref.selectors and not known and self._is_action(self.owner, self.actions, name):
+            self._own_action(call, name)
+        elif call.ref.selectors or known:
+            ref, action = self._action_of(call.ref)
+            instance = variable(self, ref)
             if not isinstance(instance.type, ty.Block):
                 self.env.fail(
                     call.pos, f"{call.ref.name} cannot be called", expected="a function block", got=str(instance.type)
                 )
-            self._block_call(call, instance.code, instance.type)
+            self._block_call(call, instance.code, instance.type, action)
         else:
             self.out.line(self.value(call).code, s.pos)
 
-    def _block_call(self, call: t.Call, code: str, block: ty.Block) -> None:
+    def _is_action(self, pou: str, actions: frozenset[str], name: str) -> bool:
+        return name in actions or f"{pou}.{name}" in self.env.missing
+
+    def _own_action(self, call: t.Call, name: str) -> None:
+        """Write the call of an action of the same POU."""
+        self._note_action(self.owner, name, call)
+        if call.arguments:
+            self.env.fail(call.arguments[0].pos, f"action {call.ref.name} takes no arguments")
+        self.out.line(f"self.a_{name}()", call.pos)
+
+    def _note_action(self, pou: str, name: str, call: t.Call) -> None:
+        key = f"{pou}.{name}"
+        self.env.refuse_missing(key, call.pos)
+        self.env.calls.setdefault(self.pou, {}).setdefault(key, call.pos)
+
+    def _action_of(self, ref: t.Ref) -> tuple[t.Ref, str]:
+        """Return the reference to a function block, and the name of its action that `ref` selects; "" for the block itself."""
+        last = ref.selectors[-1] if ref.selectors else None
+        if isinstance(last, t.Member):
+            instance = t.Ref(ref.pos, ref.name, ref.selectors[:-1])
+            kind, name = self.type_of(instance), last.name.lower()
+            if isinstance(kind, ty.Block) and self._is_action(kind.name.lower(), kind.actions, name):
+                return instance, name
+        return ref, ""
+
+    def _block_call(self, call: t.Call, code: str, block: ty.Block, action: str = "") -> None:
+        """Write the call of a function block, or of one of its actions."""
+        if action:
+            self._note_action(block.name.lower(), action, call)
         if "[" in code:  # compute the place once
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)
@@ -88,7 +154,7 @@ class Statements(Expressions):
         for name, (member, _) in block.in_outs.items():
             if name not in given:
                 self.env.fail(call.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
-        self.out.line(f"{code}.execute(_c.now_ns)", call.pos)
+        self.out.line(f"{code}.a_{action}()" if action else f"{code}.execute(_c.now_ns)", call.pos)
         self.take_back(cells, call.pos)
         for argument in (a for a in call.arguments if a.target is not None):
             name = argument.name.lower()

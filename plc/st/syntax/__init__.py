@@ -1,1 +1,1 @@
-"""Reading a Structured Text or PLCopen XML file into a tree."""
+"""Reading a Structured Text file into a tree."""

@@ -34,9 +34,7 @@ _UNSUPPORTED = {
         "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
-        "steps, transitions and actions of SFC": (
-            "STEP INITIAL_STEP END_STEP TRANSITION END_TRANSITION ACTION END_ACTION"
-        ),
+        "steps and transitions of SFC": "STEP INITIAL_STEP END_STEP TRANSITION END_TRANSITION",
         "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
         "R_EDGE and F_EDGE": "R_EDGE F_EDGE",
         "labels and jumps": "JMP",
@@ -71,7 +69,7 @@ def parse(text: str, path: str = "", dialect: Dialect = STANDARD, before: tuple[
     warnings: list[StWarning] = []
     text = blanked(text, path, dialect, warnings)
     try:
-        unit: t.SourceUnit = _Build(path, before).transform(_parser().parse(text))
+        unit: t.SourceUnit = _Build(path, before).transform(_parser().parse(text, start="start"))
         return replace(unit, warnings=tuple(warnings))
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
@@ -79,6 +77,25 @@ def parse(text: str, path: str = "", dialect: Dialect = STANDARD, before: tuple[
         if not isinstance(e.orig_exc, _Bad):
             raise
         raise e.orig_exc.at(path) from e
+
+
+def parse_expression(text: str, at: t.Pos) -> t.Expr:
+    """Return the tree of one expression of a drawing; all its parts are at the element `at`. Raises `FileInvalid`."""
+    try:
+        text = blanked(text, at.path)
+        return _Build(at.path, at=at).transform(_parser().parse(text, start="expression"))  # type: ignore[no-any-return]
+    except UnexpectedInput as e:
+        error = _invalid(e, text, at.path)
+    except VisitError as e:
+        if not isinstance(e.orig_exc, _Bad):
+            raise
+        error = e.orig_exc.at(at.path)
+    except FileInvalid as e:
+        error = e
+    raise FileInvalid(
+        f"{at.element}: {shortened(text.strip())}: {error.message}",
+        path=at.path, line=at.line, column=at.column, expected=error.expected, got=error.got,
+    )  # fmt: skip
 
 
 def parse_all(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
@@ -148,7 +165,10 @@ def _moved(error: FileInvalid, lines: int, columns: int) -> FileInvalid:
 @cache
 def _parser() -> Lark:
     grammar = resources.files("fieldtwin.plc.st.syntax").joinpath("grammar.lark").read_text(encoding="utf-8")
-    return Lark(grammar, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII)
+    starts = ["start", "expression"]
+    return Lark(
+        grammar, start=starts, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII
+    )
 
 
 class _Bad(Exception):
@@ -211,12 +231,15 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     It is not recursive, so the nesting depth has no limit."""
 
-    def __init__(self, path: str, before: tuple[int, int]) -> None:
+    def __init__(self, path: str, before: tuple[int, int] = (0, 0), at: t.Pos | None = None) -> None:
         super().__init__()
         self._path = path
         self._lines, self._columns = before
+        self._at = at
 
     def _pos(self, where: Meta | Token) -> t.Pos:
+        if self._at is not None:
+            return self._at
         line, column = where.line or 1, where.column or 1
         return t.Pos(line + self._lines, column + (self._columns if line == 1 else 0), self._path)
 
@@ -247,7 +270,9 @@ class _Build(Transformer_NonRecursive[Token, Any]):
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items
         returns = rest.pop(0) if isinstance(rest[0], t.TypeSpec) else None
-        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), rest[-1])
+        body = tuple(i for i in rest[-1] if not isinstance(i, t.Action))
+        actions = tuple(i for i in rest[-1] if isinstance(i, t.Action))
+        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), body, actions)
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
         return self._pou("PROGRAM", meta, items)
@@ -356,6 +381,12 @@ class _Build(Transformer_NonRecursive[Token, Any]):
 
     def body(self, meta: Meta, items: list[Any]) -> tuple[t.Statement, ...]:
         return tuple(i for i in items if i is not None)
+
+    pou_body = body
+
+    def action(self, meta: Meta, items: list[Any]) -> t.Action:
+        name, body = items
+        return t.Action(self._pos(name), str(name), body)
 
     def empty(self, meta: Meta, items: list[Any]) -> None:
         return None

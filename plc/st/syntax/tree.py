@@ -10,11 +10,13 @@ from fieldtwin.plc.st.dialects import StWarning
 
 @dataclass(frozen=True, slots=True)
 class Pos:
-    """Line and column, both from 1, of a file; `path` is empty if the text is not from a file."""
+    """Line and column, both from 1, of a file; `path` is empty if the text is not from a file. `element` names the element of
+    a drawing, such as "localId 3 of Main"."""
 
     line: int
     column: int
     path: str = ""
+    element: str = ""
 
 
 # -- types ------------------------------------------------------------------------------------------------------------
@@ -131,6 +133,15 @@ class VarBlock:
 
 
 @dataclass(frozen=True, slots=True)
+class Action:
+    """An action of a PROGRAM or FUNCTION_BLOCK: statements with a name that use the variables of the POU."""
+
+    pos: Pos
+    name: str
+    body: tuple[Statement, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Pou:
     """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is the type of a
     function's result; None for a function without a result."""
@@ -141,16 +152,32 @@ class Pou:
     returns: TypeSpec | None
     blocks: tuple[VarBlock, ...]
     body: tuple[Statement, ...]
+    actions: tuple[Action, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """A declaration that was not imported, because a part of it is not supported. `kind` is program, function, function block,
+    action or type; the `name` of an action has the name of its POU before it, with a dot."""
+
+    pos: Pos
+    kind: str
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.reason} ({self.pos.path}:{self.pos.line})"
 
 
 @dataclass(frozen=True, slots=True)
 class SourceUnit:
-    """All declarations of one file."""
+    """All declarations of one file, and those that were not imported."""
 
     types: tuple[TypeDecl, ...] = ()
     globals: tuple[VarBlock, ...] = ()
     pous: tuple[Pou, ...] = ()
     warnings: tuple[StWarning, ...] = ()
+    missing: tuple[Missing, ...] = ()
 
 
 # -- expressions --------------------------------------------------------------------------------------------------------
@@ -299,4 +326,19 @@ class Jump:
     word: str
 
 
-Statement = Assign | CallStatement | If | Case | For | While | Repeat | Jump
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """A value in a network that later statements of the same body read by `name`, such as the state of a contact.
+
+    If `boolean` is not empty, the value has to be a BOOL, and `boolean` names it in errors. A value with `enabled` is computed
+    only while that is true; otherwise it is the initial value of its type.
+    """
+
+    pos: Pos
+    name: str
+    value: Expr
+    boolean: str = ""
+    enabled: Expr | None = None
+
+
+Statement = Hold | Assign | CallStatement | If | Case | For | While | Repeat | Jump

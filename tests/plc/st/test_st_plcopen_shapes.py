@@ -79,11 +79,13 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
         assert (e.value.line, e.value.column) == (line, column)
 
 
-def test_methods_and_actions_are_refused_at_their_position(tmp_path: Path) -> None:
+def test_a_block_with_a_method_is_refused_where_it_is_used(tmp_path: Path) -> None:
     text = (SHAPES / "codesys_shape.xml").read_text()
     assert text.count("<addData />") == 1
     path = tmp_path / "tank.xml"
     data = '<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Reset"/></data></addData>'
     path.write_text(text.replace("<addData />", data))
-    with pytest.raises(FileInvalid, match="FB_Ramp has an unsupported part: method"):
+    with pytest.raises(
+        FileInvalid, match=r"tank\.xml:\d+:\d+: FB_Ramp has a method, which is not supported \(.*tank\.xml:\d+\)"
+    ):
         load_source(path)

@@ -1,20 +1,23 @@
 """Convert PLCopen XML (TC6, version 2.01, as CODESYS, OpenPLC and Beremiz export it) to Structured Text, line for line.
 
 Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
-the user's file. Bodies in languages other than ST are refused with their language; drawings, task configurations and
-vendors' additions are ignored. Document types are refused, which excludes all attacks with entities.
+the user's file. Bodies in FBD and LD become statements of the tree (`networks`). A POU, an action or a type with a part that is
+not supported is left out and listed in `Export.missing`. Drawings, task configurations and vendors' additions are ignored.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from xml.parsers import expat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.plcopen.elements import Element, project_of
+from fieldtwin.plc.st.plcopen.networks import Drawn, drawn
+from fieldtwin.plc.st.plcopen.nodes import Unsupported
+from fieldtwin.plc.st.syntax.tree import Missing, Pos
 
-MAX_ELEMENTS = 500_000
 _BLOCKS = {
     "localVars": "VAR", "inputVars": "VAR_INPUT", "outputVars": "VAR_OUTPUT", "inOutVars": "VAR_IN_OUT",
     "tempVars": "VAR_TEMP", "externalVars": "VAR_EXTERNAL", "globalVars": "VAR_GLOBAL",
@@ -25,80 +28,33 @@ _QUALIFIED = re.compile(
 )
 """A name before a dot; comments and strings are skipped."""
 _POUS = {"program": "PROGRAM", "function": "FUNCTION", "functionBlock": "FUNCTION_BLOCK"}
+_LANGUAGES = ("ST", "FBD", "LD", "SFC", "IL")
 
 
-@dataclass(slots=True)
-class _Element:
-    tag: str
-    attributes: dict[str, str]
-    line: int
-    children: list[_Element] = field(default_factory=list)
-    text: list[tuple[int, str]] = field(default_factory=list)
-    """Pieces of text with the line on which each begins."""
-    end_line: int = 0
+@dataclass(frozen=True, slots=True)
+class Export:
+    """A PLCopen XML file as Structured Text, and what of it is missing there."""
 
-    def find(self, tag: str) -> _Element | None:
-        return next((c for c in self.children if c.tag == tag), None)
-
-    def every(self, tag: str) -> Iterator[_Element]:
-        for child in self.children:
-            if child.tag == tag:
-                yield child
-            yield from child.every(tag)
+    text: str
+    missing: tuple[Missing, ...]
+    drawings: Mapping[tuple[str, str], Drawn]
+    """The bodies in FBD and LD by POU and action, in lower case; the body of a POU has "" as its action."""
 
 
-def is_plcopen(text: str) -> bool:
-    return text.lstrip("\ufeff \t\r\n").startswith("<")
-
-
-def to_st(text: str, path: str = "") -> str:
+def convert(text: str, path: str = "") -> Export:
     """Return the Structured Text of a PLCopen XML export. Raises `FileInvalid`."""
-    return _Converter(_parsed(text, path), path, text.count("\n") + 1).text()
-
-
-def _parsed(text: str, path: str) -> _Element:
-    root = _Element("", {}, 1)
-    stack, count = [root], 0
-    parser = expat.ParserCreate(namespace_separator="}")
-    parser.buffer_text = False
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        if count > MAX_ELEMENTS:
-            raise FileInvalid("the export is too large", path=path, expected=f"at most {MAX_ELEMENTS} elements")
-        element = _Element(name.rpartition("}")[2], attributes, parser.CurrentLineNumber)
-        stack[-1].children.append(element)
-        stack.append(element)
-
-    def end(name: str) -> None:
-        stack.pop().end_line = parser.CurrentLineNumber
-
-    def characters(data: str) -> None:
-        stack[-1].text.append((parser.CurrentLineNumber, data))
-
-    def doctype(*_: object) -> None:
-        raise FileInvalid("a document type declaration is not allowed", path=path, line=parser.CurrentLineNumber)
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.CharacterDataHandler = characters
-    parser.StartDoctypeDeclHandler = doctype
-    try:
-        parser.Parse(text.encode(), True)
-    except expat.ExpatError as e:
-        raise FileInvalid(f"not XML: {expat.ErrorString(e.code)}", path=path, line=e.lineno, column=e.offset + 1) from e
-    project = root.find("project")
-    if project is None:
-        raise FileInvalid("not a PLCopen export", path=path, line=1, expected="a <project>")
-    return project
+    return _Converter(project_of(text, path), path, text.count("\n") + 1).export()
 
 
 class _Converter:
-    def __init__(self, project: _Element, path: str, lines: int) -> None:
+    def __init__(self, project: Element, path: str, lines: int) -> None:
         self.path = path
         self.project = project
-        self.lines: list[list[str]] = [[] for _ in range(lines + 2)]
+        self.count = lines
+        self.pieces: list[tuple[int, str]] = []
+        """Each piece of the text with its line."""
+        self.missing: list[Missing] = []
+        self.drawings: dict[tuple[str, str], Drawn] = {}
         self.last = 1
         enums = [d for d in project.every("dataType") if any(b.find("enum") for b in d.children if b.tag == "baseType")]
         self.qualifiers = {d.attributes.get("name", "").lower(): "#" for d in enums}
@@ -108,24 +64,42 @@ class _Converter:
             g.attributes["name"].lower(): "" for g in project.every("globalVars") if "name" in g.attributes
         }
 
-    def text(self) -> str:
+    def export(self) -> Export:
         for data_type in self.project.every("dataType"):
-            self._data_type(data_type)
+            with self._whole(data_type, "type", data_type.attributes.get("name", "")):
+                self._data_type(data_type)
         for pou in self.project.every("pou"):
-            self._pou(pou)
+            with self._whole(pou, _kind(pou).lower().replace("_", " "), pou.attributes.get("name", "")):
+                self._pou(pou)
         for block in self.project.every("globalVars"):
             self._variables(block)
-        return "\n".join(" ".join(pieces) for pieces in self.lines[1:])
+        lines: list[list[str]] = [[] for _ in range(self.count + 2)]
+        for line, text in self.pieces:
+            lines[min(line, len(lines) - 1)].append(text)
+        return Export("\n".join(" ".join(pieces) for pieces in lines[1:]), tuple(self.missing), self.drawings)
+
+    @contextmanager
+    def _whole(self, element: Element, kind: str, name: str) -> Iterator[None]:
+        """Convert an element completely, or, if a part of it is not supported, not at all."""
+        mark = len(self.pieces)
+        try:
+            yield
+        except Unsupported as e:
+            del self.pieces[mark:]
+            self.missing.append(Missing(Pos(e.line, e.column, self.path), kind, name, e.message))
 
     def _put(self, line: int, text: str) -> None:
         """Write `text` on `line`, or on a later line if earlier text has already reached one."""
         self.last = max(self.last, line)
-        self.lines[min(self.last, len(self.lines) - 1)].append(text)
+        self.pieces.append((self.last, text))
 
-    def _fail(self, element: _Element, message: str, *, expected: str = "", got: str = "") -> FileInvalid:
+    def _fail(self, element: Element, message: str, *, expected: str = "", got: str = "") -> FileInvalid:
         return FileInvalid(message, path=self.path, line=element.line, expected=expected, got=got)
 
-    def _name(self, element: _Element) -> str:
+    def _unsupported(self, element: Element, message: str) -> Unsupported:
+        return Unsupported(message, path=self.path, line=element.line, column=element.column)
+
+    def _name(self, element: Element) -> str:
         name = element.attributes.get("name", "")
         if not name.isidentifier():
             raise self._fail(element, f"a <{element.tag}> without a usable name", got=repr(name))
@@ -133,7 +107,7 @@ class _Converter:
 
     # -- declarations -----------------------------------------------------------------------------------------------------
 
-    def _data_type(self, element: _Element) -> None:
+    def _data_type(self, element: Element) -> None:
         self.last = element.line  # types, POUs and globals may be in any order, so each starts anew
         base = element.find("baseType")
         if base is None or not base.children:
@@ -156,27 +130,47 @@ class _Converter:
             self._put(inner.line, f"{name} : {self._type_of(inner)}{self._initial(element)};")
         self._put(element.end_line, "END_TYPE")
 
-    def _pou(self, pou: _Element) -> None:
+    def _pou(self, pou: Element) -> None:
         self.last = pou.line
-        kind = _POUS.get(pou.attributes.get("pouType", ""))
-        if kind is None:
+        kind = _kind(pou)
+        if not kind:
             raise self._fail(
                 pou, "a POU of unknown kind", expected=", ".join(_POUS), got=pou.attributes.get("pouType", "")
             )
-        for unsupported in ("Method", "Property", "action", "transition"):
-            for found in pou.every(unsupported):
-                raise self._fail(found, f"{self._name(pou)} has an unsupported part: {unsupported.lower()}")
+        for tag in ("Method", "Property"):
+            for found in pou.every(tag):
+                raise self._unsupported(found, f"{self._name(pou)} has a {tag.lower()}, which is not supported")
         interface = pou.find("interface")
-        returns = interface.find("returnType") if interface else None
-        result = returns.children[0] if kind == "FUNCTION" and returns is not None and returns.children else None
-        self._put(pou.line, f"{kind} {self._name(pou)}" + (f" : {self._type_of(result)}" if result is not None else ""))
+        result = interface.inside("returnType") if kind == "FUNCTION" and interface is not None else []
+        self._put(pou.line, f"{kind} {self._name(pou)}" + (f" : {self._type_of(result[0])}" if result else ""))
         for block in interface.children if interface else ():
             if block.tag in _BLOCKS:
                 self._variables(block)
-        self._body(pou)
+        if not pou.inside("body"):
+            raise self._fail(pou, f"POU {self._name(pou)} has no body", expected="<body><ST>")
+        for part in pou.children:  # in their order in the file, because the text keeps the lines
+            if part.tag == "body":
+                self._body(pou, part)
+            elif part.tag == "actions":
+                self._actions(pou, part)
         self._put(pou.end_line, f"END_{kind}")
 
-    def _variables(self, block: _Element) -> None:
+    def _actions(self, pou: Element, actions: Element) -> None:
+        for action in actions.children:
+            if action.tag != "action":
+                continue
+            name = f"{self._name(pou)}.{self._name(action)}"
+            with self._whole(action, "action", name):
+                if _kind(pou) == "FUNCTION":
+                    raise self._fail(action, f"{name}: a function has no actions")
+                body = action.find("body")
+                if body is None:
+                    raise self._fail(action, f"action {name} has no body", expected="<body><ST>")
+                self._put(action.line, f"ACTION {self._name(action)}:")
+                self._body(pou, body, self._name(action))
+                self._put(action.end_line, "END_ACTION")
+
+    def _variables(self, block: Element) -> None:
         if block.tag == "globalVars":
             self.last = block.line
         words = [_BLOCKS[block.tag]]
@@ -192,13 +186,13 @@ class _Converter:
                 self._put(v.line, f"{self._name(v)}{at} : {self._type(v)}{self._initial(v)};")
         self._put(block.end_line, "END_VAR")
 
-    def _type(self, variable: _Element) -> str:
+    def _type(self, variable: Element) -> str:
         kind = variable.find("type")
         if kind is None or not kind.children:
             raise self._fail(variable, f"variable {variable.attributes.get('name')} has no type", expected="<type>")
         return self._type_of(kind.children[0])
 
-    def _type_of(self, element: _Element) -> str:
+    def _type_of(self, element: Element) -> str:
         tag = element.tag
         if tag == "derived":
             return self._name(element)
@@ -217,14 +211,14 @@ class _Converter:
         if tag in ("subrangeSigned", "subrangeUnsigned") and inner and ranges:
             return f"{inner}({ranges[0]})"
         if element.children or not tag.isupper():
-            raise self._fail(element, f"a type that is not supported: {tag}")
+            raise self._unsupported(element, f"the type {tag} is not supported")
         return tag
 
-    def _initial(self, element: _Element) -> str:
+    def _initial(self, element: Element) -> str:
         found = element.find("initialValue")
         return f" := {self._value(found.children[0])}" if found is not None and found.children else ""
 
-    def _value(self, element: _Element) -> str:
+    def _value(self, element: Element) -> str:
         if element.tag == "simpleValue":
             return element.attributes.get("value", "")
         inner = [(v, self._value(v.children[0])) for v in element.children if v.tag == "value" and v.children]
@@ -238,17 +232,23 @@ class _Converter:
 
     # -- bodies -----------------------------------------------------------------------------------------------------------
 
-    def _body(self, pou: _Element) -> None:
-        body = pou.find("body")
-        if body is None or not body.children:
-            raise self._fail(pou, f"POU {self._name(pou)} has no body", expected="<body><ST>")
-        language = next((c for c in body.children if c.tag in ("ST", "IL", "LD", "FBD", "SFC")), None)
-        if language is None or language.tag != "ST":
-            got = language.tag if language else body.children[0].tag
-            raise self._fail(body, f"the body of {self._name(pou)} is not Structured Text", expected="ST", got=got)
+    def _body(self, pou: Element, body: Element, action: str = "") -> None:
+        """Write the body of a POU, or of its action `action`."""
+        of = f"action {self._name(pou)}.{action}" if action else self._name(pou)
+        language = next((c for c in body.children if c.tag in _LANGUAGES), None)
+        if language is None:
+            raise self._fail(body, f"the body of {of} has no language", expected=", ".join(_LANGUAGES))
         interface = pou.find("interface")
         own = {v.attributes.get("name", "").lower() for v in interface.every("variable")} if interface else set()
-        for line, text in _texts(language):
+        if language.tag in ("FBD", "LD"):
+            found = drawn(language, of, self.path, lambda text: self._unqualified(text, own), action.lower())
+            if found.edges and _kind(pou) == "FUNCTION":
+                raise self._unsupported(language, f"{of} is a function that detects an edge, which is not supported")
+            self.drawings[self._name(pou).lower(), action.lower()] = found
+            return
+        if language.tag != "ST":
+            raise self._unsupported(language, f"{of} has a body in {language.tag}, which is not supported")
+        for line, text in language.texts():
             for offset, piece in enumerate(self._unqualified(text, own).split("\n")):
                 if piece.strip():
                     self._put(line + offset, piece)
@@ -267,8 +267,6 @@ class _Converter:
         return _QUALIFIED.sub(standard, text)
 
 
-def _texts(element: _Element) -> Iterator[tuple[int, str]]:
-    if element.text:  # the parser delivers text in pieces, one for each entity or line
-        yield element.text[0][0], "".join(piece for _, piece in element.text)
-    for child in element.children:
-        yield from _texts(child)
+def _kind(pou: Element) -> str:
+    """Return the kind of a POU in capitals, or "" if the standard does not know it."""
+    return _POUS.get(pou.attributes.get("pouType", ""), "")

@@ -1,0 +1,1 @@
+"""Importing PLCopen XML into the tree of Structured Text."""

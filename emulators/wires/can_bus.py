@@ -208,9 +208,11 @@ class CanBus:
             return self._wire.done[0].frame.t_ns
         start = self._next or (self._upcoming() if self._wire.waiting else None)
         recovery = self._recovery_ns() if self._wire.off else None
-        if start is None or (not self.monitored and self._idles(start)):
-            return recovery
-        return start.end_ns if recovery is None else min(start.end_ns, recovery)
+        if recovery is not None and (start is None or recovery <= start.start_ns):
+            return recovery  # a frame that begins earlier postpones it, because the bus is not idle then
+        if start is None or (recovery is None and not self.monitored and self._idles(start)):
+            return None
+        return start.end_ns
 
     def _run(self, now_ns: int) -> None:
         while True:

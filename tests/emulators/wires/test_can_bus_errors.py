@@ -388,3 +388,26 @@ def test_no_frame_is_lost_and_looking_changes_nothing(
         own = [n for n in notices if n.node == node]
         assert all(a.state is b.before and a.t_ns <= b.t_ns for a, b in itertools.pairwise(own))
     assert bus.next_event_ns() is None
+
+
+@pytest.mark.parametrize("monitored", [True, False])
+def test_a_frame_that_begins_before_a_recovery_postpones_it(monitored: bool) -> None:
+    """The next event was the recovery, at which nothing happened: virtual time stood still."""
+    bus, (a, b, _) = make(3, monitored=monitored)
+    bus.disturb(spoil(times=32))
+    bus.submit(a, ONE, 0)
+    while bus.error_state(a)[0] is not BUS_OFF:
+        event_ns = bus.next_event_ns()
+        assert event_ns is not None
+        bus.advance(event_ns)
+    bus.take_notices(), bus.take_faults()
+    recovery_ns = bus.next_event_ns()
+    assert recovery_ns is not None
+    bus.submit(b, ZERO, recovery_ns - 5 * BIT_NS)
+    assert bus.next_event_ns() == recovery_ns + (50 - 5) * BIT_NS
+    events = []
+    while (event_ns := bus.next_event_ns()) is not None:
+        bus.advance(event_ns)
+        assert len(events) < 10
+        events.append(event_ns)
+    assert bus.error_state(a)[0] is ACTIVE

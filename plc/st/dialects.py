@@ -6,14 +6,15 @@ warnings show each place where a program relies on its dialect, and a user can t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 MAX_WARNINGS = 1_000
-"""The largest number of warnings of one unit that are kept."""
+"""The largest number of warnings with one id that are kept for a unit."""
 
 WARNINGS = {
     "ST001": "assignment to an input",
@@ -105,14 +106,20 @@ def chosen_ids(names: Iterable[str]) -> frozenset[str]:
 
 @dataclass
 class WarningCollector:
-    """The warnings of a unit, each place and id once."""
+    """The warnings of a unit, each place and id once. The last one that is kept of an id says that there are more."""
 
     found: dict[tuple[str, str, int, int], StWarning] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
 
     def add(self, warning: StWarning) -> None:
-        """Add a warning; beyond `MAX_WARNINGS` it is dropped."""
-        if len(self.found) < MAX_WARNINGS:
-            self.found.setdefault((warning.id, warning.path, warning.line, warning.column), warning)
+        """Add a warning; beyond `MAX_WARNINGS` of its id it is dropped."""
+        key = (warning.id, warning.path, warning.line, warning.column)
+        if key in self.found or self.counts[warning.id] == MAX_WARNINGS:
+            return
+        self.counts[warning.id] += 1
+        if self.counts[warning.id] == MAX_WARNINGS:
+            warning = replace(warning, message=f"{warning.message}; further warnings {warning.id} are not listed")
+        self.found[key] = warning
 
     def sorted(self) -> tuple[StWarning, ...]:
         """Return the warnings by file, line and column."""

@@ -14,7 +14,7 @@ from fieldtwin.explain.lookup import explain
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_text
-from fieldtwin.plc.st.dialects import DIALECTS, WARNINGS, chosen_ids, dialect_of
+from fieldtwin.plc.st.dialects import DIALECTS, MAX_WARNINGS, WARNINGS, chosen_ids, dialect_of
 from fieldtwin.plc.st.program import program_class
 from fieldtwin.plc.st.values import LogicError
 from fieldtwin.twin.site.schema import ProgramForm
@@ -214,3 +214,10 @@ def test_every_warning_is_explained() -> None:
 
 def test_the_system_file_knows_every_dialect() -> None:
     assert [ProgramForm(source="a.st", dialect=name).dialect for name in DIALECTS] == list(DIALECTS)  # type: ignore[arg-type]
+
+
+def test_many_warnings_of_one_id_hide_no_other_and_say_that_there_are_more() -> None:
+    found = compiled("\n".join([*["r := d;"] * (MAX_WARNINGS + 1), "i := 3;"]), "codesys").warnings
+    assert [w.id for w in found] == [*["ST002"] * MAX_WARNINGS, "ST001"]
+    assert found[-2].message.endswith("further warnings ST002 are not listed")
+    assert "further" not in found[-3].message

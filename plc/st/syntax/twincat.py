@@ -1,8 +1,8 @@
 """Convert the files of a TwinCAT project (.TcPOU, .TcDUT, .TcGVL) to Structured Text, line for line and column for column.
 
 Such a file is XML with the declaration and the ST body of one object as text in CDATA sections; outside of these, an entity
-moves the columns after it. Methods, properties, actions, transitions and
-bodies in graphical languages are refused by name. Document types are refused, which excludes all attacks with entities.
+moves the columns after it. Actions become those of Structured Text. Methods, properties, transitions and bodies in graphical
+languages are refused by name. Document types are refused, which excludes all attacks with entities.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _KIND = re.compile(
 )
 """The first word of a declaration; comments and pragmas are skipped."""
 _UNSUPPORTED = {
-    "Method": "methods", "Property": "properties", "Action": "actions", "Transition": "transitions", "Itf": "interfaces",
+    "Method": "methods", "Property": "properties", "Transition": "transitions", "Itf": "interfaces",
 }  # fmt: skip
 _PARTS = ("POU", "DUT", "GVL")
 
@@ -36,13 +36,28 @@ def to_st(text: str, path: str = "") -> str:
     return reader.text()
 
 
+Piece = tuple[int, int, str]
+"""A part of a text, with its line and column in the file."""
+
+
 @dataclass(slots=True)
-class _Object:
-    """A POU, type or list: the pieces of its texts, each with its line and column in the file, and where it ends."""
+class _Action:
+    """An action of a POU: its name, where its element begins and ends, and the pieces of its body."""
 
     name: str
-    declaration: list[tuple[int, int, str]] = field(default_factory=list)
-    body: list[tuple[int, int, str]] = field(default_factory=list)
+    begin: tuple[int, int]
+    body: list[Piece] = field(default_factory=list)
+    end: tuple[int, int] = (1, 0)
+
+
+@dataclass(slots=True)
+class _Object:
+    """A POU, type or list: the pieces of its texts, its actions, and where it ends."""
+
+    name: str
+    declaration: list[Piece] = field(default_factory=list)
+    body: list[Piece] = field(default_factory=list)
+    actions: list[_Action] = field(default_factory=list)
     end: tuple[int, int] = (1, 0)
 
 
@@ -71,10 +86,12 @@ class _Reader:
     def text(self) -> str:
         lines: list[str] = []
         for found in self._objects:
-            for pieces in (found.declaration, found.body):
-                if pieces:  # the parser delivers a text in pieces, one for each line or entity
-                    line, column, _ = pieces[0]
-                    _put(lines, line, column, "".join(piece for _, _, piece in pieces))
+            _put_pieces(lines, found.declaration)
+            _put_pieces(lines, found.body)
+            for action in found.actions:
+                _put(lines, *action.begin, f"ACTION {action.name}:")
+                _put_pieces(lines, action.body)
+                _put(lines, *action.end, "END_ACTION ")
             kind = _KIND.match("".join(piece for _, _, piece in found.declaration))
             if kind is not None:
                 _put(lines, *found.end, f"END_{kind[1].upper()}")
@@ -92,19 +109,34 @@ class _Reader:
         elif tag in _UNSUPPORTED and len(self._open) <= 3:
             of = f" of {self._objects[-1].name}" if self._objects else ""
             self._fail(f"{name}{of}: {_UNSUPPORTED[tag]} are not supported")
-        elif self._open[2:] == ["Implementation", tag] and tag != "ST":
-            self._fail(f"the body of {self._objects[-1].name} is not Structured Text", expected="ST", got=tag)
+        elif self._open[1:] == ["POU", "Action"]:
+            self._objects[-1].actions.append(_Action(name, self._place()))
+        elif self._objects and tag != "ST" and self._open[2:-1] in (["Implementation"], ["Action", "Implementation"]):
+            self._fail(f"the body of {self._owner()} is not Structured Text", expected="ST", got=tag)
 
     def _end(self, tag: str) -> None:
         if self._open[1:] == [tag] and self._objects:
-            self._objects[-1].end = self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber
+            self._objects[-1].end = self._place()
+        elif self._open[1:] == ["POU", "Action"]:
+            self._objects[-1].actions[-1].end = self._place()
         self._open.pop()
 
+    def _owner(self) -> str:
+        """Return the name of the POU or the action that is being read."""
+        found = self._objects[-1]
+        return f"{found.name}.{found.actions[-1].name}" if "Action" in self._open else found.name
+
+    def _place(self) -> tuple[int, int]:
+        return self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber
+
     def _characters(self, data: str) -> None:
-        piece = self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber, data
+        piece = (*self._place(), data)
         if not self._objects:
             return
-        places = {"Declaration": self._objects[-1].declaration, "Implementation/ST": self._objects[-1].body}
+        found = self._objects[-1]
+        places = {"Declaration": found.declaration, "Implementation/ST": found.body}
+        if found.actions:
+            places["Action/Implementation/ST"] = found.actions[-1].body
         pieces = places.get("/".join(self._open[2:]))
         if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is no part of the text
             pieces.append(piece)
@@ -112,6 +144,13 @@ class _Reader:
     def _doctype(self, *_: object) -> None:
         line = self._parser.CurrentLineNumber
         raise FileInvalid("a document type declaration is not allowed", path=self._path, line=line)
+
+
+def _put_pieces(lines: list[str], pieces: list[Piece]) -> None:
+    """Write a text at its place. The parser delivers it in pieces, one for each line or entity."""
+    if pieces:
+        line, column, _ = pieces[0]
+        _put(lines, line, column, "".join(piece for _, _, piece in pieces))
 
 
 def _put(lines: list[str], line: int, column: int, text: str) -> None:

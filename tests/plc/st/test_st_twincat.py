@@ -85,20 +85,48 @@ def test_errors_have_line_and_column_of_the_file(project: Path, file: str, befor
     assert f"{path.name}:{place}" in places
 
 
+ACTIONS = """  <Action Name="Reset" Id="{5}">
+      <Implementation>
+        <ST><![CDATA[n := 0;
+calls := calls + 1;]]></ST>
+      </Implementation>
+    </Action><Action Name="Nothing"/>
+  </POU>"""
+
+
+def test_actions_are_called_and_errors_in_them_have_their_place(tmp_path: Path) -> None:
+    path = tmp_path / "MAIN.TcPOU"
+    text = f"""{HEAD}<POU Name="MAIN" Id="{{1}}"><Declaration><![CDATA[PROGRAM MAIN
+VAR n : INT := 5; calls : INT; END_VAR]]></Declaration>
+    <Implementation><ST>n := n + 1; IF n > 6 THEN Reset(); Nothing(); END_IF</ST></Implementation>
+{ACTIONS}</TcPlcObject>"""
+    path.write_text(text.replace("n > 6", "n &gt; 6"))
+    made: Any = load_program(str(path), dialect="twincat")
+    for number in range(1, 4):
+        scan(made, number)
+    assert (made.n, made.calls) == (1, 1)
+    path.write_text(path.read_text().replace("calls := calls", "calls := call"))
+    with pytest.raises(FileInvalid, match=r"MAIN\.TcPOU:9:10: .*call"):
+        load_program(str(path), dialect="twincat")
+
+
 def test_parts_that_are_not_supported_are_named() -> None:
     parts = (
         '<Method Name="Start" Id="{5}"><Declaration>METHOD Start</Declaration></Method>\n'
-        '<Property Name="Level" Id="{6}"><Get Name="Get"/></Property><Action Name="Reset"/>\n</POU>'
+        '<Property Name="Level" Id="{6}"><Get Name="Get"/></Property><Transition Name="Full"/>\n</POU>'
     )
     with pytest.raises(FileInvalid) as caught:
         to_st(MAIN.replace("</POU>", parts), "MAIN.TcPOU")
     assert [str(error) for error in (caught.value, *caught.value.others)] == [
         "MAIN.TcPOU:17:3: Start of MAIN: methods are not supported",
         "MAIN.TcPOU:18:1: Level of MAIN: properties are not supported",
-        "MAIN.TcPOU:18:61: Reset of MAIN: actions are not supported",
+        "MAIN.TcPOU:18:61: Full of MAIN: transitions are not supported",
     ]
     with pytest.raises(FileInvalid, match="the body of MAIN is not Structured Text; expected ST; got NWL"):
         to_st(MAIN.replace("<ST>", "<NWL>").replace("</ST>", "</NWL>"))
+    drawn = '<Action Name="Stop"><Implementation><NWL/></Implementation></Action></POU>'
+    with pytest.raises(FileInvalid, match=r"the body of MAIN\.Stop is not Structured Text"):
+        to_st(MAIN.replace("</POU>", drawn))
     with pytest.raises(FileInvalid, match="I_Motor: interfaces are not supported"):
         to_st(f'{HEAD}<Itf Name="I_Motor"/></TcPlcObject>')
 
@@ -112,6 +140,7 @@ def test_parts_that_are_not_supported_are_named() -> None:
             "a document type declaration is not allowed",
         ),
         (f"{HEAD}</TcPlcObject>", ""),
+        (f"{HEAD}<Other><Implementation><X/></Implementation></Other></TcPlcObject>", ""),
     ],
 )
 def test_a_damaged_file_is_refused(text: str, message: str) -> None:

@@ -34,8 +34,8 @@ class Inspection:
     """The types of a unit's function blocks, and the variables of a program: its top level, by the name as declared."""
 
     def __init__(self, unit: CompiledUnit, variables: Sequence[tuple[str, ty.Type]]) -> None:
-        self._blocks = unit.blocks
-        self._variables = variables
+        self._blocks = {name: _declared(of) for name, of in unit.blocks.items()}
+        self._variables = _declared(variables)
 
     def names(self, body: Any) -> Iterator[str]:
         """Return the path of every variable of `body`; an array of simple values has one path."""
@@ -88,6 +88,11 @@ class Inspection:
             return None
         members = self._members(kind, value)
         return next(((of, inside) for member, of, inside in members if member.lower() == name.lower()), None)
+
+
+def _declared(variables: Sequence[tuple[str, ty.Type]]) -> list[tuple[str, ty.Type]]:
+    """Return the variables that a source declares. The compiler adds blocks for drawn edges, whose names begin with a number."""
+    return [(name, kind) for name, kind in variables if not name[0].isdigit()]
 
 
 def _first(path: str) -> tuple[str, str]:

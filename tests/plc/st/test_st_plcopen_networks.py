@@ -144,6 +144,7 @@ def test_contacts_and_coils_for_edges_are_true_for_one_scan() -> None:
         scan(made, number, a=a)
         seen.append((made.up, made.down, made.once))
     assert seen == [(False, True, False), (True, False, True), (False,) * 3, (False, True, False), (False,) * 3]
+    assert list(made.internal_names()) == []  # the blocks for the edges are not in the export
 
 
 def test_networks_run_from_top_to_bottom_and_order_numbers_change_that() -> None:

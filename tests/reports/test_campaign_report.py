@@ -57,6 +57,14 @@ def test_the_coverage_curve_counts_each_situation_once_in_the_order_of_the_ends(
     assert "Coverage over virtual hours" not in render_campaign([campaign_of(runs(entry(1)))])
 
 
+def test_a_short_campaign_without_named_workers_has_readable_times() -> None:
+    made = [replace(entry(n, worker=""), hours=0.01, coverage=Coverage(frozenset({n})).text()) for n in (1, 2)]
+    page = render_campaign([campaign_of(runs(*made))])
+    assert "0 workers" not in page
+    assert ">36 s<" in page  # half of 0.02 h, below the curve
+    assert "e-0" not in page
+
+
 def test_a_missing_seed_is_inconclusive_and_is_an_error_in_junit(tmp_path: Path) -> None:
     campaign = campaign_of(runs(entry(1), entry(2)), frozenset({1, 2, 3}))
     assert campaign.verdict is Verdict.INCONCLUSIVE

@@ -39,8 +39,8 @@ def runs_chart(timeline: Timeline) -> Markup:
     return _chart("runs that ended over wall time", most, labels, marks)
 
 
-def curve_chart(title: str, points: Sequence[tuple[float, int]], unit: str) -> Markup:
-    """Return a step curve through `points`, each a position (rising) in `unit` and a count, which begins at (0, 0)."""
+def curve_chart(title: str, points: Sequence[tuple[float, int]]) -> Markup:
+    """Return a step curve through `points`, each a virtual time in hours (rising) and a count, which begins at (0, 0)."""
     end, most = max(points[-1][0], 1e-9), _round_up(max(y for _, y in points))
     across, room = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
     words, last = [f"M{LEFT:.1f} {HEIGHT - BOTTOM:.1f}"], ""
@@ -49,7 +49,7 @@ def curve_chart(title: str, points: Sequence[tuple[float, int]], unit: str) -> M
         if word != last:
             words.append(word)
         last = word
-    labels = [f"{_short(n * end / TICKS)} {unit}" for n in range(TICKS + 1)]
+    labels = [_hours(n * end / TICKS) if end >= 1 else duration(n * end / TICKS * 3600) for n in range(TICKS + 1)]
     return _chart(title, most, labels, [el("path", cls="curve", d="".join(words))])
 
 
@@ -72,8 +72,8 @@ def _chart(title: str, most: int, labels: Sequence[str], marks: Sequence[Markup]
     )  # fmt: skip
 
 
-def _short(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+def _hours(hours: float) -> str:
+    return f"{hours:,.0f} h" if hours >= 100 else f"{hours:.3g} h"
 
 
 def _round_up(count: int) -> int:

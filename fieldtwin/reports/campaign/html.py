@@ -62,7 +62,7 @@ def _section(campaign: CampaignResult, *, alone: bool) -> Markup:
         facts=_facts(campaign, timeline),
         speed=_speed(campaign, timeline),
         runs_chart=runs_chart(timeline) if timeline is not None else None,
-        coverage_chart=curve_chart("different situations reached over virtual hours", campaign.coverage, "h")
+        coverage_chart=curve_chart("different situations reached over virtual hours", campaign.coverage)
         if campaign.coverage
         else None,
         causes_chart=_causes_chart(campaign) if len(campaign.groups) > 1 else None,
@@ -111,7 +111,7 @@ def _causes_chart(campaign: CampaignResult) -> Markup:
         if run.seed in group_of and group_of[run.seed] not in found:
             found.add(group_of[run.seed])
             points.append((hours, len(found)))
-    return curve_chart("causes of failures found over virtual hours", [*points, (hours, len(found))], "h")
+    return curve_chart("causes of failures found over virtual hours", [*points, (hours, len(found))])
 
 
 def listed(seeds: Sequence[int]) -> str:

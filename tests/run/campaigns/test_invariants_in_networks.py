@@ -81,6 +81,7 @@ def test_a_run_of_a_network_with_a_broken_invariant_is_not_ok(folder: Path) -> N
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)  # two campaigns of three systems, each with the search for causes and runs for traces
 def test_random_faults_break_an_invariant_of_a_member_and_are_shrunk(folder: Path) -> None:
     add(folder, "west", READ)
     code, results = judge("active.scenario.yaml", "--seeds", "1..2", "--for", "4min", *RANDOM)

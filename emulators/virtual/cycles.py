@@ -36,7 +36,7 @@ def skip_runs(timers: Timers) -> None:
     Their timers get later, and keep their order.
     """
     first: Timers = []
-    while timers and isinstance(timers[0][2], CycleSleep) and (not first or _have_one_period(first[0], timers[0])):
+    while timers and isinstance(timers[0][2], CycleSleep) and (not first or _run_in_turn(first[0], timers[0])):
         sleep = heappop(timers)
         if not sleep[2].done():
             first.append(sleep)
@@ -46,8 +46,13 @@ def skip_runs(timers: Timers) -> None:
         heappush(timers, sleep)
 
 
-def _have_one_period(one: tuple[int, int, CycleSleep], other: tuple[int, int, CycleSleep]) -> bool:
-    return one[2].cycle.period_ns == other[2].cycle.period_ns
+def _run_in_turn(one: tuple[int, int, CycleSleep], other: tuple[int, int, CycleSleep]) -> bool:
+    """Return whether two cycles have one period and the second runs within a period of the first one.
+
+    A later run could be at the same instant as one of the first cycle, which then has a later sequence number than it has now.
+    """
+    period_ns = one[2].cycle.period_ns
+    return period_ns == other[2].cycle.period_ns and other[0] - one[0] < period_ns
 
 
 def _is_repeated(sleeps: Timers, until_ns: int) -> bool:

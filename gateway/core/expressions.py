@@ -53,7 +53,7 @@ def _deadband(x: float, width: float) -> float:
 
 OF_NUMBERS: dict[str, tuple[int, Callable[..., float]]] = {
     "abs": (1, abs),
-    "atan2": (2, math.atan2),
+    "atan2": (2, lambda y, x: math.atan2(y + 0.0, x + 0.0)),  # -0.0 as 0.0: a whole number has only one zero
     "clamp": (3, clamp),
     "cos": (1, math.cos),
     "deadband": (2, _deadband),

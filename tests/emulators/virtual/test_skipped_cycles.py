@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -90,6 +90,7 @@ def log_of(phases: list[int], periods: list[int], events: list[int], *, skips: b
     periods=st.lists(st.sampled_from([10, 20]), min_size=1, max_size=3),
     events=st.lists(st.integers(0, 999), max_size=20),
 )
+@example([1, 1, 21], [10, 10, 10], [22])  # the third cycle begins at a run of the others, two periods later
 def test_every_event_and_cycle_sees_the_same_with_and_without_skipped_runs(
     phases: list[int], periods: list[int], events: list[int]
 ) -> None:

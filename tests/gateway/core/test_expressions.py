@@ -7,7 +7,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.simulation.formula import Formula
@@ -34,6 +34,7 @@ def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
 
 
 @given(st.recursive(LEAVES, _grown, max_leaves=8))
+@example("(-atan2(0, (-0)))")
 def test_a_condition_and_a_formula_compute_the_same_number(text: str) -> None:
     condition = Expression(text, list(NAMES)).evaluate(lambda function, name: NAMES[name])
     formula = Formula(text, tuple(NAMES), Random(1))({"t": 0.0, "dt": 0.1, **NAMES})

@@ -196,7 +196,8 @@ class OutputImage:
         sent = self.writer.last_sequence
         for output, outbox in self.outboxes:
             got = taken[output.taken] if output.taken is not None else 0
-            outbox.outstanding = sent(output.tag) - (got if isinstance(got, int) else 0)
+            # A receiver that counted messages before this process began may have taken more than were published.
+            outbox.outstanding = max(0, sent(output.tag) - (got if isinstance(got, int) else 0))
 
     def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
         """Collect the present values of `programs`, and record each change with the inputs that the program read."""

@@ -6,6 +6,7 @@ FMI 2.0.4 and FMI 3.0.1 (fmi-standard.org), section 2.2 (2.0) and 2.4 (3.0). The
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -154,5 +155,5 @@ def unpack(path: Path, folder: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             archive.extractall(folder)  # removes absolute paths and ".." from the names
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError) as e:
+    except (OSError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, ValueError) as e:
         raise FileInvalid(f"cannot be unpacked: {str(e) or type(e).__name__}", path=str(path)) from e

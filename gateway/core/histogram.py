@@ -52,7 +52,9 @@ class Histogram:
         self.count += times
         self.total_ns += ns * times
         self.counts[bisect_left(self.limits_ns, ns) if ns else 0] += times  # in virtual time every scan takes 0 ns
-        if self._recent.maxlen:
+        if times == 1:  # the usual case, once for each scan and each request
+            self._recent.append(ns)
+        elif self._recent.maxlen:
             self._recent.extend([ns] * min(times, self._recent.maxlen))
 
     @property

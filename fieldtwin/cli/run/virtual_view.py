@@ -14,9 +14,9 @@ from rich.table import Table
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_reports import CampaignReports
-from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, show_causes, simulated_causes
+from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, simulated_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
-from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
+from fieldtwin.cli.campaigns.failures import examine_failures
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
@@ -142,42 +142,41 @@ def run_many(
     )
     has_faults = options.random_faults is not None or options.faults or options.fault_file
     finished = [r for r in failed if r.sha256]
-    found, search_interrupted = list[FoundCause](), False
-    if finished and has_faults and not interrupted:
-        found, search_interrupted = simulated_causes(options, finished, len(left), jobs)
-    ends_now = interrupted or search_interrupted
-    hashes = {} if ends_now else {r.seed: r.sha256 for r in finished}
-    traces, traces_interrupted = keep_traces(place, work, hashes, [one.seeds[0] for one in found], system)
-    ended_early = ends_now or traces_interrupted
+    examined = examine_failures(
+        place,
+        work,
+        {r.seed: r.sha256 for r in finished},
+        system,
+        (lambda: simulated_causes(options, finished, len(left), jobs)) if has_faults else None,
+        interrupted=interrupted,
+    )
     if reports.given:
         recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
         untested_all = untested and len(left) == len(seeds)
-        reports.write([_result(what, recorded, seeds, ledger_path, traces, untested=untested_all)])
+        reports.write([_result(what, recorded, seeds, ledger_path, examined.traces, untested=untested_all)])
     if as_json:
         json.dump(
             {
                 "results": [_plain(r) for r in results],
                 "failed": sorted([*before, *(r.seed for r in failed)]),
-                "groups": [one.plain() for one in found],
-                "traces": traces.plain(),
+                "groups": [one.plain() for one in examined.causes],
+                "traces": examined.traces.plain(),
                 "coverage": joined(r.coverage for r in results).counts(),
                 "repeated": repeats.count,
                 "different": sorted(different),
-                "interrupted": ended_early,
+                "interrupted": examined.interrupted,
             },
             sys.stdout,
             indent=2,
         )
         sys.stdout.write("\n")
-        return INTERRUPTED if ended_early else 1 if failed or before or untested or different else 0
+        return INTERRUPTED if examined.interrupted else 1 if failed or before or untested or different else 0
     for result in failed:
         stdout.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
         for error in result.errors:
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
-    show_causes(found)
-    if not ends_now:
-        show_traces(traces, [r.seed for r in finished], again)
+    examined.show([r.seed for r in finished], again)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
@@ -204,7 +203,7 @@ def run_many(
     if interrupted:
         stdout.print(interrupted_text(len(results), len(left)), soft_wrap=True)
         return INTERRUPTED
-    if search_interrupted:
+    if examined.search_interrupted:
         stdout.print(SEARCH_INTERRUPTED, soft_wrap=True)
     if untested and not failed and not before and not different:
         stdout.print(
@@ -214,7 +213,7 @@ def run_many(
         return 1
     bad = bool(failed or before or different)
     stdout.print("[bold red]not ok[/bold red]" if bad else "[bold green]ok[/bold green]")
-    return INTERRUPTED if ended_early else 1 if bad else 0
+    return INTERRUPTED if examined.interrupted else 1 if bad else 0
 
 
 def _result(

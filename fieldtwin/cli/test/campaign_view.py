@@ -10,9 +10,9 @@ from rich.markup import escape
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
-from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, find_causes, show_causes, shrunk_texts
+from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, FoundCause, find_causes, shrunk_texts
 from fieldtwin.cli.campaigns.ending import different_texts, ends_early, interrupted_text, repeats_text
-from fieldtwin.cli.campaigns.traces import keep_traces, show_traces
+from fieldtwin.cli.campaigns.failures import examine_failures
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.virtual_view import coverage_text
@@ -103,23 +103,22 @@ def run_scenario_campaign(
         for result in results:
             _show_seed(result, show)
     failed = [result for result in results if result.verdict.bad and result.trace_hash]
-    shrinks = bool(failed) and not interrupted and campaign.random_faults is not None
-    found, search_interrupted = list[FoundCause](), False
-    if shrinks:
-        found, search_interrupted = _causes(campaign, failed, len(results), options.jobs or 1)
-    if show is not None:
-        show_causes(found)
-    ends_now = interrupted or search_interrupted
-    hashes = {} if ends_now else {result.seed or 0: result.trace_hash for result in failed}
-    traces, traces_interrupted = keep_traces(place, work, hashes, [one.seeds[0] for one in found], case_of(path))
+    has_faults = campaign.random_faults is not None
+    examined = examine_failures(
+        place,
+        work,
+        {result.seed or 0: result.trace_hash for result in failed},
+        case_of(path),
+        (lambda: _causes(campaign, failed, len(results), options.jobs or 1)) if has_faults else None,
+        interrupted=interrupted,
+    )
     if show is not None:
         reproduce = {result.seed or 0: result.reproduce for result in failed}
-        if not ends_now:
-            show_traces(traces, list(reproduce), reproduce.__getitem__)
-        if search_interrupted:
+        examined.show(list(reproduce), reproduce.__getitem__)
+        if examined.search_interrupted:
             stdout.print(SEARCH_INTERRUPTED, soft_wrap=True)
         _show_whole(whole)
-    files = traces.plain()
+    files = examined.traces.plain()
     report = campaign_of(
         Runs(what, __version__, tuple(entries if ledger is None else ledger.entries_of(what, seeds))),
         frozenset(seeds),
@@ -135,8 +134,8 @@ def run_scenario_campaign(
     return CampaignResults(
         whole,
         [replace(one, trace_file=files.get(one.seed or 0, "")) for one in results],
-        [one.confirmed for one in found if one.confirmed is not None],
-        ends_now or traces_interrupted,
+        [one.confirmed for one in examined.causes if one.confirmed is not None],
+        examined.interrupted,
         report,
     )
 

@@ -1,5 +1,4 @@
-"""The elements of a PLCopen XML file with their positions. Document types are refused, which excludes all attacks with
-entities."""
+"""The elements of a PLCopen XML file with their positions."""
 
 from __future__ import annotations
 
@@ -8,6 +7,7 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.syntax.xml_text import parse_xml
 
 MAX_ELEMENTS = 500_000
 
@@ -55,36 +55,29 @@ def project_of(text: str, path: str = "") -> Element:
     """Return the ``<project>`` of a PLCopen XML file. Raises `FileInvalid`."""
     root = Element("", {}, 1)
     stack, count = [root], 0
-    parser = expat.ParserCreate(namespace_separator="}")
-    parser.buffer_text = False
 
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        if count > MAX_ELEMENTS:
-            raise FileInvalid("the export is too large", path=path, expected=f"at most {MAX_ELEMENTS} elements")
-        line, column = parser.CurrentLineNumber, parser.CurrentColumnNumber + 1
-        element = Element(name.rpartition("}")[2], attributes, line, column)
-        stack[-1].children.append(element)
-        stack.append(element)
+    def listen(parser: expat.XMLParserType) -> None:
+        def start(name: str, attributes: dict[str, str]) -> None:
+            nonlocal count
+            count += 1
+            if count > MAX_ELEMENTS:
+                raise FileInvalid("the export is too large", path=path, expected=f"at most {MAX_ELEMENTS} elements")
+            line, column = parser.CurrentLineNumber, parser.CurrentColumnNumber + 1
+            element = Element(name.rpartition("}")[2], attributes, line, column)
+            stack[-1].children.append(element)
+            stack.append(element)
 
-    def end(name: str) -> None:
-        stack.pop().end_line = parser.CurrentLineNumber
+        def end(name: str) -> None:
+            stack.pop().end_line = parser.CurrentLineNumber
 
-    def characters(data: str) -> None:
-        stack[-1].text.append((parser.CurrentLineNumber, data))
+        def characters(data: str) -> None:
+            stack[-1].text.append((parser.CurrentLineNumber, data))
 
-    def doctype(*_: object) -> None:
-        raise FileInvalid("a document type declaration is not allowed", path=path, line=parser.CurrentLineNumber)
+        parser.StartElementHandler = start
+        parser.EndElementHandler = end
+        parser.CharacterDataHandler = characters
 
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.CharacterDataHandler = characters
-    parser.StartDoctypeDeclHandler = doctype
-    try:
-        parser.Parse(text.encode(), True)
-    except expat.ExpatError as e:
-        raise FileInvalid(f"not XML: {expat.ErrorString(e.code)}", path=path, line=e.lineno, column=e.offset + 1) from e
+    parse_xml(text, path, listen, "}")
     project = root.find("project")
     if project is None:
         raise FileInvalid("not a PLCopen export", path=path, line=1, expected="a <project>")

@@ -2,7 +2,7 @@
 
 Such a file is XML with the declaration and the ST body of one object as text in CDATA sections; outside of these, an entity
 moves the columns after it. Actions become those of Structured Text. Methods, properties, transitions and bodies in graphical
-languages are refused by name. Document types are refused, which excludes all attacks with entities.
+languages are refused by name.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from xml.parsers import expat
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.plc.st.syntax.xml_text import parse_xml
 
 _ROOT = re.compile(r"\s*(<\?xml[^>]*\?>)?\s*<TcPlcObject\b")
 _KIND = re.compile(
@@ -67,21 +68,17 @@ class _Reader:
         self._errors = ErrorCollector()
         self._open: list[str] = []
         self._objects: list[_Object] = []
-        self._parser = expat.ParserCreate()
+        self._parser: expat.XMLParserType
 
     def read(self, text: str) -> None:
-        parser = self._parser
-        parser.buffer_text = False
+        parse_xml(text, self._path, self._listen)
+        self._errors.raise_all()
+
+    def _listen(self, parser: expat.XMLParserType) -> None:
+        self._parser = parser
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
         parser.CharacterDataHandler = self._characters
-        parser.StartDoctypeDeclHandler = self._doctype
-        try:
-            parser.Parse(text.encode(), True)
-        except expat.ExpatError as e:
-            message = f"not XML: {expat.ErrorString(e.code)}"
-            raise FileInvalid(message, path=self._path, line=e.lineno, column=e.offset + 1) from e
-        self._errors.raise_all()
 
     def text(self) -> str:
         lines: list[str] = []
@@ -140,10 +137,6 @@ class _Reader:
         pieces = places.get("/".join(self._open[2:]))
         if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is no part of the text
             pieces.append(piece)
-
-    def _doctype(self, *_: object) -> None:
-        line = self._parser.CurrentLineNumber
-        raise FileInvalid("a document type declaration is not allowed", path=self._path, line=line)
 
 
 def _put_pieces(lines: list[str], pieces: list[Piece]) -> None:

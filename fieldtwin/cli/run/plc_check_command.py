@@ -17,17 +17,16 @@ from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.plc.st.dialects import DIALECTS, Dialect, StWarning, chosen_ids, dialect_of
 
 if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
-    from fieldtwin.plc.st.dialects import Dialect, StWarning
     from fieldtwin.plc.st.syntax.tree import Missing
 
     _Program = tuple[Path, Dialect, tuple[Path, ...]]
     """A file or folder of programs, its dialect, and its libraries."""
 
 _OF_SYSTEMS = (".yaml", ".yml")
-_DIALECTS = ("standard", "codesys", "twincat", "matiec")
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class _Found:
     "Options",
     click.option(
         "--dialect",
-        type=click.Choice(_DIALECTS),
+        type=click.Choice(list(DIALECTS)),
         help="The dialect of a file or folder (default: standard). A system states the dialect of each program.",
     ),
     click.option(
@@ -94,8 +93,6 @@ def check(
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
     """
-    from fieldtwin.plc.st.dialects import chosen_ids, dialect_of
-
     if _is_program(source):
         programs = [(Path(source), dialect_of(dialect or "standard"), libraries)]
     elif dialect is not None or libraries:
@@ -129,7 +126,6 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[_Progra
 
     Raises `UsageError` if it has none.
     """
-    from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.run.template import system_file
     from fieldtwin.twin.site.system import load_system
 

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.prove import Proof
 from fieldtwin.plc.states import StateTable
@@ -105,11 +104,10 @@ def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:
 
 def programs(system: System) -> dict[str, Program]:
     """Load each program of a system by name, without running it. Raises `FileInvalid`."""
+    from fieldtwin.twin.plant.physical import programs_of
+
     folder = str(system.path.parent)
-    return {
-        name: load_program(form.source, (folder,), dialect=form.dialect, libraries=form.libraries)
-        for name, form in system.plc.programs.items()
-    }
+    return {config.name: config.bind((folder,)).program for config in programs_of(system)}
 
 
 def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:

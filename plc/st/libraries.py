@@ -23,11 +23,12 @@ class Library:
 
     found: dict[str, Declaration] = field(default_factory=dict)
     broken: dict[str, FileInvalid] = field(default_factory=dict)
-    warnings: list[t.SourceUnit] = field(default_factory=list)
+    units: list[t.SourceUnit] = field(default_factory=list)
+    """The files, for their warnings and for what was not imported from them."""
 
     def add(self, unit: t.SourceUnit) -> None:
         """Add the declarations of a file; PROGRAMs are left out."""
-        self.warnings.append(unit)
+        self.units.append(unit)
         for pou in unit.pous:
             if pou.kind != "PROGRAM":
                 self._name(pou.name, pou)
@@ -78,8 +79,8 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
         (*unit.types, *(d for d in taken.values() if isinstance(d, t.TypeDecl))),
         (*unit.globals, *(d for d in taken.values() if isinstance(d, t.VarBlock))),
         (*unit.pous, *(d for d in taken.values() if isinstance(d, t.Pou))),
-        (*unit.warnings, *(w for one in library.warnings for w in one.warnings if w.path in files)),
-        (*unit.missing, *(m for one in library.warnings for m in one.missing if _owner(m) in seen)),
+        (*unit.warnings, *(w for one in library.units for w in one.warnings if w.path in files)),
+        (*unit.missing, *(m for one in library.units for m in one.missing if _owner(m) in seen)),
     )
 
 

@@ -6,6 +6,7 @@ In a unit, types, globals and POUs may be declared in any order and in any file,
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -70,14 +71,10 @@ def _library(texts: Texts, dialect: Dialect) -> Library:
             library.add(_unit(path, text, dialect))
         except FileInvalid as whole:
             try:
-                parts = read_parts if _is_export(text) else parse_parts
-                source = text if _is_export(text) else _as_st(path, text)
-                for unit, names, error in parts(source, path, dialect):
-                    library.add(_in_list(unit, path, text, dialect))
+                for unit, names, error in _parts(path, text, dialect):
+                    library.add(unit)
                     library.fail(names, error or whole)
-            except (
-                FileInvalid
-            ) as e:  # a file that is not even text of the language: its name is that of its declaration
+            except FileInvalid as e:  # not even text of the language: the file's name is that of its declaration
                 library.fail((Path(path).stem,), e)
     return library
 
@@ -106,6 +103,15 @@ def _unit(path: str, text: str, dialect: Dialect) -> SourceUnit:
     return _in_list(parse_all(_as_st(path, text), path, dialect), path, text, dialect)
 
 
+def _parts(path: str, text: str, dialect: Dialect) -> Iterator[tuple[SourceUnit, tuple[str, ...], FileInvalid | None]]:
+    """Read each declaration of a file alone, as `parse_parts` does, with the list of its global variables as in `_unit`."""
+    if _is_export(text):
+        yield from read_parts(text, path, dialect)
+        return
+    for unit, names, error in parse_parts(_as_st(path, text), path, dialect):
+        yield _in_list(unit, path, text, dialect), names, error
+
+
 def _is_export(text: str) -> bool:
     return is_plcopen(text) and not twincat.is_twincat(text)
 
@@ -116,7 +122,7 @@ def _as_st(path: str, text: str) -> str:
 
 
 def _in_list(unit: SourceUnit, path: str, text: str, dialect: Dialect) -> SourceUnit:
-    if not dialect.vendor or _is_export(text):
+    if not dialect.vendor:
         return unit
     name, only_qualified = Path(path).stem, _QUALIFIED_ONLY.search(text) is not None
     lists = (replace(block, list=name, only_qualified=only_qualified) for block in unit.globals)

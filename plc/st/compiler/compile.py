@@ -368,18 +368,17 @@ class _Unit:
         self._note_parts(pou, symbols)
         held = [s for s in symbols.values() if s.code.startswith("self.")]
         kept = [s.code.split(".")[1] for s in held]
-        references = {v.name.lower() for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables}
-        self._kept[pou.name.lower()] = tuple((s.name, s.type) for s in held if s.name.lower() not in references)
+        in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
+        self._kept[pou.name.lower()] = tuple(
+            (s.name, s.type) for s, attribute in zip(held, kept, strict=True) if attribute not in in_outs
+        )
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
             self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
-            in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
             self.out.line(f"in_outs = {tuple(in_outs)}")
             with self.out.block("def __init__(self):"):
                 self._initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou)))
-                for block in pou.blocks:
-                    if block.kind == "VAR_IN_OUT":
-                        for v in block.variables:
-                            self.out.line(f"self.v_{v.name.lower()} = None")
+                for attribute in in_outs:
+                    self.out.line(f"self.{attribute} = None")
             with self.out.block("def execute(self, now_ns):"):
                 self.out.step(pou.pos)
                 self._initialise(pou, symbols, ("VAR_TEMP",))

@@ -10,7 +10,7 @@ from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.expressions import Expressions
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, simple_default
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_REPEATED = 100
@@ -280,14 +280,9 @@ class Declarations:
         return code
 
     def _default(self, kind: ty.Type) -> str:
-        if isinstance(kind, ty.Subrange):
-            return str(min(max(0, kind.low), kind.high))
-        if isinstance(kind, ty.Elementary):
-            return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
-        if isinstance(kind, ty.String):
-            return "''"
-        if isinstance(kind, ty.Enum):
-            return str(kind.initial)
+        simple = simple_default(kind)
+        if simple is not None:
+            return simple
         if isinstance(kind, ty.Struct):
             return f"S_{kind.name.lower()}()"
         if isinstance(kind, ty.Block):

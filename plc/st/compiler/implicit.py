@@ -28,11 +28,10 @@ def converted(x: Compiling, value: Value, target: ty.Type, pos: Pos) -> str | No
         value = Value(value.code, source)
     if not (isinstance(source, ty.Elementary) and isinstance(sink, ty.Elementary)):
         return None
-    warning = "" if ty.fits(source, sink) else _warning(source, sink)
-    if not warning and not ty.fits(source, sink):
-        return None
-    if warning and not x.env.accepts(warning, pos, f"{value.type} is converted to {sink}"):
-        return None
+    if not ty.fits(source, sink):
+        warning = _warning(source, sink)
+        if not warning or not x.env.accepts(warning, pos, f"{value.type} is converted to {sink}"):
+            return None
     code = _code(value.code, source, sink)
     return f"_v.inside({code}, {target.low}, {target.high})" if isinstance(target, ty.Subrange) else code
 

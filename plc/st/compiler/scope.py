@@ -71,6 +71,17 @@ class Signature:
     outputs: tuple[Parameter, ...]
 
 
+def simple_default(kind: ty.Type) -> str | None:
+    """Return the initial value of a type without parts as Python code; None for other types."""
+    if isinstance(kind, ty.Subrange):
+        return str(min(max(0, kind.low), kind.high))
+    if isinstance(kind, ty.Elementary):
+        return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
+    if isinstance(kind, ty.String):
+        return "''"
+    return str(kind.initial) if isinstance(kind, ty.Enum) else None
+
+
 def by_reference(kind: ty.Type) -> bool:
     """Return whether a VAR_IN_OUT of this type is passed as the object itself; other types need an object that refers
     to them."""

@@ -236,10 +236,9 @@ def _shift(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
             )  # fmt: skip
         value, kind = Value(x.coerced(value, wanted, what.pos), wanted), wanted
     name = call.ref.name.upper()
-    integer = isinstance(kind, ty.Elementary) and kind.kind == "int"
-    if integer and not x.env.accepts("ST004", what.pos, f"{name} of {kind}"):
-        x.env.fail(what.pos, "an argument", expected="bits", got=str(value.type))
-    if not isinstance(kind, ty.Elementary) or kind.kind not in ("bits", "int"):
+    if not isinstance(kind, ty.Elementary) or not (
+        kind.kind == "bits" or (kind.kind == "int" and x.env.accepts("ST004", what.pos, f"{name} of {kind}"))
+    ):
         x.env.fail(what.pos, "an argument", expected="bits", got=str(value.type))
     if kind.low < 0 and name == "SHR":
         return Value(f"_v.arithmetic_right({value.code}, {count.code})", kind)

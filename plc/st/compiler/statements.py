@@ -10,7 +10,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.implicit import meeting
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, wrapped
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, simple_default, wrapped
 from fieldtwin.plc.st.compiler.variables import variable
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -81,12 +81,9 @@ class Statements(Expressions):
 
     def _initial(self, kind: ty.Type, s: t.Hold) -> str:
         """Return the value of the result of a function with EN while it is not executed."""
-        plain = ty.plain(kind)
-        if isinstance(plain, ty.Struct | ty.Array):
+        if isinstance(kind, ty.Struct | ty.Array):
             self.env.fail(s.pos, "the result of a function with EN", expected="an elementary type", got=str(kind))
-        if isinstance(plain, ty.Enum):
-            return str(plain.initial)
-        return "''" if isinstance(plain, ty.String) else "False" if ty.is_kind(plain, "bool") else "0"
+        return simple_default(kind) or "0"  # the type of a literal has no initial value
 
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call

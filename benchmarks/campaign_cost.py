@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compute the cost of a large campaign from the figures that benchmarks/campaign.py measures.
 
-    benchmarks/campaign_cost.py --cpu-s 7.1 [--hours 1000000] [--cores 128] [--run-hours 24] [--efficiency 0.9] ...
+    benchmarks/campaign_cost.py --cpu-s 1.9 [--hours 1000000] [--cores 128] [--run-hours 24] [--efficiency 0.9] ...
 
 It measures nothing. Prints a Markdown table; docs/explanation/campaign-cost.md has those for its figures.
 """

@@ -1,4 +1,4 @@
-"""Draws a state table as SVG, without a network, a font or a layout program.
+"""Draws a state machine as SVG, without a network, a font or a layout program.
 
 States are placed on an ellipse in the order of their codes, with the initial state on top and a dot before it; each transition
 is an arrow with its guard. Transitions from any state are drawn from each state. This module reads and writes no file.
@@ -10,8 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from math import atan2, cos, hypot, pi, sin
+from typing import Protocol
 
-from fieldtwin.plc.states import StateTable
+from fieldtwin.plc.states import Transition
 
 _CHAR = 7.2
 """Width of a character of the 12 px monospace font, in px."""
@@ -29,6 +30,20 @@ _STYLE = """
   .arrow { fill: none; stroke: #5b6b85; stroke-width: 1.3 } .tip { fill: #5b6b85 }
   .label { fill: #333; text-anchor: middle } .paper { fill: #fff; opacity: .88 } .dot { fill: #14284a }
 """
+
+
+class Drawable(Protocol):
+    """A state machine that can be drawn: a `StateTable`, or the `StateDiagram` of a program in Structured Text."""
+
+    @property
+    def states(self) -> tuple[str, ...]: ...
+
+    @property
+    def initial(self) -> str: ...
+
+    def leaving(self, state: str) -> list[Transition]:
+        """Return the transitions that begin in `state`."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +92,7 @@ def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
 
 
-def svg(table: StateTable, title: str = "", current: str = "") -> str:
+def svg(table: Drawable, title: str = "", current: str = "") -> str:
     """Return the diagram of `table` as SVG text, with the state `current` highlighted."""
     arrows = _arrows(table)
     longest = max((len(line) for *_, lines in arrows for line in lines), default=0)
@@ -110,7 +125,7 @@ def svg(table: StateTable, title: str = "", current: str = "") -> str:
     return "\n".join([*parts, *labels.drawn, "</svg>", ""])
 
 
-def _arrows(table: StateTable) -> list[tuple[str, str, list[str]]]:
+def _arrows(table: Drawable) -> list[tuple[str, str, list[str]]]:
     """Return the arrows as (source, target, labels).
 
     Transitions between the same two states share an arrow, with a label each.
@@ -122,7 +137,7 @@ def _arrows(table: StateTable) -> list[tuple[str, str, list[str]]]:
     return [(s, t, list(dict.fromkeys(label for label in labels if label))) for (s, t), labels in found.items()]
 
 
-def _places(table: StateTable, longest: int) -> dict[str, _Box]:
+def _places(table: Drawable, longest: int) -> dict[str, _Box]:
     names = [table.initial, *(s for s in table.states if s != table.initial)]
     widths = {n: max(70.0, len(n) * _CHAR + 24) for n in names}
     around = max(longest * _CHAR + 60, max(widths.values()) + 40) * len(names) / (2 * pi) * 1.3

@@ -40,9 +40,16 @@ def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Pat
 
     Raises `FileInvalid` for the first error, with the others.
     """
-    texts = tuple((str(file), _text(file)) for file in source_files(path))
-    more = tuple((str(file), _text(file)) for library in libraries for file in source_files(library))
-    return _compiled(texts, more, str(path), dialect)
+    return _compiled(_texts((path,)), _texts(libraries), str(path), dialect)
+
+
+def read_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> SourceUnit:
+    """Read the declarations that `compile_source` compiles. Raises `FileInvalid` for the first syntax error, with the others."""
+    return _unit_of(_texts((path,)), _texts(libraries), dialect)
+
+
+def _texts(paths: tuple[Path, ...]) -> Texts:
+    return tuple((str(file), _text(file)) for path in paths for file in source_files(path))
 
 
 def _text(path: Path) -> str:
@@ -57,10 +64,14 @@ def _text(path: Path) -> str:
 @lru_cache(maxsize=32)
 def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect) -> CompiledUnit:
     """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
-    unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
+    unit = _unit_of(texts, libraries, dialect)
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
     return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
+
+
+def _unit_of(texts: Texts, libraries: Texts, dialect: Dialect) -> SourceUnit:
+    return with_library(_parsed(texts, dialect), _library(libraries, dialect))
 
 
 def _library(texts: Texts, dialect: Dialect) -> Library:

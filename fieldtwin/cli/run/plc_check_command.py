@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,19 +14,22 @@ import click
 from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
+from fieldtwin.cli.run.plc_sources import (
+    StSource,
+    agreed_system,
+    dialect_option,
+    library_option,
+    source_file,
+    st_sources,
+)
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.plc.st.dialects import DIALECTS, Dialect, StWarning, chosen_ids, dialect_of
+from fieldtwin.plc.st.dialects import StWarning, chosen_ids
 
 if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
     from fieldtwin.plc.st.syntax.tree import Missing
-
-    _Program = tuple[Path, Dialect, tuple[Path, ...]]
-    """A file or folder of programs, its dialect, and its libraries."""
-
-_OF_SYSTEMS = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
@@ -46,11 +49,7 @@ class _Found:
 @click.argument("source", shell_complete=systems)
 @group(
     "Options",
-    click.option(
-        "--dialect",
-        type=click.Choice(list(DIALECTS)),
-        help="The dialect of a file or folder (default: standard). A system states the dialect of each program.",
-    ),
+    dialect_option,
     click.option(
         "--error",
         "as_errors",
@@ -59,13 +58,7 @@ class _Found:
         shell_complete=st_warnings,
         help="Treat the warning ID (such as ST001), or all, as an error. Can be repeated.",
     ),
-    click.option(
-        "--library",
-        "libraries",
-        type=click.Path(path_type=Path, exists=True),
-        multiple=True,
-        help="A file or folder whose declarations SOURCE may use; only those that it uses are compiled. Can be repeated.",
-    ),
+    library_option,
     sources=TemplateSearchOptions,
 )
 @json_option
@@ -93,13 +86,8 @@ def check(
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
     """
-    if _is_program(source):
-        programs = [(Path(source), dialect_of(dialect or "standard"), libraries)]
-    elif dialect is not None or libraries:
-        expected = "`dialect:` and `libraries:` of the program in the system file"
-        raise UsageError(f"--dialect or --library for the system {source}", expected=expected)
-    else:
-        programs = list(_sources_of(source, sources))
+    file = source_file(source, dialect, libraries)
+    programs = [file] if file is not None else _sources_of(source, sources)
     found = _checked(programs, chosen_ids(as_errors))
     if as_json:
         click.echo(json.dumps(_as_json(found), indent=2))
@@ -115,36 +103,20 @@ def check(
     return 1 if found.errors else 0
 
 
-def _is_program(source: str) -> bool:
-    """Return whether `source` is a file or folder of programs, and not the file or name of a system."""
-    path = Path(source)
-    return path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS)
-
-
-def _sources_of(system: str, sources: TemplateSearchOptions) -> Iterator[_Program]:
+def _sources_of(system: str, sources: TemplateSearchOptions) -> list[StSource]:
     """Return each file or folder of programs in Structured Text that a system has, once, with dialect and libraries.
 
     Raises `UsageError` if it has none.
     """
-    from fieldtwin.run.template import system_file
-    from fieldtwin.twin.site.system import load_system
-
-    loaded = load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
-    folder = loaded.path.parent
-    forms = [(form.source.partition(":")[0].strip(), form) for form in loaded.plc.programs.values()]
-    found = dict.fromkeys(
-        (folder / name, dialect_of(form.dialect), tuple(folder / library for library in form.libraries))
-        for name, form in forms
-        if name != "python"
-    )
+    found = dict.fromkeys(st_sources(agreed_system(system, sources)).values())
     if not found:
         raise UsageError(
             f"{system} has no program in Structured Text", hint="Python programs are checked by mypy or ruff"
         )
-    yield from found
+    return list(found)
 
 
-def _checked(programs: Sequence[_Program], as_errors: frozenset[str]) -> _Found:
+def _checked(programs: Sequence[StSource], as_errors: frozenset[str]) -> _Found:
     from fieldtwin.plc.st.project import compile_source
 
     found = _Found([], [], [])

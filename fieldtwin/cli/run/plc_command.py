@@ -15,11 +15,12 @@ from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.cli.run.plc_diagram_command import diagram
+from fieldtwin.cli.run.plc_sources import agreed_system
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
-from fieldtwin.twin.site.system import System, load_system
 
 instance_option = click.option(
     "--instance", default="", metavar="NAME", help="Name of the instance; default: the only running one."
@@ -56,6 +57,7 @@ def command() -> None:
 
 
 command.add_command(check)
+command.add_command(diagram)
 
 
 def _emit(value: Any) -> int:
@@ -247,33 +249,6 @@ def why(tag: str, instance: str, as_json: bool) -> int:
     return 0
 
 
-def _agreed(system: str, sources: TemplateSearchOptions) -> System:
-    """Return the system whose program is inspected, after the user has agreed to import its programs. Nothing is opened."""
-    from fieldtwin.run.template import system_file
-
-    return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
-
-
-@command.command("diagram")
-@click.argument("system")
-@click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a state table.")
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Output file; default: stdout.")
-@group("Options", sources=TemplateSearchOptions)
-def diagram(system: str, program: str, output: Path | None, sources: TemplateSearchOptions) -> int:
-    """Draw the state table of a program of SYSTEM as SVG."""
-    from fieldtwin.plc.diagram import svg
-    from fieldtwin.run.processes.plc_client import chosen, table_of
-
-    loaded = _agreed(system, sources)
-    name, table = chosen(loaded, program, table_of, "a state table")
-    drawn = svg(table, f"{loaded.name}: {name}")
-    if output is None:
-        sys.stdout.write(drawn)
-    else:
-        write_text(output, drawn)
-    return 0
-
-
 @command.command("prove")
 @click.argument("system")
 @click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a proof.")
@@ -305,7 +280,7 @@ def prove(
     from fieldtwin.run.processes.plc_client import chosen, proof_of
     from fieldtwin.scenarios.language.counterexample import scenario
 
-    loaded = _agreed(system, sources)
+    loaded = agreed_system(system, sources)
     name, proof = chosen(loaded, program, proof_of, "a proof")
     result = look(proof, max_states)
     text = scenario(loaded, name, proof, result) if result.broken else ""

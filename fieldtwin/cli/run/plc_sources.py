@@ -1,0 +1,66 @@
+"""The argument SOURCE of commands that read programs: a file or folder of programs, or a system, with its options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fieldtwin.cli.template_question import TemplateSearchOptions
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.st.dialects import DIALECTS, Dialect, dialect_of
+
+if TYPE_CHECKING:
+    from fieldtwin.twin.site.system import System
+
+StSource = tuple[Path, Dialect, tuple[Path, ...]]
+"""A file or folder of programs, its dialect, and its libraries."""
+_OF_SYSTEMS = (".yaml", ".yml")
+
+dialect_option: Callable[[Any], Any] = click.option(
+    "--dialect",
+    type=click.Choice(list(DIALECTS)),
+    help="The dialect of a file or folder (default: standard). A system states the dialect of each program.",
+)
+library_option: Callable[[Any], Any] = click.option(
+    "--library",
+    "libraries",
+    type=click.Path(path_type=Path, exists=True),
+    multiple=True,
+    help="A file or folder whose declarations SOURCE may use; only those that it uses are compiled. Can be repeated.",
+)
+
+
+def source_file(source: str, dialect: str | None, libraries: tuple[Path, ...]) -> StSource | None:
+    """Return `source` if it is a file or folder of programs; None if it is the file or name of a system.
+
+    Raises `UsageError` for a system with a dialect or libraries, which its file states.
+    """
+    path = Path(source)
+    if path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS):
+        return path, dialect_of(dialect or "standard"), libraries
+    if dialect is not None or libraries:
+        expected = "`dialect:` and `libraries:` of the program in the system file"
+        raise UsageError(f"--dialect or --library for the system {source}", expected=expected)
+    return None
+
+
+def agreed_system(system: str, sources: TemplateSearchOptions) -> System:
+    """Return a system whose programs are read, after the user has agreed to this. Nothing is opened."""
+    from fieldtwin.run.template import system_file
+    from fieldtwin.twin.site.system import load_system
+
+    return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
+
+
+def st_sources(system: System) -> dict[str, StSource]:
+    """Return the source of each program in Structured Text of a system, by the name of the program."""
+    forms = {name: (form.source.partition(":")[0].strip(), form) for name, form in system.plc.programs.items()}
+    folder = system.path.parent
+    return {
+        name: (folder / file, dialect_of(form.dialect), tuple(folder / library for library in form.libraries))
+        for name, (file, form) in forms.items()
+        if file != "python"
+    }

@@ -35,7 +35,7 @@ COMMANDS = {
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
-        "fieldtwin.cli.run.plc_command",
+        "fieldtwin.cli.plc.plc_command",
         "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
     ),
     "topside": (

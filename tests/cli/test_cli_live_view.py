@@ -9,8 +9,8 @@ from msgspec import structs
 from rich.console import Console
 from statuses import gateway_status
 
+from fieldtwin.cli.plc.views import Row, tag_table, value_text
 from fieldtwin.cli.run.live_view import age_text, line, render
-from fieldtwin.cli.run.plc_views import Row, tag_table, value_text
 from fieldtwin.cli.run.troubles import interference, troubles
 from fieldtwin.plc.status import PlcStatus, Spread
 from fieldtwin.run.live.options import RunOptions

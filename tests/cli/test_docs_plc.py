@@ -10,7 +10,7 @@ from typing import Any
 from st_bench import program
 from st_bench import scan as st_scan
 
-from fieldtwin.cli.run.plc_command import command
+from fieldtwin.cli.plc.plc_command import command
 from fieldtwin.plc.program import Role, ScanInfo
 from fieldtwin.plc.prove import prove
 

@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.cli.plc.check_command import check
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.st.dialects import DIALECTS
 

@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.run.plc_views import value_text
+from fieldtwin.cli.plc.views import value_text
 from fieldtwin.cli.run.troubles import fronts_of, interference, troubles, waiting_once
 from fieldtwin.console import stderr
 from fieldtwin.gateway.runtime.gateway_status import BusStatus

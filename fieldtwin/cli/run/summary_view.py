@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from rich.markup import escape
 
-from fieldtwin.cli.run.plc_views import acts_text, without_texts
+from fieldtwin.cli.plc.views import acts_text, without_texts
 from fieldtwin.cli.run.troubles import READ_ONLY, forces_text
 from fieldtwin.console import stdout
 from fieldtwin.results.trace import refusal_text

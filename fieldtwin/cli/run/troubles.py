@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from fieldtwin.cli.run.plc_views import value_text, waiting_texts
+from fieldtwin.cli.plc.views import value_text, waiting_texts
 from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession

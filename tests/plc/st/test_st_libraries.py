@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from st_bench import scan
 
-from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.cli.plc.check_command import check
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.binding import BoundProgram, load_program
 from fieldtwin.plc.runtime.sources import sources

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run.plc_check_command import check
+from fieldtwin.cli.plc.check_command import check
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import ScanInfo
 from fieldtwin.plc.st.program import load_source

@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.cli.run.plc_diagram_command import diagram
+from fieldtwin.cli.plc.diagram_command import diagram
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.state_diagram import OTHER, StateDiagram, state_diagrams

@@ -12,7 +12,7 @@ import click
 from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.run.plc_sources import (
+from fieldtwin.cli.plc.sources import (
     StSource,
     agreed_system,
     dialect_option,

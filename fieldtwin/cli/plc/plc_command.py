@@ -14,9 +14,9 @@ import msgspec
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.run.plc_check_command import check
-from fieldtwin.cli.run.plc_diagram_command import diagram
-from fieldtwin.cli.run.plc_sources import agreed_system
+from fieldtwin.cli.plc.check_command import check
+from fieldtwin.cli.plc.diagram_command import diagram
+from fieldtwin.cli.plc.sources import agreed_system
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
@@ -86,7 +86,7 @@ def _status(instance: str, brief: bool) -> dict[str, Any]:
 
 
 def _tags(instance: str, patterns: tuple[str, ...]) -> list[dict[str, Any]]:
-    from fieldtwin.cli.run.plc_views import ask_tags
+    from fieldtwin.cli.plc.views import ask_tags
     from fieldtwin.run.processes.plc_client import talk_to
 
     return talk_to(instance, lambda client: ask_tags(client, patterns))
@@ -112,7 +112,7 @@ def _act(instance: str, command: str, **args: Any) -> Any:
 @json_option
 def status(instance: str, as_json: bool) -> int:
     """Show the state, the cycle statistics of each task, forces, retained variables and counters."""
-    from fieldtwin.cli.run.plc_views import print_status, tags_as_data
+    from fieldtwin.cli.plc.views import print_status, tags_as_data
 
     found = _status(instance, brief=not as_json)
     if as_json:
@@ -135,7 +135,7 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
     """
     import asyncio
 
-    from fieldtwin.cli.run.plc_views import print_tags, tags_as_data, watch_live
+    from fieldtwin.cli.plc.views import print_tags, tags_as_data, watch_live
     from fieldtwin.run.processes.plc_client import choose
 
     if once or as_json or not sys.stdout.isatty():
@@ -157,7 +157,7 @@ def force(tag: str, value: str, yes: bool, instance: str) -> int:
     """Force TAG, an input, an output or a local, to VALUE until it is unforced. VALUE is true, false, a number, or a state's
     name.
     """
-    from fieldtwin.cli.run.plc_views import is_now
+    from fieldtwin.cli.plc.views import is_now
     from fieldtwin.run.processes.plc_client import parse_value
 
     rows = [row for row in _tags(instance, (tag,)) if row["tag"] == tag]
@@ -240,7 +240,7 @@ def why(tag: str, instance: str, as_json: bool) -> int:
 
     Without --json it also shows the missing inputs of a program that has not started.
     """
-    from fieldtwin.cli.run.plc_views import print_why
+    from fieldtwin.cli.plc.views import print_why
 
     answer = _call(instance, "why", tag=tag)
     if as_json:
@@ -275,7 +275,7 @@ def prove(
     the program (the program's module name with the suffix _proof). Exit code 1 with a shortest counterexample, or if a bound
     was reached before all states were visited.
     """
-    from fieldtwin.cli.run.plc_views import print_proof
+    from fieldtwin.cli.plc.views import print_proof
     from fieldtwin.plc.prove import prove as look
     from fieldtwin.run.processes.plc_client import chosen, proof_of
     from fieldtwin.scenarios.language.counterexample import scenario

@@ -14,7 +14,7 @@ import click
 from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
-from fieldtwin.cli.run.plc_sources import (
+from fieldtwin.cli.plc.sources import (
     StSource,
     agreed_system,
     dialect_option,

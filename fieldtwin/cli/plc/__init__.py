@@ -1,0 +1,1 @@
+"""The commands of `fieldtwin plc`, and the forms in which they show a PLC."""

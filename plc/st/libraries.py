@@ -81,6 +81,7 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
         (*unit.pous, *(d for d in taken.values() if isinstance(d, t.Pou))),
         (*unit.warnings, *(w for one in library.units for w in one.warnings if w.path in files)),
         (*unit.missing, *(m for one in library.units for m in one.missing if _owner(m) in seen)),
+        unit.instances,
     )
 
 

@@ -104,6 +104,7 @@ def _parsed(texts: Texts, dialect: Dialect) -> SourceUnit:
         tuple(pou for unit in units for pou in unit.pous),
         tuple(warning for unit in units for warning in unit.warnings),
         tuple(missing for unit in units for missing in unit.missing),
+        tuple(instance for unit in units for instance in unit.instances),
     )
 
 

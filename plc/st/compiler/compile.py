@@ -18,7 +18,7 @@ from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.assignments import Assignments
 from fieldtwin.plc.st.compiler.declarations import Declarations
-from fieldtwin.plc.st.compiler.located import without_addresses
+from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
@@ -84,7 +84,7 @@ def compile_unit(unit: t.SourceUnit, path: str, files: tuple[str, ...], dialect:
     Raises `FileInvalid` with line and column for the first error, and with the others.
     """
     try:
-        return _Unit(without_addresses(unit), path, files, dialect).compiled()
+        return _Unit(unit, path, files, dialect).compiled()
     except RecursionError as e:
         raise FileInvalid("nested too deep", path=path) from e
 
@@ -99,7 +99,7 @@ class _Unit:
         """The global variables by list and name, in lower case."""
         self._lists = list(dict.fromkeys(block.list.lower() for block in unit.globals))
         self.out = CodeWriter()
-        self.unit = unit
+        self.unit = without_addresses(unit)
         self._outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs."""
         self._kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
@@ -107,11 +107,17 @@ class _Unit:
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
         self.env.missing = {m.name.lower(): m for m in unit.missing if m.name.lower() not in declared}
         self._check_names()
-        self.declarations = Declarations(self.env, unit, self.out)
+        self._check_configuration()
+        for pou in unit.pous:
+            for variable, first in shared_addresses(pou):
+                message = f"{variable.name} and {first.name} have one address"
+                expected = "one variable for each address"
+                self.env.collected(self.env.error(variable.pos, message, expected=expected, got=variable.location))
+        self.declarations = Declarations(self.env, self.unit, self.out)
         self._declare_global_constants()
         self.declarations.resolve()
         self._declare_globals()
-        for pou in unit.pous:
+        for pou in self.unit.pous:
             if pou.kind == "FUNCTION":
                 with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
                     self.env.functions[pou.name.lower()] = self._signature(pou)
@@ -148,6 +154,15 @@ class _Unit:
             if pou.name.lower() in seen or pou.name.upper() in ty.ELEMENTARY:
                 self.env.collected(self.env.error(pou.pos, f"{pou.name} is declared twice"))
             seen.add(pou.name.lower())
+
+    def _check_configuration(self) -> None:
+        """Check that the programs that a CONFIGURATION runs exist. The system file states which programs and tasks a PLC runs."""
+        programs = {pou.name.lower(): pou.name for pou in self.unit.pous if pou.kind == "PROGRAM"}
+        for instance in self.unit.instances:
+            if instance.program.lower() not in programs.keys() | self.env.missing.keys():
+                message = f"a program {instance.program!r} is not declared"
+                expected = ", ".join(programs.values())
+                self.env.collected(self.env.error(instance.pos, message, expected=expected))
 
     def _code(self, text: str) -> tuple[CodeType, ...]:
         places = self._places()

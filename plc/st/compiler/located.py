@@ -2,16 +2,35 @@
 outputs.
 
 OpenPLC and other systems bind a program to its hardware by addresses; here the system file binds it, by name. So a
-variable at %I is an input, at %Q an output, at %M an ordinary variable; the rest of the address is ignored.
+variable at %I is an input, at %Q an output, at %M an ordinary variable; the rest of the address is ignored. Two
+outputs or two %M variables with one address would be one variable in those systems, so a program that has them is refused.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from dataclasses import replace
 
 from fieldtwin.plc.st.syntax import tree as t
 
 _KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
+
+
+_ADDRESS = re.compile(r"%([QM])([XBWDL]?)(\d+(?:\.\d+)*)", re.IGNORECASE)
+
+
+def shared_addresses(pou: t.Pou) -> Iterator[tuple[t.VarDecl, t.VarDecl]]:
+    """Return the outputs and %M variables of a POU whose address an earlier variable has, with that variable."""
+    first: dict[tuple[str, str, tuple[int, ...]], t.VarDecl] = {}
+    for variable in (v for block in pou.blocks for v in block.variables):
+        found = _ADDRESS.fullmatch(variable.location)
+        if found is None:
+            continue
+        area, size, numbers = found.groups()
+        address = (area.upper(), size.upper() or "X", tuple(int(number) for number in numbers.split(".")))
+        if (other := first.setdefault(address, variable)) is not variable:
+            yield variable, other
 
 
 def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:

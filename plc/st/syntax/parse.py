@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -183,6 +183,27 @@ class _Bad(Exception):
         return FileInvalid(str(self), path=path, line=line, column=column, got=shortened(str(self.token)))
 
 
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A TASK of a configuration or resource."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class _InTask:
+    """A program of a configuration or resource, and the name of its task, if it states one."""
+
+    instance: t.Instance
+    task: Token | None
+
+
+def _flat(items: Iterable[Any]) -> Iterator[Any]:
+    """Yield the items, and in place of a tuple its items."""
+    for item in items:
+        yield from item if isinstance(item, tuple) else (item,)
+
+
 def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
     if isinstance(e, UnexpectedToken) and e.token.type != "$END":
         got, line, column = str(e.token), e.line, e.column
@@ -252,20 +273,31 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         types = tuple(one for item in items if isinstance(item, list) for one in item)
         return t.SourceUnit(
             types,
-            tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock)),
+            tuple(each for each in _flat(items) if isinstance(each, t.VarBlock)),
             tuple(i for i in items if isinstance(i, t.Pou)),
+            instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
         )
 
-    def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock, ...]:
-        """Return the globals of a configuration, and those of its resources."""
-        return tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock))
+    def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock | t.Instance, ...]:
+        """Return the globals and the programs of a configuration, with those of its resources."""
+        tasks = {item.name.lower() for item in items if isinstance(item, _Task)}
+        for item in items:
+            if isinstance(item, _InTask) and item.task is not None and item.task.lower() not in tasks:
+                raise _Bad(item.task, f"a task {str(item.task)!r} is not declared in this configuration or resource")
+        parts = [item.instance if isinstance(item, _InTask) else item for item in items]
+        return tuple(each for each in _flat(parts) if isinstance(each, t.VarBlock | t.Instance))
 
     resource = configuration
 
-    def task(self, meta: Meta, items: list[Any]) -> None:
+    def task(self, meta: Meta, items: list[Any]) -> _Task:
+        return _Task(str(items[0]))
+
+    def task_value(self, meta: Meta, items: list[Any]) -> None:
         return None
 
-    instance = task_value = task
+    def instance(self, meta: Meta, items: list[Any]) -> _InTask:
+        name, *task, program = items
+        return _InTask(t.Instance(self._pos(program), str(name), str(program)), task[0] if task else None)
 
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items

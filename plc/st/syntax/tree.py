@@ -170,6 +170,15 @@ class Missing:
 
 
 @dataclass(frozen=True, slots=True)
+class Instance:
+    """A program that a CONFIGURATION or RESOURCE runs: `name` is the instance, `program` its type."""
+
+    pos: Pos
+    name: str
+    program: str
+
+
+@dataclass(frozen=True, slots=True)
 class SourceUnit:
     """All declarations of one file, and those that were not imported."""
 
@@ -178,6 +187,7 @@ class SourceUnit:
     pous: tuple[Pou, ...] = ()
     warnings: tuple[StWarning, ...] = ()
     missing: tuple[Missing, ...] = ()
+    instances: tuple[Instance, ...] = ()
 
 
 # -- expressions --------------------------------------------------------------------------------------------------------

@@ -295,6 +295,49 @@ END_CONFIGURATION
     assert (made.lamp, made.on) == (True, 7)  # type: ignore[attr-defined]
 
 
+CONFIGURATION = """PROGRAM blink VAR x : INT; END_VAR x := 1; END_PROGRAM
+CONFIGURATION Config0
+  RESOURCE Res0 ON PLC
+    TASK fast(INTERVAL := T#20ms, PRIORITY := 0);
+    PROGRAM one WITH fast : blink;
+  END_RESOURCE
+END_CONFIGURATION
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("WITH fast : blink", "WITH fast : blank", "5:29: a program 'blank' is not declared; expected blink"),
+        ("WITH fast : blink", "WITH slow : blink", "5:22: a task 'slow' is not declared"),
+    ],
+)
+def test_an_unknown_name_in_a_configuration_is_refused(right: str, wrong: str, said: str) -> None:
+    program(CONFIGURATION)
+    with pytest.raises(FileInvalid, match=said):
+        program(CONFIGURATION.replace(right, wrong))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "refused"),
+    [
+        ("%MW0", "%MW0", True),
+        ("%QX0.1", "%Q0.01", True),
+        ("%mw3", "%MW03", True),
+        ("%MW0", "%MD0", False),  # tools differ in whether these share bits
+        ("%QX0.1", "%QX0.2", False),
+        ("%IX0.1", "%IX0.1", False),  # the system file binds both, to one tag or to two
+    ],
+)
+def test_two_variables_with_one_address_are_refused(one: str, other: str, refused: bool) -> None:
+    text = f"PROGRAM p VAR a AT {one} : BOOL;\n  b AT {other} : BOOL; END_VAR END_PROGRAM"
+    if not refused:
+        program(text)
+        return
+    with pytest.raises(FileInvalid, match="2:3: b and a have one address; expected one variable for each address"):
+        program(text)
+
+
 def test_which_program_is_meant() -> None:
     two = "PROGRAM a END_PROGRAM PROGRAM b VAR x : INT := 1; END_VAR END_PROGRAM"
     with pytest.raises(FileInvalid, match="which PROGRAM"):

@@ -1,9 +1,9 @@
-"""The state machines of Structured Text: each CASE over a variable that its branches assign.
+"""The state machines of Structured Text: sequential function charts, and each CASE over a variable that its branches assign.
 
-The states are the values of the enumeration, or the labels if the variable is a number. An assignment of a state in a branch is a
-transition; its label is the condition of the IF, ELSIF or CASE around it. An assignment outside of the CASE leaves every other
-state. Bodies of actions count where they are called. This module resolves names only as far as states need it, so a unit
-should be compiled first.
+The states of a CASE are the values of the enumeration, or the labels if the variable is a number. An assignment of a state in
+a branch is a transition; its label is the condition of the IF, ELSIF or CASE around it. An assignment outside of the CASE leaves
+every other state. Bodies of actions count where they are called. This module resolves names only as far as states need
+it, so a unit should be compiled first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ LONGEST_LABEL = 48
 
 @dataclass(frozen=True, slots=True)
 class StateDiagram:
-    """A state machine of a POU: the `variable` that holds the state, its states, and the transitions in textual order.
+    """A state machine of a POU: the `variable` that holds the state ("" for a chart), its states, and the transitions in textual
+    order.
 
     `computed` are the places of assignments whose next state is not a constant, so that no transition shows them.
     """
@@ -45,6 +46,8 @@ def state_diagrams(unit: t.SourceUnit) -> Iterator[StateDiagram]:
     enums = {declared.name.lower(): declared for declared in unit.types if isinstance(declared, t.EnumDecl)}
     globals_ = {v.name.lower(): v for block in unit.globals for v in block.variables}
     for pou in unit.pous:
+        if pou.chart is not None:
+            yield _chart(pou.name, pou.chart)
         own = {v.name.lower(): v for block in pou.blocks for v in block.variables}
         bodies = [pou.body, *(action.body for action in pou.actions)]
         cases = [case for body in bodies for case in _cases(body)]
@@ -53,6 +56,23 @@ def state_diagrams(unit: t.SourceUnit) -> Iterator[StateDiagram]:
             found = _Machine(pou, name, declared, enums, [c for c in cases if _variable(c.selector) == name]).diagram()
             if found is not None:
                 yield found
+
+
+def _chart(pou: str, chart: t.Chart) -> StateDiagram:
+    """Return a chart. A transition between several steps is an arrow from each of its sources to each of its targets."""
+    names = {step.name.lower(): step.name for step in chart.steps}
+    transitions = [
+        Transition(names[source.lower()], names[target.lower()], _cut(text_of(one.condition)))
+        for one in chart.transitions
+        for source in one.sources
+        for target in one.targets
+    ]
+    initial = next(step.name for step in chart.steps if step.initial)
+    return StateDiagram(pou, "", tuple(names.values()), initial, tuple(transitions))
+
+
+def _cut(label: str) -> str:
+    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
 
 
 def _variable(expr: t.Expr) -> str:
@@ -173,8 +193,7 @@ class _Machine:
         if target is None:
             self.computed.append(statement.pos)
             return
-        when = " AND ".join(conditions)
-        self.found.append((sources, target, when if len(when) <= LONGEST_LABEL else f"{when[: LONGEST_LABEL - 1]}…"))
+        self.found.append((sources, target, _cut(" AND ".join(conditions))))
 
     def _called(self, call: t.Call, sources: tuple[str, ...] | None, conditions: tuple[str, ...]) -> None:
         """Follow the call of an action of the POU, and note a call that can change the variable."""

@@ -20,6 +20,7 @@ from fieldtwin.plc.st.compiler.assignments import Assignments
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
+from fieldtwin.plc.st.compiler.sfc import is_hidden, without_charts
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax import tree as t
@@ -99,7 +100,7 @@ class _Unit:
         """The global variables by list and name, in lower case."""
         self._lists = list(dict.fromkeys(block.list.lower() for block in unit.globals))
         self.out = CodeWriter()
-        self.unit = without_addresses(unit)
+        self.unit = without_charts(without_addresses(unit))
         self._outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs."""
         self._kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
@@ -144,7 +145,7 @@ class _Unit:
         return CompiledUnit(self.path, self.files, code, text, declared, self._kept, kinds, warnings, missing)
 
     def _kinds(self) -> tuple[str, ...]:
-        pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous]
+        pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous if not is_hidden(pou.name)]
         variables = sum(len(block.variables) for block in self.unit.globals)
         return (*pous, *["type"] * len(self.unit.types), *["global variable"] * variables)
 

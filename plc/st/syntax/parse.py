@@ -13,12 +13,12 @@ from lark import Lark, Token, UnexpectedCharacters, UnexpectedEOF, UnexpectedTok
 from lark.exceptions import UnexpectedInput, VisitError
 from lark.lexer import PatternStr
 from lark.tree import Meta
-from lark.visitors import Transformer_NonRecursive
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.sfc import ChartRules, chart_of
 from fieldtwin.plc.st.syntax.source import MAX_NAME, blanked, shortened
 
 MAX_EXPECTED = 8
@@ -34,7 +34,6 @@ _UNSUPPORTED = {
         "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
-        "steps and transitions of SFC": "STEP INITIAL_STEP END_STEP TRANSITION END_TRANSITION",
         "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
         "R_EDGE and F_EDGE": "R_EDGE F_EDGE",
         "labels and jumps": "JMP",
@@ -247,7 +246,7 @@ def _readable(name: str) -> str:
 
 
 @v_args(meta=True)
-class _Build(Transformer_NonRecursive[Token, Any]):
+class _Build(ChartRules):
     """The transformer that builds the tree bottom up: children are already nodes, tokens are still tokens.
 
     It is not recursive, so the nesting depth has no limit."""
@@ -302,9 +301,9 @@ class _Build(Transformer_NonRecursive[Token, Any]):
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items
         returns = rest.pop(0) if isinstance(rest[0], t.TypeSpec) else None
-        body = tuple(i for i in rest[-1] if not isinstance(i, t.Action))
+        body = tuple(i for i in rest[-1] if not isinstance(i, t.Action | t.Step | t.Transition))
         actions = tuple(i for i in rest[-1] if isinstance(i, t.Action))
-        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), body, actions)
+        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), body, actions, chart_of(rest[-1]))
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
         return self._pou("PROGRAM", meta, items)

@@ -142,6 +142,44 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
+class Association:
+    """An action of a step with its qualifier in capitals; `arguments` are the expressions after the qualifier."""
+
+    pos: Pos
+    action: str
+    qualifier: str
+    arguments: tuple[Expr, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    pos: Pos
+    name: str
+    initial: bool
+    associations: tuple[Association, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A transition between steps. `sources` and `targets` are names; `priority` is None if it is not stated."""
+
+    pos: Pos
+    name: str
+    priority: int | None
+    sources: tuple[str, ...]
+    targets: tuple[str, ...]
+    condition: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK (IEC 61131-3, 6.7)."""
+
+    steps: tuple[Step, ...]
+    transitions: tuple[Transition, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Pou:
     """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is the type of a
     function's result; None for a function without a result."""
@@ -153,6 +191,7 @@ class Pou:
     blocks: tuple[VarBlock, ...]
     body: tuple[Statement, ...]
     actions: tuple[Action, ...] = ()
+    chart: Chart | None = None
 
 
 @dataclass(frozen=True, slots=True)

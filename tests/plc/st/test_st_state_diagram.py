@@ -92,6 +92,24 @@ def test_a_case_whose_branches_do_not_assign_its_variable_is_no_state_machine():
     assert machines(program("CASE state OF 0: n := 1; 1: ; END_CASE", "state : INT; n : INT;")) == []
 
 
+def test_a_sequential_function_chart_has_its_steps_as_states():
+    text = """PROGRAM Main VAR go : BOOL; END_VAR
+    STEP b: END_STEP
+    INITIAL_STEP a: END_STEP
+    STEP c: END_STEP
+    TRANSITION FROM a TO (b, c) := go AND b.T = T#0s; END_TRANSITION
+    TRANSITION FROM (b, c) TO A := TRUE; END_TRANSITION
+    END_PROGRAM"""
+    (machine,) = machines(text)
+    assert (machine.states, machine.initial) == (("b", "a", "c"), "a")
+    assert arrows(machine) == [
+        ("a", "b", "go AND b.T = T#0s"),
+        ("a", "c", "go AND b.T = T#0s"),
+        ("b", "a", "TRUE"),
+        ("c", "a", "TRUE"),
+    ]
+
+
 def test_states_are_found_by_their_qualified_names_of_codesys():
     text = TANK.replace("Mode#Filling", "Mode.Filling")
     assert arrows(machines(text, "codesys")[0]) == arrows(machines(TANK)[0])

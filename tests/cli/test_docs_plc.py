@@ -59,8 +59,7 @@ def test_the_machine_fills_and_is_proved() -> None:
 
 
 def test_the_lamp_stays_on_for_two_seconds() -> None:
-    [text] = snippets("st")
-    lamp: Any = program(text)
+    lamp: Any = program(next(text for text in snippets("st") if "PROGRAM Lamp" in text))
     seen = []
     for ms, button in ((0, False), (10, True), (20, True), (30, False), (2020, False), (2030, False)):
         lamp.button = button
@@ -68,6 +67,25 @@ def test_the_lamp_stays_on_for_two_seconds() -> None:
         seen.append((lamp.lamp, lamp.presses))
     assert seen == [(False, 0), (True, 1), (True, 1), (True, 1), (True, 1), (False, 1)]
     assert lamp.retained() == {"presses": 1}
+
+
+def test_the_chart_fills_settles_and_counts_a_batch_once() -> None:
+    tank: Any = program(next(text for text in snippets("st") if "INITIAL_STEP" in text))
+    seen = []
+    scans = (
+        (0, True, 0),
+        (10, True, 0),
+        (20, False, 1),
+        (30, False, 2),
+        (5040, False, 2),
+        (5050, True, 2),
+        (5060, True, 0),
+    )
+    for ms, start, level in scans:  # the condition of a transition sees the T of the scan before
+        tank.start, tank.level = start, float(level)
+        st_scan(tank, 2, ms)
+        seen.append((tank.valve, tank.batches))
+    assert seen == [(False, 0), (True, 1), (True, 1), (False, 1), (False, 1), (False, 1), (True, 2)]
 
 
 def test_every_command_that_the_page_names_exists() -> None:

@@ -48,8 +48,8 @@ def diagram(
     """Draw the state machine of a program of SOURCE as SVG.
 
     SOURCE is a file or folder of Structured Text, PLCopen XML or TwinCAT, or a system. The state machine is the state table of a
-    Python program, or in Structured Text a chart (SFC), or a CASE over a variable that its branches assign: each assignment of a state is
-    a transition, and the condition around it is its label.
+    Python program, or in Structured Text a sequential function chart, or a CASE over a variable that its branches assign: each
+    assignment of a state is a transition, and the condition around it is its label.
 
     \b
     fieldtwin plc diagram pump.st -o pump.svg

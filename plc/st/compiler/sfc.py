@@ -203,7 +203,7 @@ class _Translation:
         return [*statements, _call(pos, control)]
 
     def _execution(self, name: str) -> t.Statement:
-        """Return the call of an action while its control says so, or the assignment of the BOOL variable."""
+        """Return the call of an action while the output of its control is TRUE, or the assignment of the BOOL variable."""
         one = self._controls[name][0][1]
         if name in self._actions or not self._is_variable(name):
             run = _member(one.pos, _control(name), "0a")

@@ -16,11 +16,11 @@ from types import CodeType
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.compiler.assignments import Assignments
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
-from fieldtwin.plc.st.compiler.sfc import is_hidden, without_charts
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax import tree as t

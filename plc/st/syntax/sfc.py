@@ -1,6 +1,6 @@
 """The rules of the grammar for sequential function charts (IEC 61131-3, 6.7): steps and transitions as nodes of the tree.
 
-This module does not check a chart; `fieldtwin.plc.st.compiler.sfc` does.
+This module does not check a chart; `fieldtwin.plc.st.charts.translate` does.
 """
 
 from __future__ import annotations

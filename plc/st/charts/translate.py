@@ -14,7 +14,7 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.plc.st.compiler.sfc_reachability import check_reachability
+from fieldtwin.plc.st.charts.reachability import check_reachability
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse
 

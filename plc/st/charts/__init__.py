@@ -1,0 +1,1 @@
+"""Sequential function charts: checks, and the translation into statements and function blocks."""

@@ -23,6 +23,7 @@ from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresse
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Parameter, Signature, Symbol, by_reference
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
+from fieldtwin.plc.st.edges import without_edges
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_all
 
@@ -100,7 +101,7 @@ class _Unit:
         """The global variables by list and name, in lower case."""
         self._lists = list(dict.fromkeys(block.list.lower() for block in unit.globals))
         self.out = CodeWriter()
-        self.unit = without_charts(without_addresses(unit))
+        self.unit = without_edges(without_charts(without_addresses(unit)))
         self._outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs."""
         self._kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}

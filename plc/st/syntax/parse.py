@@ -35,7 +35,6 @@ _UNSUPPORTED = {
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
         "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
-        "R_EDGE and F_EDGE": "R_EDGE F_EDGE",
         "labels and jumps": "JMP",
     }.items()
     for word in words.split()
@@ -332,10 +331,14 @@ class _Build(ChartRules):
         names = [i for i in items if isinstance(i, Token)]
         location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
         spec, initial = _spec(items), _initial(items)
-        return [t.VarDecl(self._pos(n), str(n), spec, initial, location) for n in names]
+        edge = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "edge"), "")
+        return [t.VarDecl(self._pos(n), str(n), spec, initial, location, edge) for n in names]
 
     def location(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
         return "at", str(items[0])
+
+    def edge(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
+        return "edge", str(items[0]).upper()
 
     def initial(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
         return "initial", items[0]

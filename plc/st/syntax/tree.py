@@ -78,13 +78,14 @@ class InitStruct:
 
 @dataclass(frozen=True, slots=True)
 class VarDecl:
-    """One declared name; `location` is the direct address after AT, if any."""
+    """One declared name; `location` is the direct address after AT, `edge` is R_EDGE or F_EDGE, if any."""
 
     pos: Pos
     name: str
     type: TypeSpec
     initial: Init | None
     location: str = ""
+    edge: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,7 +170,6 @@ def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, mo
         ("NAMESPACE n END_NAMESPACE", "namespaces"),
         ("PROGRAM p VAR a : DINT; END_VAR a := ADR(a); END_PROGRAM", "addresses and sizes of variables"),
         ("PROGRAM p VAR a : DINT; END_VAR a := SizeOf(a); END_PROGRAM", "addresses and sizes of variables"),
-        ("FUNCTION_BLOCK f VAR_INPUT a : BOOL R_EDGE; END_VAR END_FUNCTION_BLOCK", "R_EDGE and F_EDGE"),
     ],
 )
 def test_an_error_names_a_construct_that_is_not_supported(text: str, construct: str) -> None:

@@ -18,7 +18,7 @@ _BLOCKS = {"R_EDGE": "R_TRIG", "F_EDGE": "F_TRIG"}
 
 
 def without_edges(unit: t.SourceUnit) -> t.SourceUnit:
-    """Return `unit` with the edges of inputs as function blocks. The POUs must have no chart any more.
+    """Return `unit` with the edges of inputs as function blocks. Its charts must have been translated before.
 
     Raises `FileInvalid` with line and column for the first edge in a wrong place, and with the others.
     """

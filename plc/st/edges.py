@@ -79,7 +79,7 @@ def _called(variable: t.VarDecl) -> t.CallStatement:
 
 
 def _reading(node: Any, edges: dict[str, t.VarDecl]) -> Any:
-    """Return a part of the tree that reads Q of the block in place of an input. The target of an assignment stays the input itself."""
+    """Return a part of the tree that reads Q of the block in place of an input. Targets of assignments are not replaced."""
     if isinstance(node, tuple):
         return tuple(_reading(part, edges) for part in node)
     if isinstance(node, t.Ref) and node.name.lower() in edges:

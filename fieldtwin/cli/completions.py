@@ -33,9 +33,9 @@ def explained(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 
 def st_warnings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Return the ids of the warnings of Structured Text that begin with `incomplete`, and ``all``."""
-    from fieldtwin.plc.st.dialects import WARNINGS
+    from fieldtwin.plc.st.dialects import FINDINGS, WARNINGS
 
-    known = {**WARNINGS, "all": "all of them"}
+    known = {**WARNINGS, **FINDINGS, "all": "all of them"}
     return [CompletionItem(id, help=title) for id, title in known.items() if id.lower().startswith(incomplete.lower())]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fieldtwin.explain.explanation import Explanation
-from fieldtwin.plc.st.dialects import WARNINGS
+from fieldtwin.plc.st.dialects import FINDINGS, WARNINGS
 
 _MEANINGS = {
     "ST001": (
@@ -44,6 +44,40 @@ _MEANINGS = {
         "LINT at most; CODESYS may compute in a narrower one.",
         "Convert one operand to the type of the other.",
     ),
+    "ST100": (
+        "A comment `fieldtwin: allow ID: REASON` accepts a warning in its line or the next one. This one names no warning, "
+        "has no reason, or there is no such warning any more.",
+        "Correct the id, write the reason, or remove the comment.",
+    ),
+    "ST101": (
+        "No statement of the POU uses the variable, and it has no address.",
+        "Remove the variable, or use it.",
+    ),
+    "ST102": (
+        "REAL numbers are rounded after each operation, so two numbers that should be equal often differ in their last digit.",
+        "Compare the difference with a tolerance: `ABS(a - b) < 0.001`.",
+    ),
+    "ST103": (
+        "The CASE has no branch for some values of the enumeration, and no ELSE. In these states it does nothing.",
+        "Add the branches, or an ELSE that leads to a safe state; an empty `ELSE ;` shows that nothing is intended.",
+    ),
+    "ST104": (
+        "No statement assigns the output, and it has no initial value. Its tag always has the initial value of its type.",
+        "Assign the output, give it an initial value, or remove it.",
+    ),
+    "ST105": (
+        "An instance of TON, TOF, TP, R_TRIG, F_TRIG, CTU, CTD or CTUD is called in some branches of an IF or CASE only. In the "
+        "other scans it sees neither time nor edges: a timer does not restart, and an edge in between is lost.",
+        "Call the instance once in every scan, outside of the IF or CASE, and put the condition into its input.",
+    ),
+    "ST106": (
+        "A division by zero stops the task. No condition in the POU uses the divisor.",
+        "Test the divisor before the division, or limit it: `x / MAX(y, 1)`.",
+    ),
+    "ST107": (
+        "A statement follows RETURN, EXIT or CONTINUE in the same body, or a condition is always FALSE.",
+        "Remove the statement, or correct the condition.",
+    ),
 }
 
 ST_WARNINGS = tuple(
@@ -54,5 +88,5 @@ ST_WARNINGS = tuple(
         *_MEANINGS[id],
         source="docs/reference/structured-text.md",
     )
-    for id, title in WARNINGS.items()
+    for id, title in (WARNINGS | FINDINGS).items()
 )

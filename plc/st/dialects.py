@@ -26,7 +26,18 @@ WARNINGS = {
     "ST007": "skipped pragma",
     "ST008": "operands of signed and unsigned types",
 }
-"""Each warning's id and title."""
+"""The id and title of each warning about a construct of a dialect."""
+FINDINGS = {
+    "ST100": "waiver without an effect",
+    "ST101": "unused variable",
+    "ST102": "REAL numbers compared with = or <>",
+    "ST103": "CASE over an enumeration without ELSE",
+    "ST104": "output that is never written",
+    "ST105": "timer, edge or counter that is not called in every scan",
+    "ST106": "division without a test for 0",
+    "ST107": "statement that is never executed",
+}
+"""The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +107,11 @@ def chosen_ids(names: Iterable[str]) -> frozenset[str]:
     found: set[str] = set()
     for name in names:
         if name.lower() == "all":
-            found |= set(WARNINGS)
-        elif name.upper() in WARNINGS:
+            found |= {*WARNINGS, *FINDINGS}
+        elif name.upper() in (*WARNINGS, *FINDINGS):
             found.add(name.upper())
         else:
-            raise UsageError("an unknown warning", expected=f"all, {', '.join(WARNINGS)}", got=name)
+            raise UsageError("an unknown warning", expected=f"all, {', '.join((*WARNINGS, *FINDINGS))}", got=name)
     return frozenset(found)
 
 

@@ -25,10 +25,12 @@ from fieldtwin.cli.plc.sources import (
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.dialects import StWarning, chosen_ids
 
 if TYPE_CHECKING:
     from fieldtwin.plc.st.compiler.compile import CompiledUnit
+    from fieldtwin.plc.st.findings.waivers import Waiver
     from fieldtwin.plc.st.syntax.tree import Missing
 
 
@@ -39,6 +41,7 @@ class _Found:
     units: list[CompiledUnit]
     errors: list[FileInvalid]
     warnings: list[StWarning]
+    waived: list[tuple[StWarning, Waiver]]
 
     def missing(self) -> list[Missing]:
         """Return the declarations that were not imported and that no program uses."""
@@ -80,7 +83,9 @@ def check(
     fieldtwin plc check plc/ --dialect codesys --error ST002
     fieldtwin plc check observatory
 
-    A warning marks a construct that only the dialect accepts; `fieldtwin explain ST001` explains it.
+    A warning marks a construct that only the dialect accepts (ST001 to ST008), or that is often a mistake (from ST101 on);
+    `fieldtwin explain ST101` explains it. The comment `// fieldtwin: allow ST101: REASON`, in its line or the line above, accepts
+    it.
     Parts of a PLCopen XML file that are not supported are listed too; they are errors only where a program uses them.
 
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
@@ -117,9 +122,11 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> list[StSource]:
 
 
 def _checked(programs: Sequence[StSource], as_errors: frozenset[str]) -> _Found:
-    from fieldtwin.plc.st.project import compile_source
+    from fieldtwin.plc.st.findings.find import findings
+    from fieldtwin.plc.st.findings.waivers import waivers_of, without_waived
+    from fieldtwin.plc.st.project import compile_source, read_source
 
-    found = _Found([], [], [])
+    found = _Found([], [], [], [])
     for path, dialect, libraries in programs:
         try:
             unit = compile_source(path, dialect, libraries)
@@ -127,8 +134,14 @@ def _checked(programs: Sequence[StSource], as_errors: frozenset[str]) -> _Found:
             found.errors.extend((e, *e.others))
             continue
         found.units.append(unit)
-        found.errors.extend(warning.as_error() for warning in unit.warnings if warning.id in as_errors)
-        found.warnings.extend(warning for warning in unit.warnings if warning.id not in as_errors)
+        own = {str(file) for file in source_files(path)}
+        about = [one for one in findings(read_source(path, dialect, libraries)) if one.path in own]
+        waivers = [waiver for file in sorted(own) for waiver in waivers_of(file)]
+        warnings, waived = without_waived((*unit.warnings, *about), waivers)
+        warnings.sort(key=lambda one: (one.path, one.line, one.column, one.id))
+        found.waived.extend(waived)
+        found.errors.extend(warning.as_error() for warning in warnings if warning.id in as_errors)
+        found.warnings.extend(warning for warning in warnings if warning.id not in as_errors)
     return found
 
 
@@ -159,4 +172,5 @@ def _as_json(found: _Found) -> dict[str, object]:
         ],
         "errors": [error.as_data() for error in found.errors],
         "warnings": [warning.as_data() for warning in found.warnings],
+        "waived": [{**warning.as_data(), "reason": waiver.reason} for warning, waiver in found.waived],
     }

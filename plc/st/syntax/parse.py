@@ -440,8 +440,9 @@ class _Build(ChartRules):
 
     def case_statement(self, meta: Meta, items: list[Any]) -> t.Case:
         selector, *rest = items
-        otherwise = rest.pop()[1] if rest and rest[-1][0] == "else" else ()
-        return t.Case(self._pos(meta), selector, tuple(rest), otherwise)
+        has_else = bool(rest) and rest[-1][0] == "else"
+        otherwise = rest.pop()[1] if has_else else ()
+        return t.Case(self._pos(meta), selector, tuple(rest), otherwise, has_else)
 
     def case_branch(self, meta: Meta, items: list[Any]) -> tuple[tuple[t.CaseLabel, ...], tuple[t.Statement, ...]]:
         return tuple(items[:-1]), items[-1]

@@ -338,10 +338,13 @@ class CaseLabel:
 
 @dataclass(frozen=True, slots=True)
 class Case:
+    """A CASE. `has_else`: it has an ELSE, also one without a statement."""
+
     pos: Pos
     selector: Expr
     branches: tuple[tuple[tuple[CaseLabel, ...], tuple[Statement, ...]], ...]
     otherwise: tuple[Statement, ...] = ()
+    has_else: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from fieldtwin.explain.lookup import explain
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_text
-from fieldtwin.plc.st.dialects import DIALECTS, MAX_WARNINGS, WARNINGS, chosen_ids, dialect_of
+from fieldtwin.plc.st.dialects import DIALECTS, FINDINGS, MAX_WARNINGS, WARNINGS, chosen_ids, dialect_of
 from fieldtwin.plc.st.program import program_class
 from fieldtwin.plc.st.values import LogicError
 from fieldtwin.twin.site.schema import ProgramForm
@@ -201,7 +201,7 @@ def test_shifts_of_integers_equal_those_of_two_s_complement(number: int, count: 
 
 def test_ids_are_chosen_by_name() -> None:
     assert chosen_ids(["st001", "ST002"]) == {"ST001", "ST002"}
-    assert chosen_ids(["all"]) == set(WARNINGS)
+    assert chosen_ids(["all"]) == {*WARNINGS, *FINDINGS}
     with pytest.raises(UsageError, match="an unknown warning; expected all, ST001"):
         chosen_ids(["E1"])
     with pytest.raises(UsageError, match="did you mean 'codesys'"):

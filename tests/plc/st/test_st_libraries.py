@@ -94,5 +94,8 @@ def test_a_library_that_does_not_exist_is_named(folder: Path) -> None:
 def test_the_command_takes_libraries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(check, ["main.st", "--library", "lib", "--library", "lib2"], standalone_mode=False)
-    assert done.output == "2 files, no errors: 2 functions, 1 global variable, 1 program, 1 type\n"
+    assert done.output.splitlines() == [
+        "main.st:1:18: ST101 limited is not used",
+        "2 files, no errors, 1 warning: 2 functions, 1 global variable, 1 program, 1 type",
+    ]
     assert CliRunner().invoke(check, ["main.st"], standalone_mode=False).return_value == 1

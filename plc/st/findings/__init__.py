@@ -1,0 +1,1 @@
+"""Findings of `fieldtwin plc check`: constructs that every dialect accepts and that are often mistakes."""

@@ -1,0 +1,184 @@
+"""The findings about each POU of a unit.
+
+Every rule is narrow: where the tree alone does not show that a construct is suspicious, there is no finding. The unit has to
+be compiled first, so names and types are valid here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+
+from fieldtwin.plc.st.dialects import StWarning
+from fieldtwin.plc.st.findings.calls import called_sometimes
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import nodes
+from fieldtwin.plc.st.syntax.written import reference, text_of
+
+_LOCAL = ("VAR", "VAR_TEMP", "VAR_EXTERNAL")
+_REALS = ("REAL", "LREAL")
+_REAL_FUNCTIONS = ("SQRT", "LN", "LOG", "EXP", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "ATAN2")
+Finding = tuple[str, t.Pos, str]
+"""The id, the place, and the message."""
+
+
+def findings(unit: t.SourceUnit) -> Iterator[StWarning]:
+    """Yield the findings about a unit that compiles, POU by POU."""
+    enums = {one.name.lower(): one for one in unit.types if isinstance(one, t.EnumDecl)}
+    shared = {v.name.lower(): v for block in unit.globals for v in block.variables}
+    for pou in unit.pous:
+        about = _About(pou, enums, shared)
+        for rule in _RULES:
+            for id, pos, message in rule(about):
+                yield StWarning(id, message, pos.path, pos.line, pos.column)
+
+
+class _About:
+    """A POU with what the rules need to know about its names. All names are in lower case."""
+
+    def __init__(self, pou: t.Pou, enums: dict[str, t.EnumDecl], shared: dict[str, t.VarDecl]) -> None:
+        self.pou, self.enums = pou, enums
+        own = {v.name.lower(): v for block in pou.blocks for v in block.variables}
+        self.variables = shared | own
+        self.constants = {
+            v.name.lower() for block in pou.blocks if "CONSTANT" in block.qualifiers for v in block.variables
+        }
+        self.bodies = [pou.body, *(action.body for action in pou.actions)]
+        self.nodes = list(nodes((pou.body, pou.actions, pou.chart)))
+        self.chart_actions = {one.action.lower() for one in self.nodes if isinstance(one, t.Association)}
+        self.conditions = [condition for one in self.nodes for condition in _conditions(one)]
+
+    def named_type(self, name: str) -> str:
+        """Return the name of the type of a variable, in capitals; "" if it has none or is unknown."""
+        declared = self.variables.get(name.lower())
+        return declared.type.name.upper() if declared and isinstance(declared.type, t.NamedType) else ""
+
+
+def _conditions(node: object) -> Iterator[t.Expr]:
+    """Yield the expressions on which the execution of other statements depends."""
+    if isinstance(node, t.If):
+        yield from (condition for condition, _ in node.branches)
+    elif isinstance(node, t.Case):
+        yield node.selector
+    elif isinstance(node, t.While | t.Transition):
+        yield node.condition
+
+
+def _unused(about: _About) -> Iterator[Finding]:
+    in_declarations = nodes(tuple((v.type, v.initial) for block in about.pou.blocks for v in block.variables))
+    used = {
+        one.name.lower() for one in (*about.nodes, *in_declarations) if isinstance(one, t.Ref)
+    } | about.chart_actions
+    for block in about.pou.blocks:
+        for variable in block.variables if block.kind in _LOCAL else ():
+            if variable.name.lower() not in used and not variable.location:
+                yield "ST101", variable.pos, f"{variable.name} is not used"
+
+
+def _equal_reals(about: _About) -> Iterator[Finding]:
+    for one in about.nodes:
+        if not isinstance(one, t.Binary) or one.op not in ("=", "<>") or text_of(one.left) == text_of(one.right):
+            continue  # `x <> x` is the test for NaN
+        if _is_real(one.left, about) or _is_real(one.right, about):
+            yield "ST102", one.pos, f"REAL numbers are compared with {one.op}: {text_of(one)}"
+
+
+def _is_real(expr: t.Expr, about: _About) -> bool:
+    if isinstance(expr, t.Literal):
+        return expr.kind == "REAL"
+    if isinstance(expr, t.Ref):
+        return not expr.selectors and about.named_type(expr.name) in _REALS
+    if isinstance(expr, t.Unary):
+        return _is_real(expr.operand, about)
+    if isinstance(expr, t.Binary):
+        return expr.op in ("+", "-", "*", "/", "**") and (_is_real(expr.left, about) or _is_real(expr.right, about))
+    name = expr.ref.name.upper()
+    return name in _REAL_FUNCTIONS or name.endswith(("_TO_REAL", "_TO_LREAL"))
+
+
+def _cases_without_else(about: _About) -> Iterator[Finding]:
+    for one in about.nodes:
+        if not isinstance(one, t.Case) or one.has_else or not isinstance(one.selector, t.Ref) or one.selector.selectors:
+            continue
+        enum = about.enums.get(about.named_type(one.selector.name).lower())
+        if enum is None:
+            continue
+        labels = [label for labels, _ in one.branches for label in labels]
+        if any(label.high is not None for label in labels):
+            continue
+        named = {text_of(label.low).rpartition("#")[2].rpartition(".")[2].lower() for label in labels}
+        left = [name for name, _ in enum.values if name.lower() not in named]
+        if left:
+            yield "ST103", one.pos, f"CASE has no ELSE, and no branch for {', '.join(left)} of {enum.name}"
+
+
+def _unwritten_outputs(about: _About) -> Iterator[Finding]:
+    written = set(about.chart_actions)
+    for one in about.nodes:
+        if isinstance(one, t.Assign):
+            written.add(one.target.name.lower())
+        elif isinstance(one, t.For):
+            written.add(one.variable.name.lower())
+        elif isinstance(one, t.Call):
+            written.add(one.ref.name.lower())
+            written.update(a.target.name.lower() for a in one.arguments if a.target is not None)
+            written.update(a.value.name.lower() for a in one.arguments if isinstance(a.value, t.Ref))
+    for block in about.pou.blocks:
+        for variable in block.variables if block.kind == "VAR_OUTPUT" else ():
+            if variable.name.lower() not in written and variable.initial is None:
+                yield "ST104", variable.pos, f"the output {variable.name} is never written"
+
+
+def _conditional_calls(about: _About) -> Iterator[Finding]:
+    for body in about.bodies:
+        for name, pos in called_sometimes(body, lambda ref: about.named_type(ref.name) if not ref.selectors else ""):
+            kind = about.named_type(name)
+            yield (
+                "ST105",
+                pos,
+                f"{name} ({kind}) is not called in every scan, so it does not follow time or edges meanwhile",
+            )
+
+
+def _divisions(about: _About) -> Iterator[Finding]:
+    guarded = {one.name.lower() for one in nodes(tuple(about.conditions)) if isinstance(one, t.Ref)}
+    for one in about.nodes:
+        if not isinstance(one, t.Binary) or one.op.upper() not in ("/", "MOD") or not isinstance(one.right, t.Ref):
+            continue
+        name = one.right.name.lower()
+        if name in about.variables and name not in about.constants | guarded:
+            yield "ST106", one.right.pos, f"a division by {reference(one.right)}, which no condition tests for 0"
+
+
+def _unreachable(about: _About) -> Iterator[Finding]:
+    for body in _all_bodies(about):
+        for one, after in pairwise(body):
+            if isinstance(one, t.Jump):
+                yield "ST107", after.pos, f"a statement after {one.word} is never executed"
+                break
+    for one in about.nodes:
+        if isinstance(one, t.If):
+            for condition, _ in one.branches:
+                if isinstance(condition, t.Literal) and condition.kind == "FALSE":
+                    yield "ST107", condition.pos, "the condition is always FALSE"
+
+
+def _all_bodies(about: _About) -> Iterator[Sequence[t.Statement]]:
+    yield from about.bodies
+    for one in about.nodes:
+        if isinstance(one, t.If | t.Case):
+            yield from (body for _, body in one.branches)
+            yield one.otherwise
+        elif isinstance(one, t.For | t.While | t.Repeat):
+            yield one.body
+
+
+_RULES: tuple[Callable[[_About], Iterator[Finding]], ...] = (
+    _unused,
+    _equal_reals,
+    _cases_without_else,
+    _unwritten_outputs,
+    _conditional_calls,
+    _divisions,
+    _unreachable,
+)

@@ -1,0 +1,159 @@
+"""The findings of `fieldtwin plc check`, and their waivers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fieldtwin.cli.plc.check_command import check
+from fieldtwin.explain.lookup import everything
+from fieldtwin.plc.st.dialects import FINDINGS
+from fieldtwin.plc.st.findings.find import findings
+from fieldtwin.plc.st.syntax.parse import parse_all
+
+ROOT = Path(__file__).parents[3]
+SHIPPED = sorted((*(ROOT / "profiles").rglob("*.st"), *(ROOT / "examples").rglob("*.st")))
+MODE = "TYPE Mode : (Idle, Run, Fault); END_TYPE\n"
+VARIABLES = """VAR_INPUT x, y : REAL; n, m : INT; go : BOOL; END_VAR
+VAR_OUTPUT q : BOOL; z : REAL; i : INT; END_VAR
+VAR mode : Mode; after : TON; edge : R_TRIG; END_VAR
+VAR CONSTANT TEN : INT := 10; END_VAR
+after(IN := go, PT := T#1s); edge(CLK := go); q := after.Q OR edge.Q; z := x + y; i := n + m + TEN;
+CASE mode OF Idle: ; ELSE ; END_CASE
+"""
+
+
+def ids(body: str) -> list[str]:
+    unit = parse_all(f"{MODE}PROGRAM p\n{VARIABLES}{body}\nEND_PROGRAM", "p.st")
+    return [one.id for one in findings(unit)]
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("", []),
+        ("q := x = y;", ["ST102"]),
+        ("q := x <> x;", []),  # the test for NaN
+        ("q := INT_TO_REAL(n) <> 2.5;", ["ST102"]),
+        ("q := x * 2.0 >= y;", []),
+        ("q := n = m;", []),
+        ("CASE mode OF Idle: i := 1; Run: i := 2; END_CASE", ["ST103"]),
+        ("CASE mode OF Idle, Run: i := 1; Mode#Fault: i := 2; END_CASE", []),
+        ("CASE mode OF Idle: i := 1; ELSE i := 2; END_CASE", []),
+        ("CASE n OF 1: i := 1; END_CASE", []),
+        ("i := n / m;", ["ST106"]),
+        ("i := n MOD m;", ["ST106"]),
+        ("IF m <> 0 THEN i := n / m; END_IF", []),
+        ("IF m = 0 THEN RETURN; END_IF i := n / m;", []),
+        ("i := n / TEN; i := n / 2; i := n / MAX(m, 1);", []),
+        ("RETURN; i := 1;", ["ST107"]),
+        ("FOR i := 1 TO 3 DO EXIT; END_FOR", []),
+        ("IF FALSE THEN i := 1; END_IF", ["ST107"]),
+    ],
+)
+def test_a_suspicious_construct_is_found_and_a_sound_one_is_not(body: str, expected: list[str]) -> None:
+    assert ids(body) == expected
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("t(IN := go); u(CU := go);", []),
+        ("IF go THEN t(IN := TRUE); END_IF u(CU := go);", ["t"]),
+        ("IF go THEN t(IN := TRUE); ELSE t(IN := FALSE); END_IF u();", []),
+        ("IF go THEN t(IN := TRUE); END_IF t(IN := FALSE); u();", []),
+        ("CASE n OF 1: t(); u(); 2: t(); ELSE t(); END_CASE", ["u"]),
+        ("IF go THEN IF n = 1 THEN t(); ELSE t(); END_IF ELSE t(); END_IF u();", []),
+    ],
+)
+def test_a_timer_has_to_be_called_in_every_branch(body: str, expected: list[str]) -> None:
+    variables = "VAR_INPUT go : BOOL; n : INT; END_VAR VAR t : TON; u : CTU; END_VAR"
+    unit = parse_all(f"PROGRAM p {variables}\n{body}\nEND_PROGRAM", "p.st")
+    assert [one.message.split()[0] for one in findings(unit) if one.id == "ST105"] == expected
+
+
+def test_unused_variables_and_unwritten_outputs_are_found() -> None:
+    text = """PROGRAM p
+VAR_INPUT a : BOOL; END_VAR
+VAR_OUTPUT b : BOOL; c : BOOL := TRUE; d, e, f : BOOL; END_VAR
+VAR g, h : INT; size : INT; kept AT %MW0 : INT; other : Block; END_VAR
+VAR_TEMP k : INT; END_VAR
+INITIAL_STEP One: d(N); END_STEP
+ACTION Go: other(x => e, y := f); END_ACTION
+END_PROGRAM
+FUNCTION_BLOCK Block VAR_OUTPUT x : BOOL; END_VAR VAR_IN_OUT y : BOOL; END_VAR x := y; END_FUNCTION_BLOCK"""
+    found = list(findings(parse_all(text, "p.st")))
+    assert [(one.id, one.line) for one in found] == [("ST101", 4)] * 3 + [("ST101", 5), ("ST104", 3)]
+    assert [one.message.split()[0] for one in found[:4]] == ["g", "h", "size", "k"]
+    assert found[4].message == "the output b is never written"
+
+
+def test_every_finding_is_explained() -> None:
+    assert {one.id for one in everything()} >= set(FINDINGS)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_the_shipped_programs_have_no_findings(path: Path) -> None:
+    assert not list(findings(parse_all(path.read_text("utf-8"), str(path))))
+
+
+def checked(*arguments: str) -> Result:
+    return CliRunner().invoke(check, arguments, standalone_mode=False)
+
+
+DIVISION = """PROGRAM p VAR_INPUT a, b : INT; END_VAR VAR_OUTPUT q : INT; END_VAR
+{before}q := a / b;{after}
+END_PROGRAM
+"""
+FOUND = "ST106 a division by b, which no condition tests for 0"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "listed"),
+    [
+        ("", "", [f"p.st:2:10: {FOUND}"]),
+        ("", " // fieldtwin: allow ST106: b is a gear ratio", []),
+        ("(* fieldtwin: allow ST106: b is a gear ratio *)\n", "", []),
+        (
+            "",
+            " // fieldtwin: allow ST106",
+            ["p.st:2:1: ST100 the waiver of ST106 has no reason", f"p.st:2:10: {FOUND}"],
+        ),
+        (
+            "// fieldtwin: allow ST101: no\n",
+            "",
+            ["p.st:2:1: ST100 the waiver of ST101 matches no", f"p.st:3:10: {FOUND}"],
+        ),
+        (
+            "// fieldtwin: allow ST999: no\n",
+            "",
+            ["p.st:2:1: ST100 the waiver names no warning: ST999", "p.st:3:10: ST106"],
+        ),
+    ],
+)
+def test_a_waiver_with_a_reason_accepts_a_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str, listed: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.st").write_text(DIVISION.format(before=before, after=after))
+    done = checked("p.st")
+    assert done.return_value == 0
+    lines = done.output.splitlines()[:-1]
+    assert len(lines) == len(listed)
+    assert all(line.startswith(text) for line, text in zip(lines, listed, strict=True)), lines
+
+
+def test_a_finding_can_be_an_error_and_a_waived_one_is_in_the_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.st").write_text(DIVISION.format(before="", after=""))
+    assert checked("p.st", "--error", "st106").return_value == 1
+    Path("p.st").write_text(DIVISION.format(before="", after=" // fieldtwin: allow ST106: b is a gear ratio"))
+    done = checked("p.st", "--error", "all", "--json")
+    assert done.return_value == 0
+    (waived,) = json.loads(done.output)["waived"]
+    assert (waived["id"], waived["line"], waived["reason"]) == ("ST106", 2, "b is a gear ratio")

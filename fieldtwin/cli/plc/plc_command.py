@@ -16,7 +16,7 @@ from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.plc.check_command import check
 from fieldtwin.cli.plc.diagram_command import diagram
-from fieldtwin.cli.plc.sources import agreed_system
+from fieldtwin.cli.plc.sources import agreed_system, source_file
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
@@ -280,6 +280,10 @@ def prove(
     from fieldtwin.run.processes.plc_client import chosen, proof_of
     from fieldtwin.scenarios.language.counterexample import scenario
 
+    if source_file(system, None, ()) is not None:
+        raise UsageError(
+            f"{system} is no system", expected="a system with a Python program that has a PROOF next to it"
+        )
     loaded = agreed_system(system, sources)
     name, proof = chosen(loaded, program, proof_of, "a proof")
     result = look(proof, max_states)

@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.charts.reachability import check_reachability
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse
+from fieldtwin.plc.st.syntax.walk import nodes
 
 _TIMED = ("L", "D", "SD", "DS", "SL")
 _QUALIFIERS = ("N", "R", "S", "P", "P0", "P1", *_TIMED)
@@ -120,6 +121,8 @@ class _Translation:
             seen.add(step.name.lower())
             for one in step.associations:
                 self._check_association(one)
+            self._check_twice(step)
+        self._check_calls()
         initial = [step for step in self._chart.steps if step.initial]
         if not initial:
             pos = (self._chart.steps or self._chart.transitions)[0].pos
@@ -137,6 +140,19 @@ class _Translation:
         if complete:
             for error in check_reachability(self._chart):
                 self._found.add(error)
+
+    def _check_twice(self, step: t.Step) -> None:
+        seen: set[tuple[str, str]] = set()
+        for one in step.associations:
+            if (one.action.lower(), one.qualifier) in seen:
+                self._bad(one.pos, f"step {step.name} has action {one.action} twice with the qualifier {one.qualifier}")
+            seen.add((one.action.lower(), one.qualifier))
+
+    def _check_calls(self) -> None:
+        """Refuse the call of a step by an action. The chart itself calls the blocks of its steps."""
+        for one in nodes(self._pou.actions):
+            if isinstance(one, t.Call) and one.ref.name.lower() in self._steps:
+                self._bad(one.pos, f"step {one.ref.name} cannot be called", hint="a transition activates a step")
 
     def _check_association(self, one: t.Association) -> None:
         if one.qualifier not in _QUALIFIERS:

@@ -1,7 +1,7 @@
 """The findings about each POU of a unit.
 
-Every rule is narrow: where the tree alone does not show that a construct is suspicious, there is no finding. The unit has to
-be compiled first, so names and types are valid here.
+A rule reports a construct only if the tree alone shows that it is suspicious. The unit has to be compiled first, so names and
+types are valid here.
 """
 
 from __future__ import annotations

@@ -199,6 +199,8 @@ A, B = "INITIAL_STEP A: END_STEP\n", "STEP B: END_STEP\n"
         ("INITIAL_STEP A: x(N, x); END_STEP", 2, "indicator variables are not supported"),
         ("INITIAL_STEP A: y(N); END_STEP", 2, "'y' is not declared"),
         (A + "x := TRUE;", 3, "a statement next to steps"),
+        ("INITIAL_STEP A: x(L, T#1s);\nx(L, T#2s); END_STEP", 3, "step A has action x twice with the qualifier L"),
+        (A + "ACTION go: A(); END_ACTION", 3, "step A cannot be called"),
         (A + "ACTION go: A.X := TRUE; END_ACTION", 3, "A cannot be assigned to"),
         (A + B + "TRANSITION FROM A TO B := 5; END_TRANSITION", 4, "expected BOOL"),
     ],

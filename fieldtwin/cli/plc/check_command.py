@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
+from fieldtwin.cli.plc.checking import Checked, checked
 from fieldtwin.cli.plc.sources import (
     StSource,
     agreed_system,
@@ -24,28 +22,8 @@ from fieldtwin.cli.plc.sources import (
 )
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stdout
-from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.plc.source_files import source_files
-from fieldtwin.plc.st.dialects import StWarning, chosen_ids
-
-if TYPE_CHECKING:
-    from fieldtwin.plc.st.compiler.compile import CompiledUnit
-    from fieldtwin.plc.st.findings.waivers import Waiver
-    from fieldtwin.plc.st.syntax.tree import Missing
-
-
-@dataclass(frozen=True)
-class _Found:
-    """The compiled units, the errors in those that cannot be compiled, and warnings, also those that count as errors."""
-
-    units: list[CompiledUnit]
-    errors: list[FileInvalid]
-    warnings: list[StWarning]
-    waived: list[tuple[StWarning, Waiver]]
-
-    def missing(self) -> list[Missing]:
-        """Return the declarations that were not imported and that no program uses."""
-        return [each for unit in self.units for each in unit.missing]
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.st.dialects import chosen_ids
 
 
 @click.command("check")
@@ -93,7 +71,7 @@ def check(
     """
     file = source_file(source, dialect, libraries)
     programs = [file] if file is not None else _sources_of(source, sources)
-    found = _checked(programs, chosen_ids(as_errors))
+    found = checked(programs, chosen_ids(as_errors))
     if as_json:
         click.echo(json.dumps(_as_json(found), indent=2))
         return 1 if found.errors else 0
@@ -121,31 +99,7 @@ def _sources_of(system: str, sources: TemplateSearchOptions) -> list[StSource]:
     return list(found)
 
 
-def _checked(programs: Sequence[StSource], as_errors: frozenset[str]) -> _Found:
-    from fieldtwin.plc.st.findings.find import findings
-    from fieldtwin.plc.st.findings.waivers import waivers_of, without_waived
-    from fieldtwin.plc.st.project import compile_source, read_source
-
-    found = _Found([], [], [], [])
-    for path, dialect, libraries in programs:
-        try:
-            unit = compile_source(path, dialect, libraries)
-        except FileInvalid as e:
-            found.errors.extend((e, *e.others))
-            continue
-        found.units.append(unit)
-        own = {str(file) for file in source_files(path)}
-        about = [one for one in findings(read_source(path, dialect, libraries)) if one.path in own]
-        waivers = [waiver for file in sorted(own) for waiver in waivers_of(file)]
-        warnings, waived = without_waived((*unit.warnings, *about), waivers)
-        warnings.sort(key=lambda one: (one.path, one.line, one.column, one.id))
-        found.waived.extend(waived)
-        found.errors.extend(warning.as_error() for warning in warnings if warning.id in as_errors)
-        found.warnings.extend(warning for warning in warnings if warning.id not in as_errors)
-    return found
-
-
-def _summary(found: _Found) -> str:
+def _summary(found: Checked) -> str:
     warned = f", {_counted(len(found.warnings), 'warning')}" if found.warnings else ""
     if found.errors:
         files = len({error.path for error in found.errors})
@@ -161,7 +115,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def _as_json(found: _Found) -> dict[str, object]:
+def _as_json(found: Checked) -> dict[str, object]:
     return {
         "kind": "fieldtwin plc check",
         "version": 1,

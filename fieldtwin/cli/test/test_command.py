@@ -131,6 +131,7 @@ def command(
                       a campaign: rules that must always hold are checked under
                       random faults
     """
+    from fieldtwin.cli.plc.checking import warnings_of
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
     from fieldtwin.results.model import Report, key_of
     from fieldtwin.run.targets.progress import Progress
@@ -157,6 +158,7 @@ def command(
         agree_to_scenario(sources.ask(), path, folders, plant=target == "real", virtual=target == "virtual")
     scenarios = [load_scenario(path, folders) for path in paths]
     show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
+    show_warnings(warnings_of(one.system for one in scenarios))
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
     where = ScenarioTarget(

@@ -25,9 +25,8 @@ Finding = tuple[str, t.Pos, str]
 def findings(unit: t.SourceUnit) -> Iterator[StWarning]:
     """Yield the findings about a unit that compiles, POU by POU."""
     enums = {one.name.lower(): one for one in unit.types if isinstance(one, t.EnumDecl)}
-    shared = {v.name.lower(): v for block in unit.globals for v in block.variables}
     for pou in unit.pous:
-        about = _About(pou, enums, shared)
+        about = _About(pou, enums, unit.globals)
         for rule in _RULES:
             for id, pos, message in rule(about):
                 yield StWarning(id, message, pos.path, pos.line, pos.column)
@@ -36,13 +35,11 @@ def findings(unit: t.SourceUnit) -> Iterator[StWarning]:
 class _About:
     """A POU with what the rules need to know about its names. All names are in lower case."""
 
-    def __init__(self, pou: t.Pou, enums: dict[str, t.EnumDecl], shared: dict[str, t.VarDecl]) -> None:
+    def __init__(self, pou: t.Pou, enums: dict[str, t.EnumDecl], shared: tuple[t.VarBlock, ...]) -> None:
         self.pou, self.enums = pou, enums
-        own = {v.name.lower(): v for block in pou.blocks for v in block.variables}
-        self.variables = shared | own
-        self.constants = {
-            v.name.lower() for block in pou.blocks if "CONSTANT" in block.qualifiers for v in block.variables
-        }
+        declared = [(v, block) for block in (*shared, *pou.blocks) for v in block.variables]
+        self.variables = {v.name.lower(): v for v, _ in declared}
+        self.constants = {v.name.lower() for v, block in declared if "CONSTANT" in block.qualifiers}
         self.bodies = [pou.body, *(action.body for action in pou.actions)]
         self.nodes = list(nodes((pou.body, pou.actions, pou.chart)))
         self.chart_actions = {one.action.lower() for one in self.nodes if isinstance(one, t.Association)}

@@ -16,7 +16,7 @@ from fieldtwin.plc.st.syntax.parse import parse_all
 
 ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((*(ROOT / "profiles").rglob("*.st"), *(ROOT / "examples").rglob("*.st")))
-MODE = "TYPE Mode : (Idle, Run, Fault); END_TYPE\n"
+MODE = "TYPE Mode : (Idle, Run, Fault); END_TYPE VAR_GLOBAL CONSTANT SHARED : INT := 4; END_VAR\n"
 VARIABLES = """VAR_INPUT x, y : REAL; n, m : INT; go : BOOL; END_VAR
 VAR_OUTPUT q : BOOL; z : REAL; i : INT; END_VAR
 VAR mode : Mode; after : TON; edge : R_TRIG; END_VAR
@@ -48,7 +48,7 @@ def ids(body: str) -> list[str]:
         ("i := n MOD m;", ["ST106"]),
         ("IF m <> 0 THEN i := n / m; END_IF", []),
         ("IF m = 0 THEN RETURN; END_IF i := n / m;", []),
-        ("i := n / TEN; i := n / 2; i := n / MAX(m, 1);", []),
+        ("i := n / TEN; i := n / SHARED; i := n / 2; i := n / MAX(m, 1);", []),
         ("RETURN; i := 1;", ["ST107"]),
         ("FOR i := 1 TO 3 DO EXIT; END_FOR", []),
         ("IF FALSE THEN i := 1; END_IF", ["ST107"]),

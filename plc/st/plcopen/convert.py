@@ -1,8 +1,9 @@
 """Convert PLCopen XML (TC6, version 2.01, as CODESYS, OpenPLC and Beremiz export it) to Structured Text, line for line.
 
 Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
-the user's file. Bodies in FBD and LD become statements of the tree (`networks`). A POU, an action or a type with a part that is
-not supported is left out and listed in `Export.missing`. Drawings, task configurations and vendors' additions are ignored.
+the user's file. Bodies in FBD and LD become statements of the tree (`networks`), and bodies in SFC become charts (`charts`).
+A POU, an action or a type with a part that is not supported is left out and listed in `Export.missing`. Drawings, task
+configurations and vendors' additions are ignored.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.plcopen.charts import read_chart
 from fieldtwin.plc.st.plcopen.elements import Element, project_of
 from fieldtwin.plc.st.plcopen.networks import Drawn, drawn
 from fieldtwin.plc.st.plcopen.nodes import Unsupported
@@ -38,7 +40,7 @@ class Export:
     text: str
     missing: tuple[Missing, ...]
     drawings: Mapping[tuple[str, str], Drawn]
-    """The bodies in FBD and LD by POU and action, in lower case; the body of a POU has "" as its action."""
+    """The bodies in FBD, LD and SFC by POU and action, in lower case; the body of a POU has "" as its action."""
 
 
 def convert(text: str, path: str = "") -> Export:
@@ -246,12 +248,33 @@ class _Converter:
                 raise self._unsupported(language, f"{of} is a function that detects an edge, which is not supported")
             self.drawings[self._name(pou).lower(), action.lower()] = found
             return
+        if language.tag == "SFC" and not action and _kind(pou) != "FUNCTION":
+            self._chart(pou, language, own)
+            return
         if language.tag != "ST":
             raise self._unsupported(language, f"{of} has a body in {language.tag}, which is not supported")
-        for line, text in language.texts():
-            for offset, piece in enumerate(self._unqualified(text, own).split("\n")):
+        self._statements(language, own)
+
+    def _statements(self, text: Element, own: set[str]) -> None:
+        for line, part in text.texts():
+            for offset, piece in enumerate(self._unqualified(part, own).split("\n")):
                 if piece.strip():
                     self._put(line + offset, piece)
+
+    def _chart(self, pou: Element, language: Element, own: set[str]) -> None:
+        """Read a chart, and write the statements in its action blocks as actions."""
+        named = {
+            transition.attributes.get("name", "").lower(): body
+            for transition in pou.inside("transitions")
+            if (body := transition.find("body")) is not None
+        }
+        name = self._name(pou)
+        found = read_chart(language, name, self.path, lambda text: self._unqualified(text, own), named)
+        for inline in found.inline:
+            self._put(inline.element.line, f"ACTION {inline.name}:")
+            self._statements(inline.element, own)
+            self._put(inline.element.end_line, "END_ACTION")
+        self.drawings[name.lower(), ""] = Drawn((), (), found.chart)
 
     def _unqualified(self, text: str, own: set[str]) -> str:
         """Write ``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; columns stay the same, so that errors name the

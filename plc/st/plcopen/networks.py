@@ -19,10 +19,11 @@ _EDGES = {"rising": "R_TRIG", "falling": "F_TRIG"}
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The statements of a drawn body, and the blocks for the edges that it detects."""
+    """The statements of a drawn body, and the blocks for the edges that it detects; or a chart."""
 
     body: tuple[t.Statement, ...]
     edges: tuple[t.VarDecl, ...]
+    chart: t.Chart | None = None
 
 
 def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suffix: str = "") -> Drawn:

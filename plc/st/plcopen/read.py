@@ -46,5 +46,5 @@ def _with_drawings(pou: t.Pou, drawings: Mapping[tuple[str, str], Drawn]) -> t.P
         replace(action, body=one.body) if one is not None else action
         for action, one in zip(pou.actions, found[1:], strict=True)
     )
-    body = found[0].body if found[0] is not None else pou.body
-    return replace(pou, blocks=(*pou.blocks, *block), body=body, actions=actions)
+    body, chart = (found[0].body, found[0].chart) if found[0] is not None else (pou.body, pou.chart)
+    return replace(pou, blocks=(*pou.blocks, *block), body=body, actions=actions, chart=chart)

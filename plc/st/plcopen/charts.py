@@ -1,0 +1,224 @@
+"""Read a body in Sequential Function Chart (PLCopen TC6 XML 2.01, 6.5.1) into the tree.
+
+The file connects steps, transitions, divergences and convergences in the direction against the flow. A transition between steps
+is found by following these connections from the transition to its sources, and from each step to the transitions that lead to
+it. A jump leads to the step that it names. Alternatives without a priority are tried from left to right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from fieldtwin.plc.st.plcopen.elements import Element
+from fieldtwin.plc.st.plcopen.nodes import Node, Unsupported, nodes_of, written
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.parse import parse_expression
+
+_SUPPORTED = (
+    "step", "jumpStep", "transition", "selectionDivergence", "selectionConvergence", "simultaneousDivergence",
+    "simultaneousConvergence", "actionBlock", "inVariable", "contact", "leftPowerRail", "rightPowerRail", "comment",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class InlineAction:
+    """An action whose statements stand in an action block. `element` holds its text, `name` is made for it."""
+
+    name: str
+    element: Element
+
+
+@dataclass(slots=True)
+class ReadChart:
+    """A chart, and the actions whose statements stand in its action blocks."""
+
+    chart: t.Chart
+    inline: list[InlineAction]
+
+
+def read_chart(
+    body: Element, of: str, path: str, standard: Callable[[str], str], named: Mapping[str, Element]
+) -> ReadChart:
+    """Read a body. `of` is the name of the POU, `standard` changes an expression to that of the standard, and `named` has the
+    bodies of the POU's transitions by their names in lower case.
+
+    Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
+    """
+    for element in body.children:
+        if element.tag not in _SUPPORTED and "localId" in element.attributes:
+            local = element.attributes["localId"]
+            raise Unsupported(
+                f"{of} has the element {element.tag} (localId {local}) in a chart, which is not supported",
+                path=path, line=element.line, column=element.column,
+            )  # fmt: skip
+    return _Reader(nodes_of(body, of, path), standard, named).read()
+
+
+@dataclass
+class _Reader:
+    nodes: dict[str, Node]
+    standard: Callable[[str], str]
+    named: Mapping[str, Element]
+    inline: list[InlineAction] = field(default_factory=list)
+
+    def read(self) -> ReadChart:
+        steps = [node for node in self.nodes.values() if node.tag == "step"]
+        targets = self._targets()
+        transitions = sorted(
+            (node for node in self.nodes.values() if node.tag == "transition"), key=lambda n: (n.place[1], n.place[0])
+        )
+        chart = t.Chart(
+            tuple(self._step(node) for node in steps),
+            tuple(self._transition(node, tuple(targets.get(node.id, ()))) for node in transitions),
+        )
+        return ReadChart(chart, self.inline)
+
+    def _of(self, tag: str) -> Iterator[Node]:
+        return (node for node in self.nodes.values() if node.tag == tag)
+
+    # -- steps and their actions ------------------------------------------------------------------------------------------
+
+    def _step(self, node: Node) -> t.Step:
+        associations = [
+            self._association(node, block, action)
+            for block in self._of("actionBlock")
+            if any(source == node.id for pin in block.pins for source, _ in pin.links)
+            for action in block.element.children
+            if action.tag == "action"
+        ]
+        initial = node.element.attributes.get("initialStep") == "true"
+        return t.Step(node.pos, _name(node, "name"), initial, tuple(associations))
+
+    def _association(self, step: Node, block: Node, action: Element) -> t.Association:
+        if action.attributes.get("indicator"):
+            raise block.unsupported("an action has an indicator variable, which is not supported")
+        reference, inline = action.find("reference"), action.find("inline")
+        if reference is not None:
+            name = reference.attributes.get("name", "").strip()
+        elif inline is not None and (text := inline.find("ST")) is not None:
+            name = f"{_name(step, 'name')}_inline{len(self.inline) + 1}"
+            self.inline.append(InlineAction(name, text))
+        else:
+            raise block.unsupported("an action has neither a name nor statements in ST")
+        qualifier = action.attributes.get("qualifier", "N").strip().upper()
+        duration = action.attributes.get("duration", "").strip()
+        arguments = (parse_expression(self.standard(duration), block.pos),) if duration else ()
+        return t.Association(block.pos, name, qualifier, arguments)
+
+    # -- transitions ------------------------------------------------------------------------------------------------------
+
+    def _transition(self, node: Node, targets: tuple[str, ...]) -> t.Transition:
+        sources = tuple(dict.fromkeys(self._sources(node, frozenset())))
+        if not sources or not targets:
+            raise node.error(f"the transition has no step {'before' if not sources else 'after'} it")
+        priority = node.element.attributes.get("priority", "").strip()
+        number = int(priority) if priority.isascii() and priority.isdigit() else 0
+        return t.Transition(node.pos, "", number or None, sources, targets, self._condition(node))
+
+    def _sources(self, node: Node, seen: frozenset[str]) -> Iterator[str]:
+        """Yield the steps from which a transition, or the element before it, comes."""
+        for other in self._before(node, seen):
+            if other.tag == "step":
+                yield _name(other, "name")
+            elif other.tag in ("selectionDivergence", "simultaneousConvergence"):
+                yield from self._sources(other, seen | {node.id})
+            else:
+                raise node.error(f"a {node.tag} follows a {other.tag} (localId {other.id})")
+
+    def _targets(self) -> dict[str, list[str]]:
+        """Return the steps to which each transition leads, from left to right."""
+        found: dict[str, list[str]] = {}
+        reached = [(node, _name(node, "name")) for node in self._of("step")]
+        reached += [(node, _name(node, "targetName")) for node in self._of("jumpStep")]
+        for node, name in sorted(reached, key=lambda each: each[0].place[1]):
+            for transition in self._leading_to(node, frozenset()):
+                targets = found.setdefault(transition.id, [])
+                if name not in targets:
+                    targets.append(name)
+        return found
+
+    def _leading_to(self, node: Node, seen: frozenset[str]) -> Iterator[Node]:
+        for other in self._before(node, seen):
+            if other.tag == "transition":
+                yield other
+            elif other.tag in ("selectionConvergence", "simultaneousDivergence"):
+                yield from self._leading_to(other, seen | {node.id})
+            else:
+                raise node.error(f"a {node.tag} follows a {other.tag} (localId {other.id})")
+
+    def _before(self, node: Node, seen: frozenset[str]) -> Iterator[Node]:
+        """Yield the elements to which the inputs of an element are connected."""
+        if node.id in seen:
+            raise node.error("a loop of divergences and convergences without a step")
+        for pin in node.pins:
+            yield from (self.nodes[source] for source, _ in pin.links)
+
+    # -- conditions -------------------------------------------------------------------------------------------------------
+
+    def _condition(self, node: Node) -> t.Expr:
+        condition = node.element.find("condition")
+        for part in condition.children if condition is not None else ():
+            if part.tag == "reference":
+                name = part.attributes.get("name", "").strip()
+                declared = self.named.get(name.lower())
+                return self._parsed(node, name) if declared is None else self._in_text(node, declared)
+            if part.tag == "inline":
+                return self._in_text(node, part)
+            if part.tag == "connectionPointIn":
+                return self._connected(node, part)
+        raise node.error("the transition has no condition")
+
+    def _in_text(self, node: Node, body: Element) -> t.Expr:
+        """Return a condition in ST: ``:= a AND b;``, as the standard writes it, or only the expression."""
+        text = body.find("ST")
+        if text is None:
+            raise node.unsupported("the condition of a transition has a body in another language than ST")
+        written_text = "".join(piece for _, piece in text.texts()).strip()
+        return self._parsed(node, written_text.removeprefix(":=").rstrip("; \t\r\n"))
+
+    def _connected(self, node: Node, point: Element) -> t.Expr:
+        """Return the value at a connection. Connections that meet are a wired OR."""
+        links = [c.attributes.get("refLocalId", "").strip() for c in point.children if c.tag == "connection"]
+        return self._either(node, links, frozenset())
+
+    def _either(self, node: Node, links: list[str], seen: frozenset[str]) -> t.Expr:
+        values = [self._value(node, link, seen) for link in links]
+        if not values:
+            raise node.error(f"the {node.tag} has no connection at its input")
+        found = values[0]
+        for value in values[1:]:
+            found = t.Binary(node.pos, "OR", found, value)
+        return found
+
+    def _value(self, reader: Node, link: str, seen: frozenset[str]) -> t.Expr:
+        node = self.nodes.get(link)
+        if node is None or link in seen:
+            raise reader.error(f"a connection to the element {link}, which does not exist or reads itself")
+        if node.tag == "leftPowerRail":
+            return t.Literal(node.pos, "TRUE", "TRUE")
+        negated = node.element.attributes.get("negated") == "true"
+        if node.tag == "inVariable":
+            return self._negated(self._parsed(node, written(node.element)), negated)
+        if node.tag == "contact" and node.element.attributes.get("edge", "none") == "none":
+            variable = node.element.find("variable")
+            name = "".join(text for _, text in variable.texts()).strip() if variable is not None else ""
+            state = self._negated(self._parsed(node, name), negated)
+            before = self._either(node, [source for pin in node.pins for source, _ in pin.links], seen | {link})
+            return state if isinstance(before, t.Literal) else t.Binary(node.pos, "AND", before, state)
+        raise node.unsupported(f"a {node.tag} at the condition of a transition is not supported")
+
+    def _negated(self, value: t.Expr, negated: bool) -> t.Expr:
+        return t.Unary(value.pos, "NOT", value) if negated else value
+
+    def _parsed(self, node: Node, text: str) -> t.Expr:
+        if not text:
+            raise node.error(f"the {node.tag} has no variable or expression")
+        return parse_expression(self.standard(text), node.pos)
+
+
+def _name(node: Node, attribute: str) -> str:
+    name = node.element.attributes.get(attribute, "").strip()
+    if not name.isidentifier():
+        raise node.error(f"the {node.tag} has no usable {attribute}: {name!r}")
+    return name

@@ -1,0 +1,227 @@
+"""Bodies in Sequential Function Chart of PLCopen XML files (TC6 XML 2.01, 6.5.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from st_bench import scan
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.st.compiler.compile import compile_unit
+from fieldtwin.plc.st.plcopen.read import read_plcopen
+from fieldtwin.plc.st.program import program_class
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.written import text_of
+
+XHTML = 'xmlns="http://www.w3.org/1999/xhtml"'
+INTERFACE = """<interface>
+<inputVars><variable name="go"><type><BOOL/></type></variable><variable name="stop"><type><BOOL/></type></variable></inputVars>
+<outputVars><variable name="q"><type><BOOL/></type></variable><variable name="n"><type><INT/></type></variable></outputVars>
+</interface>"""
+
+
+def link(*sources: str) -> str:
+    return (
+        "<connectionPointIn>" + "".join(f'<connection refLocalId="{one}"/>' for one in sources) + "</connectionPointIn>"
+    )
+
+
+def element(tag: str, local: str, *inputs: str, x: int = 0, y: int = 0, inside: str = "", **attributes: str) -> str:
+    more = "".join(f' {name}="{value}"' for name, value in attributes.items())
+    points = (
+        "".join(link(one) for one in inputs) if tag == "simultaneousConvergence" else link(*inputs) if inputs else ""
+    )
+    return f'<{tag} localId="{local}"{more}><position x="{x}" y="{y}"/>{points}{inside}</{tag}>\n'
+
+
+def step(local: str, name: str, *inputs: str, x: int = 0, initial: bool = False) -> str:
+    start = {"initialStep": "true"} if initial else {}
+    return element("step", local, *inputs, x=x, name=name, **start)
+
+
+def inline(text: str) -> str:
+    return f'<condition><inline name=""><ST><p {XHTML}>{text}</p></ST></inline></condition>'
+
+
+def transition(local: str, *inputs: str, x: int = 0, condition: str = inline("TRUE"), **attributes: str) -> str:
+    return element("transition", local, *inputs, x=x, inside=condition, **attributes)
+
+
+def project(body: str, more: str = "", kind: str = "program") -> str:
+    return (
+        '<project xmlns="http://www.plcopen.org/xml/tc6_0201"><types><pous>'
+        f'<pou name="Main" pouType="{kind}">{INTERFACE}{more}<body><SFC>\n{body}</SFC></body></pou></pous></types></project>'
+    )
+
+
+def chart(body: str, more: str = "") -> t.Chart:
+    (pou,) = read_plcopen(project(body, more), "main.xml").pous
+    assert pou.chart is not None
+    return pou.chart
+
+
+def moves(read: t.Chart) -> set[tuple[frozenset[str], frozenset[str]]]:
+    return {(frozenset(one.sources), frozenset(one.targets)) for one in read.transitions}
+
+
+def running(body: str, more: str = "") -> Any:
+    made = program_class(
+        compile_unit(read_plcopen(project(body, more), "main.xml"), "main.xml", ("main.xml",)), "Main"
+    )()
+    assert isinstance(made, Program)
+    return made
+
+
+FILLING = (
+    step("1", "Idle", "9", initial=True)
+    + transition("2", "1", condition='<condition><reference name="go"/></condition>')
+    + step("3", "Run", "2")
+    + transition("4", "3", condition=inline(":= stop;"))
+    + element("jumpStep", "5", "4", targetName="Idle")
+    + transition("9", "99")
+    + step("99", "Never", "98")
+    + transition("98", "3", x=5, condition=inline("n &gt; 10"))
+    + element(
+        "actionBlock", "6", "3",
+        inside='<action localId="7" qualifier="N"><reference name="q"/></action>'
+        f'<action localId="8" qualifier="P1"><inline><ST><p {XHTML}>n := n\n+ 1;</p></ST></inline></action>',
+    )
+)  # fmt: skip
+
+
+def test_steps_transitions_jumps_and_actions_run() -> None:
+    made = running(FILLING)
+    seen = []
+    for number, (go, stop) in enumerate(
+        [(False, False), (True, False), (False, False), (False, True), (True, False)], 1
+    ):
+        made.go, made.stop = go, stop
+        scan(made, number)
+        seen.append((made.q, made.n))
+    assert seen == [(False, 0), (True, 1), (True, 1), (False, 1), (True, 2)]
+
+
+def test_alternatives_are_tried_by_priority_and_then_from_left_to_right() -> None:
+    read = chart(
+        step("1", "A", "8", initial=True)
+        + element("selectionDivergence", "2", "1")
+        + transition("3", "2", x=30)
+        + transition("4", "2", x=10)
+        + transition("5", "2", x=90, priority="1")
+        + element("selectionConvergence", "6", "3", "4", "5")
+        + step("7", "B", "6")
+        + transition("8", "7", x=99)
+    )
+    assert [(one.pos.element.split()[1], one.priority) for one in read.transitions] == [
+        ("4", None), ("3", None), ("5", 1), ("8", None),
+    ]  # fmt: skip
+    assert moves(read) == {(frozenset({"A"}), frozenset({"B"})), (frozenset({"B"}), frozenset({"A"}))}
+
+
+names = some.lists(some.sampled_from("ABCDE"), min_size=1, max_size=3, unique=True)
+
+
+@given(some.lists(some.tuples(names, names), min_size=1, max_size=6))
+def test_every_form_of_branch_is_read(wanted: list[tuple[list[str], list[str]]]) -> None:
+    body = ""
+    out_of: dict[str, str] = {}
+    for name in "ABCDE":  # each step with its divergence, if several transitions leave it
+        leaving = [n for n, (sources, _) in enumerate(wanted) if name in sources]
+        out_of[name] = f"2{ord(name)}" if len(leaving) > 1 else f"1{ord(name)}"
+        if len(leaving) > 1:
+            body += element("selectionDivergence", f"2{ord(name)}", f"1{ord(name)}")
+    for n, (sources, targets) in enumerate(wanted):
+        before = out_of[sources[0]]
+        if len(sources) > 1:
+            body += element("simultaneousConvergence", f"4{n}", *(out_of[name] for name in sources))
+            before = f"4{n}"
+        body += transition(f"3{n}", before)
+        if len(targets) > 1:
+            body += element("simultaneousDivergence", f"5{n}", f"3{n}")
+    for name in "ABCDE":
+        arriving = [
+            f"5{n}" if len(targets) > 1 else f"3{n}" for n, (_, targets) in enumerate(wanted) if name in targets
+        ]
+        if len(arriving) > 1:
+            body += element("selectionConvergence", f"6{ord(name)}", *arriving)
+        body += step(
+            f"1{ord(name)}", name, *([f"6{ord(name)}"] if len(arriving) > 1 else arriving), initial=name == "A"
+        )
+    assert moves(chart(body)) == {(frozenset(sources), frozenset(targets)) for sources, targets in wanted}
+
+
+READY = f'<transition name="ready"><body><ST><p {XHTML}>:= go AND NOT stop;</p></ST></body></transition>'
+NAMED = f"<transitions>{READY}</transitions>"
+CONTACTS = (
+    element("leftPowerRail", "50")
+    + element("contact", "51", "50", inside="<variable>go</variable>")
+    + element("contact", "52", "51", inside="<variable>stop</variable>", negated="true")
+    + element("inVariable", "53", inside="<expression>n = 3</expression>")
+)
+
+
+@pytest.mark.parametrize(
+    ("condition", "text"),
+    [
+        ('<condition><reference name="READY"/></condition>', "go AND NOT stop"),
+        ('<condition><reference name="go"/></condition>', "go"),
+        (inline("go OR stop"), "go OR stop"),
+        (f"<condition>{link('52')}</condition>", "go AND NOT stop"),
+        (f"<condition>{link('51', '53')}</condition>", "go OR n = 3"),
+    ],
+)
+def test_a_condition_is_a_name_a_text_or_a_connection(condition: str, text: str) -> None:
+    read = chart(step("1", "A", "2", initial=True) + transition("2", "1", condition=condition) + CONTACTS, NAMED)
+    assert text_of(read.transitions[0].condition) == text
+
+
+LOOP = step("1", "A", "2", initial=True)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (step("1", "A", initial=True) + transition("2", "1"), "localId 2 of Main: the transition has no step after it"),
+        (LOOP + transition("2"), "localId 2 of Main: the transition has no step before it"),
+        (LOOP + transition("2", "1", condition=""), "localId 2 of Main: the transition has no condition"),
+        (LOOP + transition("2", "3"), "a connection to the element 3, which does not exist"),
+        (LOOP + transition("2", "3") + element("selectionDivergence", "3", "3"), "a loop of divergences"),
+        (LOOP + transition("2", "3") + transition("3", "1"), "a transition follows a transition"),
+        (step("1", "1a", "2") + transition("2", "1"), "the step has no usable name: '1a'"),
+    ],
+)
+def test_a_wrong_chart_is_refused_with_the_element(body: str, said: str) -> None:
+    with pytest.raises(FileInvalid, match=said):
+        chart(body)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (LOOP + element("macroStep", "9"), "Main has the element macroStep"),
+        (
+            LOOP + transition("2", "1", condition="<condition><inline><LD/></inline></condition>"),
+            "another language than ST",
+        ),
+        (
+            LOOP + transition("2", "1") + element("actionBlock", "3", "1", inside='<action indicator="x"/>'),
+            "an indicator variable",
+        ),
+    ],
+)
+def test_a_chart_with_an_unsupported_part_is_not_imported(body: str, said: str) -> None:
+    unit = read_plcopen(project(body), "main.xml")
+    assert not unit.pous
+    assert said in unit.missing[0].reason
+
+
+def test_an_error_in_an_inline_action_has_its_line() -> None:
+    text = project(FILLING.replace("+ 1;", "+ nothing;"))
+    line = 1 + text[: text.index("+ nothing")].count("\n")
+    with pytest.raises(FileInvalid, match="nothing") as caught:
+        compile_unit(read_plcopen(text, "main.xml"), "main.xml", ("main.xml",))
+    assert caught.value.line == line

@@ -34,12 +34,14 @@ library_option: Callable[[Any], Any] = click.option(
 
 
 def source_file(source: str, dialect: str | None, libraries: tuple[Path, ...]) -> StSource | None:
-    """Return `source` if it is a file or folder of programs; None if it is the file or name of a system.
+    """Return `source` if it is a file or folder of programs; None if it is the file or name of a system, or a template.
 
     Raises `UsageError` for a system with a dialect or libraries, which its file states.
     """
+    from fieldtwin.twin.template.package import is_template
+
     path = Path(source)
-    if path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS):
+    if not is_template(path) and (path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS)):
         return path, dialect_of(dialect or "standard"), libraries
     if dialect is not None or libraries:
         expected = "`dialect:` and `libraries:` of the program in the system file"

@@ -176,6 +176,7 @@ class _Translation:
             for step in self._chart.steps
             for flag in ("0lost", "0gained")
         ]
+        statements += self._chart.before
         transitions = sorted(
             self._chart.transitions,
             key=lambda one: (one.priority is None, one.priority if one.priority is not None else 0),

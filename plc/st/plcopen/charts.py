@@ -3,22 +3,22 @@
 The file connects steps, transitions, divergences and convergences in the direction against the flow. A transition between steps
 is found by following these connections from the transition to its sources, and from each step to the transitions that lead to
 it. A jump leads to the step that it names. Alternatives without a priority are tried from left to right.
+
+Blocks, contacts, coils and variables beside the chart are a network in LD or FBD. A condition may be connected to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.plcopen.elements import Element
-from fieldtwin.plc.st.plcopen.nodes import Node, Unsupported, nodes_of, written
+from fieldtwin.plc.st.plcopen.networks import Drawing, Drawn
+from fieldtwin.plc.st.plcopen.nodes import Node, Unsupported, nodes_of, pin_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_expression
 
-_SUPPORTED = (
-    "step", "jumpStep", "transition", "selectionDivergence", "selectionConvergence", "simultaneousDivergence",
-    "simultaneousConvergence", "actionBlock", "inVariable", "contact", "leftPowerRail", "rightPowerRail", "comment",
-)  # fmt: skip
+_UNSUPPORTED = ("macroStep", "jump", "label", "return", "error", "vendorElement")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class InlineAction:
 class ReadChart:
     """A chart, and the actions whose statements stand in its action blocks."""
 
-    chart: t.Chart
+    drawn: Drawn
     inline: list[InlineAction]
 
 
@@ -46,8 +46,8 @@ def read_chart(
     Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
     """
     for element in body.children:
-        if element.tag not in _SUPPORTED and "localId" in element.attributes:
-            local = element.attributes["localId"]
+        if element.tag in _UNSUPPORTED:
+            local = element.attributes.get("localId", "")
             raise Unsupported(
                 f"{of} has the element {element.tag} (localId {local}) in a chart, which is not supported",
                 path=path, line=element.line, column=element.column,
@@ -55,12 +55,11 @@ def read_chart(
     return _Reader(nodes_of(body, of, path), standard, named).read()
 
 
-@dataclass
-class _Reader:
-    nodes: dict[str, Node]
-    standard: Callable[[str], str]
-    named: Mapping[str, Element]
-    inline: list[InlineAction] = field(default_factory=list)
+class _Reader(Drawing):
+    def __init__(self, nodes: dict[str, Node], standard: Callable[[str], str], named: Mapping[str, Element]) -> None:
+        super().__init__(nodes, standard, "")
+        self.named = named
+        self.inline: list[InlineAction] = []
 
     def read(self) -> ReadChart:
         steps = [node for node in self.nodes.values() if node.tag == "step"]
@@ -72,7 +71,8 @@ class _Reader:
             tuple(self._step(node) for node in steps),
             tuple(self._transition(node, tuple(targets.get(node.id, ()))) for node in transitions),
         )
-        return ReadChart(chart, self.inline)
+        network = self.drawn()
+        return ReadChart(Drawn((), network.edges, replace(chart, before=network.body)), self.inline)
 
     def _of(self, tag: str) -> Iterator[Node]:
         return (node for node in self.nodes.values() if node.tag == tag)
@@ -166,7 +166,7 @@ class _Reader:
             if part.tag == "inline":
                 return self._in_text(node, part)
             if part.tag == "connectionPointIn":
-                return self._connected(node, part)
+                return self._flow(node, pin_of("", part, part))
         raise node.error("the transition has no condition")
 
     def _in_text(self, node: Node, body: Element) -> t.Expr:
@@ -177,44 +177,13 @@ class _Reader:
         written_text = "".join(piece for _, piece in text.texts()).strip()
         return self._parsed(node, written_text.removeprefix(":=").rstrip("; \t\r\n"))
 
-    def _connected(self, node: Node, point: Element) -> t.Expr:
-        """Return the value at a connection. Connections that meet are a wired OR."""
-        links = [c.attributes.get("refLocalId", "").strip() for c in point.children if c.tag == "connection"]
-        return self._either(node, links, frozenset())
-
-    def _either(self, node: Node, links: list[str], seen: frozenset[str]) -> t.Expr:
-        values = [self._value(node, link, seen) for link in links]
-        if not values:
-            raise node.error(f"the {node.tag} has no connection at its input")
-        found = values[0]
-        for value in values[1:]:
-            found = t.Binary(node.pos, "OR", found, value)
-        return found
-
-    def _value(self, reader: Node, link: str, seen: frozenset[str]) -> t.Expr:
-        node = self.nodes.get(link)
-        if node is None or link in seen:
-            raise reader.error(f"a connection to the element {link}, which does not exist or reads itself")
-        if node.tag == "leftPowerRail":
-            return t.Literal(node.pos, "TRUE", "TRUE")
-        negated = node.element.attributes.get("negated") == "true"
-        if node.tag == "inVariable":
-            return self._negated(self._parsed(node, written(node.element)), negated)
-        if node.tag == "contact" and node.element.attributes.get("edge", "none") == "none":
-            variable = node.element.find("variable")
-            name = "".join(text for _, text in variable.texts()).strip() if variable is not None else ""
-            state = self._negated(self._parsed(node, name), negated)
-            before = self._either(node, [source for pin in node.pins for source, _ in pin.links], seen | {link})
-            return state if isinstance(before, t.Literal) else t.Binary(node.pos, "AND", before, state)
-        raise node.unsupported(f"a {node.tag} at the condition of a transition is not supported")
-
-    def _negated(self, value: t.Expr, negated: bool) -> t.Expr:
-        return t.Unary(value.pos, "NOT", value) if negated else value
-
-    def _parsed(self, node: Node, text: str) -> t.Expr:
-        if not text:
-            raise node.error(f"the {node.tag} has no variable or expression")
-        return parse_expression(self.standard(text), node.pos)
+    def _source(self, node: Node, source: str, output: str) -> t.Expr:
+        other = self.nodes.get(source)
+        if other is None:
+            raise node.error(f"a connection to the element {source}, which does not exist")
+        if other.tag == "step":
+            return t.Ref(node.pos, _name(other, "name"), (t.Member(node.pos, "X"),))
+        return super()._source(node, source, output)
 
 
 def _name(node: Node, attribute: str) -> str:

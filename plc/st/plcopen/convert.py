@@ -274,7 +274,7 @@ class _Converter:
             self._put(inline.element.line, f"ACTION {inline.name}:")
             self._statements(inline.element, own)
             self._put(inline.element.end_line, "END_ACTION")
-        self.drawings[name.lower(), ""] = Drawn((), (), found.chart)
+        self.drawings[name.lower(), ""] = found.drawn
 
     def _unqualified(self, text: str, own: set[str]) -> str:
         """Write ``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; columns stay the same, so that errors name the

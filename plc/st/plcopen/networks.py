@@ -39,10 +39,12 @@ def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suf
                 f"{of} has the element {element.tag} (localId {local}), which is not supported",
                 path=path, line=element.line, column=element.column,
             )  # fmt: skip
-    return _Drawing(nodes_of(body, of, path), standard, suffix).drawn()
+    return Drawing(nodes_of(body, of, path), standard, suffix).drawn()
 
 
-class _Drawing:
+class Drawing:
+    """The translation of the blocks, contacts, coils and variables of a body."""
+
     def __init__(self, nodes: dict[str, Node], standard: Callable[[str], str], suffix: str) -> None:
         self.nodes = nodes
         self.standard = standard

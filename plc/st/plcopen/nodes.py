@@ -108,16 +108,17 @@ def _order(node: Node) -> int:
 
 def _pins(element: Element) -> Iterator[Pin]:
     if element.tag != "block":
-        yield from (_pin("", element, point) for point in element.children if point.tag == "connectionPointIn")
+        yield from (pin_of("", element, point) for point in element.children if point.tag == "connectionPointIn")
         return
     for variables in ("inputVariables", "inOutVariables"):
         for variable in element.inside(variables):
             point = variable.find("connectionPointIn")
             if variable.tag == "variable" and point is not None:
-                yield _pin(variable.attributes.get("formalParameter", ""), variable, point)
+                yield pin_of(variable.attributes.get("formalParameter", ""), variable, point)
 
 
-def _pin(name: str, element: Element, point: Element) -> Pin:
+def pin_of(name: str, element: Element, point: Element) -> Pin:
+    """Return the input whose connections are in `point`, a ``<connectionPointIn>``."""
     links = [
         (c.attributes.get("refLocalId", "").strip(), c.attributes.get("formalParameter", ""))
         for c in point.children

@@ -174,10 +174,14 @@ class Transition:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK (IEC 61131-3, 6.7)."""
+    """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK (IEC 61131-3, 6.7).
+
+    `before` are the statements of the blocks that are drawn beside the chart. Each scan executes them before the transitions.
+    """
 
     steps: tuple[Step, ...]
     transitions: tuple[Transition, ...]
+    before: tuple[Statement, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

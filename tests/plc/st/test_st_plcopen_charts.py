@@ -10,7 +10,6 @@ from hypothesis import strategies as some
 from st_bench import scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.program import Program
 from fieldtwin.plc.st.compiler.compile import compile_unit
 from fieldtwin.plc.st.plcopen.read import read_plcopen
 from fieldtwin.plc.st.program import program_class
@@ -68,12 +67,10 @@ def moves(read: t.Chart) -> set[tuple[frozenset[str], frozenset[str]]]:
     return {(frozenset(one.sources), frozenset(one.targets)) for one in read.transitions}
 
 
-def running(body: str, more: str = "") -> Any:
-    made = program_class(
-        compile_unit(read_plcopen(project(body, more), "main.xml"), "main.xml", ("main.xml",)), "Main"
-    )()
-    assert isinstance(made, Program)
-    return made
+def running(body: str, interface: str = "") -> Any:
+    text = project(body).replace("</interface>", f"{interface}</interface>")
+    unit = compile_unit(read_plcopen(text, "main.xml"), "main.xml", ("main.xml",))
+    return program_class(unit, "Main")()
 
 
 FILLING = (
@@ -170,13 +167,55 @@ CONTACTS = (
         ('<condition><reference name="READY"/></condition>', "go AND NOT stop"),
         ('<condition><reference name="go"/></condition>', "go"),
         (inline("go OR stop"), "go OR stop"),
-        (f"<condition>{link('52')}</condition>", "go AND NOT stop"),
-        (f"<condition>{link('51', '53')}</condition>", "go OR n = 3"),
+        (f"<condition>{link('53')}</condition>", "n = 3"),
+        (f"<condition>{link('1')}</condition>", "A.X"),
     ],
 )
 def test_a_condition_is_a_name_a_text_or_a_connection(condition: str, text: str) -> None:
     read = chart(step("1", "A", "2", initial=True) + transition("2", "1", condition=condition) + CONTACTS, NAMED)
     assert text_of(read.transitions[0].condition) == text
+
+
+@pytest.mark.parametrize(("go", "stop", "leaves"), [(False, False, False), (True, True, False), (True, False, True)])
+def test_contacts_at_a_condition_are_a_network(go: bool, stop: bool, leaves: bool) -> None:
+    made = running(
+        step("1", "A", "4", initial=True)
+        + transition("2", "1", condition=f"<condition>{link('52')}</condition>")
+        + step("3", "B", "2")
+        + transition("4", "3", condition=inline("FALSE"))
+        + CONTACTS
+    )
+    scan(made, 1)
+    made.go, made.stop = go, stop
+    scan(made, 2)
+    assert made.internal("B.X").value is leaves
+
+
+TIMER = """<block localId="20" typeName="TON" instanceName="t"><position x="0" y="0"/><inputVariables>
+<variable formalParameter="IN"><connectionPointIn><connection refLocalId="1"/></connectionPointIn></variable>
+<variable formalParameter="PT"><connectionPointIn><connection refLocalId="21"/></connectionPointIn></variable>
+</inputVariables><inOutVariables/><outputVariables><variable formalParameter="Q"><connectionPointOut/></variable>
+</outputVariables></block>
+<inVariable localId="21"><position x="0" y="0"/><expression>T#20ms</expression></inVariable>
+"""
+OF_TIMER = '<connectionPointIn><connection refLocalId="20" formalParameter="Q"/></connectionPointIn>'
+
+
+def test_a_timer_beside_the_chart_decides_a_transition_as_openplc_editor_draws_it() -> None:
+    made = running(
+        step("1", "A", "4", initial=True)
+        + transition("2", "1", condition=f"<condition>{OF_TIMER}</condition>")
+        + step("3", "B", "2")
+        + transition("4", "3", condition=inline("FALSE"))
+        + element("actionBlock", "6", "3", inside='<action localId="0"><reference name="q"/></action>')
+        + TIMER,
+        interface='<localVars><variable name="t"><type><derived name="TON"/></type></variable></localVars>',
+    )
+    seen = []
+    for number in range(1, 7):
+        scan(made, number)
+        seen.append(made.q)
+    assert seen == [False, False, False, True, True, True]  # A.X is seen from the second scan on, and 20 ms later Q
 
 
 LOOP = step("1", "A", "2", initial=True)

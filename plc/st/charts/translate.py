@@ -79,7 +79,10 @@ def without_charts(unit: t.SourceUnit) -> t.SourceUnit:
     if all(pou.chart is None for pou in unit.pous):
         return unit
     found = ErrorCollector()
-    pous = tuple(_Translation(pou, pou.chart, found).pou() if pou.chart is not None else pou for pou in unit.pous)
+    shared = frozenset(v.name.lower() for block in unit.globals for v in block.variables)
+    pous = tuple(
+        _Translation(pou, pou.chart, shared, found).pou() if pou.chart is not None else pou for pou in unit.pous
+    )
     found.raise_all()
     return replace(unit, pous=(*_blocks(), *pous))
 
@@ -87,8 +90,10 @@ def without_charts(unit: t.SourceUnit) -> t.SourceUnit:
 class _Translation:
     """The translation of the chart of one POU."""
 
-    def __init__(self, pou: t.Pou, chart: t.Chart, found: ErrorCollector) -> None:
+    def __init__(self, pou: t.Pou, chart: t.Chart, shared: frozenset[str], found: ErrorCollector) -> None:
         self._pou, self._chart, self._found = pou, chart, found
+        self._variables = shared | {v.name.lower() for block in pou.blocks for v in block.variables}
+        """The variables of the POU and the global ones, in lower case."""
         self._steps = {step.name.lower(): step for step in chart.steps}
         self._actions = {action.name.lower() for action in pou.actions}
         self._controls: dict[str, list[tuple[t.Step, t.Association]]] = {}
@@ -222,13 +227,10 @@ class _Translation:
     def _execution(self, name: str) -> t.Statement:
         """Return the call of an action while the output of its control is TRUE, or the assignment of the BOOL variable."""
         one = self._controls[name][0][1]
-        if name in self._actions or not self._is_variable(name):
+        if name in self._actions or name not in self._variables:
             run = _member(one.pos, _control(name), "0a")
             return t.If(one.pos, ((run, (_call(one.pos, one.action),)),))
         return t.Assign(one.pos, t.Ref(one.pos, one.action), _member(one.pos, _control(name), "0q"))
-
-    def _is_variable(self, name: str) -> bool:
-        return any(v.name.lower() == name for block in self._pou.blocks for v in block.variables)
 
 
 def _control(name: str) -> str:

@@ -212,6 +212,17 @@ def test_an_error_in_a_chart_names_its_line(body: str, line: int, message: str) 
     assert message in str(caught.value)
 
 
+def test_an_action_may_be_a_global_variable() -> None:
+    made = program("""VAR_GLOBAL lamp : BOOL; END_VAR
+    PROGRAM p VAR_OUTPUT seen : BOOL; END_VAR
+    INITIAL_STEP A: lamp(N); Look(N); END_STEP
+    ACTION Look: seen := lamp; END_ACTION
+    END_PROGRAM""")
+    scan(made, 1)
+    scan(made, 2)
+    assert made.seen  # type: ignore[attr-defined]
+
+
 def test_a_function_has_no_chart() -> None:
     with pytest.raises(FileInvalid):
         program("FUNCTION f : INT\nINITIAL_STEP A: END_STEP\nEND_FUNCTION\nPROGRAM p END_PROGRAM")

@@ -78,6 +78,11 @@ _MEANINGS = {
         "A statement follows RETURN, EXIT or CONTINUE in the same body, or a condition is always FALSE.",
         "Remove the statement, or correct the condition.",
     ),
+    "ST108": (
+        "Programs of different tasks assign the same global variable, also through the function blocks and functions that they "
+        "use. Its value depends on which task ran last.",
+        "Let one task write the variable; give each task its own one, and combine them in one place.",
+    ),
 }
 
 ST_WARNINGS = tuple(

@@ -36,6 +36,7 @@ FINDINGS = {
     "ST105": "timer, edge or counter that is not called in every scan",
     "ST106": "division without a test for 0",
     "ST107": "statement that is never executed",
+    "ST108": "global variable that programs of several tasks write",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

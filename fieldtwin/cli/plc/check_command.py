@@ -18,7 +18,7 @@ from fieldtwin.cli.plc.sources import (
     dialect_option,
     library_option,
     source_file,
-    st_sources,
+    st_tasks,
 )
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.console import stdout
@@ -70,7 +70,7 @@ def check(
     Exit code 0 without errors, else 1.
     """
     file = source_file(source, dialect, libraries)
-    programs = [file] if file is not None else _sources_of(source, sources)
+    programs = {file: {}} if file is not None else _programs_of(source, sources)
     found = checked(programs, chosen_ids(as_errors))
     if as_json:
         click.echo(json.dumps(_as_json(found), indent=2))
@@ -86,17 +86,14 @@ def check(
     return 1 if found.errors else 0
 
 
-def _sources_of(system: str, sources: TemplateSearchOptions) -> list[StSource]:
-    """Return each file or folder of programs in Structured Text that a system has, once, with dialect and libraries.
-
-    Raises `UsageError` if it has none.
-    """
-    found = dict.fromkeys(st_sources(agreed_system(system, sources)).values())
+def _programs_of(system: str, sources: TemplateSearchOptions) -> dict[StSource, dict[str, str]]:
+    """Return the sources in Structured Text of a system, with the tasks of its programs. Raises `UsageError` if it has none."""
+    found = st_tasks(agreed_system(system, sources))
     if not found:
         raise UsageError(
             f"{system} has no program in Structured Text", hint="Python programs are checked by mypy or ruff"
         )
-    return list(found)
+    return found
 
 
 def _summary(found: Checked) -> str:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fieldtwin.cli.plc.sources import StSource, st_sources
+from fieldtwin.cli.plc.sources import StSource, st_tasks
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.dialects import StWarning
@@ -32,14 +32,15 @@ class Checked:
         return [each for unit in self.units for each in unit.missing]
 
 
-def checked(programs: Iterable[StSource], as_errors: frozenset[str]) -> Checked:
-    """Check each source. The warnings `as_errors` (ids) become errors."""
+def checked(programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset[str]) -> Checked:
+    """Check each source, with the tasks of its programs (`st_tasks`). The warnings `as_errors` (ids) become errors."""
     from fieldtwin.plc.st.findings.find import findings
+    from fieldtwin.plc.st.findings.tasks import written_by_several_tasks
     from fieldtwin.plc.st.findings.waivers import waivers_of, without_waived
     from fieldtwin.plc.st.project import compile_source, read_source
 
     found = Checked([], [], [], [])
-    for path, dialect, libraries in programs:
+    for (path, dialect, libraries), tasks in programs.items():
         try:
             unit = compile_source(path, dialect, libraries)
         except FileInvalid as e:
@@ -47,7 +48,8 @@ def checked(programs: Iterable[StSource], as_errors: frozenset[str]) -> Checked:
             continue
         found.units.append(unit)
         own = {str(file) for file in source_files(path)}
-        about = [one for one in findings(read_source(path, dialect, libraries)) if one.path in own]
+        source = read_source(path, dialect, libraries)
+        about = [one for one in (*findings(source), *written_by_several_tasks(source, tasks)) if one.path in own]
         waivers = [waiver for file in sorted(own) for waiver in waivers_of(file)]
         warnings, waived = without_waived((*unit.warnings, *about), waivers)
         warnings.sort(key=lambda one: (one.path, one.line, one.column, one.id))
@@ -59,5 +61,5 @@ def checked(programs: Iterable[StSource], as_errors: frozenset[str]) -> Checked:
 
 def warnings_of(systems: Iterable[System]) -> list[str]:
     """Return the warnings and findings about the programs of systems, each once, without their errors."""
-    sources = dict.fromkeys(source for system in systems for source in st_sources(system).values())
-    return [str(warning) for warning in checked(sources, frozenset()).warnings]
+    found = [warning for system in systems for warning in checked(st_tasks(system), frozenset()).warnings]
+    return list(dict.fromkeys(map(str, found)))

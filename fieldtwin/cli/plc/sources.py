@@ -57,6 +57,19 @@ def agreed_system(system: str, sources: TemplateSearchOptions) -> System:
     return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
 
 
+def st_tasks(system: System) -> dict[StSource, dict[str, str]]:
+    """Return the sources in Structured Text of a system, each once, with the task of each PROGRAM in it that the PLC runs.
+
+    Names of a PROGRAM are in lower case; "" stands for the only one of a source.
+    """
+    first = next(iter(system.plc.tasks), "main")
+    found: dict[StSource, dict[str, str]] = {}
+    for name, source in st_sources(system).items():
+        form = system.plc.programs[name]
+        found.setdefault(source, {})[form.source.partition(":")[2].strip().lower()] = form.task or first
+    return found
+
+
 def st_sources(system: System) -> dict[str, StSource]:
     """Return the source of each program in Structured Text of a system, by the name of the program."""
     forms = {name: (form.source.partition(":")[0].strip(), form) for name, form in system.plc.programs.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from fieldtwin.cli.plc.check_command import check
 from fieldtwin.explain.lookup import everything
 from fieldtwin.plc.st.dialects import FINDINGS
 from fieldtwin.plc.st.findings.find import findings
+from fieldtwin.plc.st.findings.tasks import written_by_several_tasks
 from fieldtwin.plc.st.syntax.parse import parse_all
 
 ROOT = Path(__file__).parents[3]
@@ -157,3 +159,52 @@ def test_a_finding_can_be_an_error_and_a_waived_one_is_in_the_data(
     assert done.return_value == 0
     (waived,) = json.loads(done.output)["waived"]
     assert (waived["id"], waived["line"], waived["reason"]) == ("ST106", 2, "b is a gear ratio")
+
+
+SHARED = """VAR_GLOBAL total, other : INT; END_VAR
+FUNCTION_BLOCK Adder VAR_INPUT x : INT; END_VAR
+total := total + x;
+END_FUNCTION_BLOCK
+PROGRAM Fast VAR total : INT; END_VAR
+total := 1; other := 2;
+END_PROGRAM
+PROGRAM Slow VAR adder : Adder; END_VAR
+adder(x := 1);
+END_PROGRAM
+PROGRAM Third VAR_EXTERNAL total : INT; END_VAR
+total := 3;
+END_PROGRAM
+"""
+
+
+@pytest.mark.parametrize(
+    ("tasks", "lines"),
+    [
+        ({"fast": "quick", "slow": "slow"}, []),  # Fast has a variable of this name
+        ({"slow": "slow", "third": "slow"}, []),
+        ({"slow": "slow", "third": "quick"}, [12]),
+        ({"slow": "slow"}, []),
+        ({"third": "quick", "slow": "slow"}, [12]),
+    ],
+)
+def test_a_variable_that_two_tasks_write_is_found_through_function_blocks(
+    tasks: dict[str, str], lines: list[int]
+) -> None:
+    found = list(written_by_several_tasks(parse_all(SHARED, "p.st"), tasks))
+    assert [one.line for one in found] == lines
+    assert all(one.message == "total is written by Slow (task slow) and Third (task quick)" for one in found)
+
+
+def test_the_tasks_of_a_system_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(ROOT / "examples" / "first-bug", tmp_path / "site")
+    monkeypatch.chdir(tmp_path / "site")
+    Path("p.st").write_text(SHARED)
+    text = Path("tank.yaml").read_text()
+    Path("tank.yaml").write_text(
+        text[: text.index("plc:")]
+        + "plc:\n  tasks: {slow: {interval_ms: 100}, quick: {interval_ms: 10}}\n"
+        + "  programs:\n    a: {source: 'p.st:Slow'}\n    b: {source: 'p.st:Third', task: quick}\n"
+    )
+    done = checked("tank.yaml", "--error", "ST108")
+    assert done.return_value == 1
+    assert "p.st:12:1: ST108 total is written by Slow (task slow) and Third (task quick)" in done.output

@@ -71,7 +71,7 @@ _MEANINGS = {
         "Call the instance once in every scan, outside of the IF or CASE, and put the condition into its input.",
     ),
     "ST106": (
-        "A division by zero stops the task. No condition in the POU uses the divisor.",
+        "A division by zero stops the task. No condition or comparison in the POU uses the divisor.",
         "Test the divisor before the division, or limit it: `x / MAX(y, 1)`.",
     ),
     "ST107": (

@@ -7,7 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from fieldtwin.plc.st.syntax import tree as t
 
 _FOLLOW = frozenset({"TON", "TOF", "TP", "R_TRIG", "F_TRIG", "CTU", "CTD", "CTUD"})
-"""The standard blocks whose result depends on how often they are called."""
+"""The standard blocks whose result depends on how often they are called. Counters also have variants such as CTU_DINT."""
+
+
+def _follows(kind: str) -> bool:
+    return kind in _FOLLOW or (kind.startswith("CT") and kind.partition("_")[0] in _FOLLOW)
 
 
 def called_sometimes(body: Sequence[t.Statement], type_of: Callable[[t.Ref], str]) -> Iterator[tuple[str, t.Pos]]:
@@ -26,7 +30,7 @@ def called_sometimes(body: Sequence[t.Statement], type_of: Callable[[t.Ref], str
 
 def _calls(body: Sequence[t.Statement], type_of: Callable[[t.Ref], str]) -> Iterator[t.Call]:
     for statement in body:
-        if isinstance(statement, t.CallStatement) and type_of(statement.call.ref) in _FOLLOW:
+        if isinstance(statement, t.CallStatement) and _follows(type_of(statement.call.ref)):
             yield statement.call
         for inner in _branches(statement) or ():
             yield from _calls(inner, type_of)
@@ -36,7 +40,7 @@ def _always(body: Sequence[t.Statement], type_of: Callable[[t.Ref], str]) -> set
     """Return the instances that every path through a body calls."""
     found = set()
     for statement in body:
-        if isinstance(statement, t.CallStatement) and type_of(statement.call.ref) in _FOLLOW:
+        if isinstance(statement, t.CallStatement) and _follows(type_of(statement.call.ref)):
             found.add(statement.call.ref.name.lower())
         elif branches := _branches(statement):
             found |= set.intersection(*(_always(branch, type_of) for branch in branches))

@@ -16,6 +16,7 @@ from fieldtwin.plc.st.syntax.walk import nodes
 from fieldtwin.plc.st.syntax.written import reference, text_of
 
 _LOCAL = ("VAR", "VAR_TEMP", "VAR_EXTERNAL")
+_COMPARISONS = ("=", "<>", "<", ">", "<=", ">=")
 _REALS = ("REAL", "LREAL")
 _REAL_FUNCTIONS = ("SQRT", "LN", "LOG", "EXP", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "ATAN2")
 Finding = tuple[str, t.Pos, str]
@@ -138,13 +139,34 @@ def _conditional_calls(about: _About) -> Iterator[Finding]:
 
 
 def _divisions(about: _About) -> Iterator[Finding]:
-    guarded = {one.name.lower() for one in nodes(tuple(about.conditions)) if isinstance(one, t.Ref)}
+    guarded = about.constants | set(_guarded(about))
     for one in about.nodes:
-        if not isinstance(one, t.Binary) or one.op.upper() not in ("/", "MOD") or not isinstance(one.right, t.Ref):
+        if not isinstance(one, t.Binary) or one.op.upper() not in ("/", "MOD"):
             continue
-        name = one.right.name.lower()
-        if name in about.variables and name not in about.constants | guarded:
+        if isinstance(one.right, t.Literal) and _is_zero(one.right):
+            yield "ST106", one.right.pos, f"a division by {one.right.text}"
+        elif isinstance(one.right, t.Ref) and one.right.name.lower() in about.variables.keys() - guarded:
             yield "ST106", one.right.pos, f"a division by {reference(one.right)}, which no condition tests for 0"
+
+
+def _guarded(about: _About) -> Iterator[str]:
+    """Yield the variables that a condition or comparison uses, that count a FOR, or that MAX or LIMIT limits."""
+    for one in about.nodes:
+        if isinstance(one, t.Binary) and one.op in _COMPARISONS:
+            yield from (each.name.lower() for each in nodes((one.left, one.right)) if isinstance(each, t.Ref))
+        elif isinstance(one, t.For):
+            yield one.variable.name.lower()
+        elif (
+            isinstance(one, t.Assign)
+            and isinstance(one.value, t.Call)
+            and one.value.ref.name.upper() in ("MAX", "LIMIT")
+        ):
+            yield one.target.name.lower()
+    yield from (each.name.lower() for each in nodes(tuple(about.conditions)) if isinstance(each, t.Ref))
+
+
+def _is_zero(literal: t.Literal) -> bool:
+    return literal.kind in ("INTEGER", "REAL") and float(literal.text.replace("_", "")) == 0
 
 
 def _unreachable(about: _About) -> Iterator[Finding]:

@@ -14,7 +14,11 @@ from pathlib import Path
 
 from fieldtwin.plc.st.dialects import FINDINGS, WARNINGS, StWarning
 
-_WAIVER = re.compile(r"(?://|\(\*|/\*)\s*fieldtwin:\s*allow\s+(\w+)\s*(?::\s*(.*?))?\s*(?:\*\)|\*/|$)", re.IGNORECASE)
+_TOKEN = re.compile(r"""'(?:\$.|[^'$\n])*'|"(?:\$.|[^"$\n])*"|(?P<comment>//[^\n]*|\(\*.*?\*\)|/\*.*?\*/)""", re.DOTALL)
+"""Strings, in which a waiver is only text, and comments."""
+_WAIVER = re.compile(
+    r"\bfieldtwin:[ \t]*allow[ \t]+(\w+)[ \t]*(?::[ \t]*([^\n]*?))?[ \t]*(?:\*\)|\*/|$)", re.IGNORECASE | re.MULTILINE
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +38,10 @@ def waivers_of(path: str) -> list[Waiver]:
     """Return the waivers in the text of a file that was compiled before."""
     text = Path(path).read_text("utf-8-sig", errors="replace")
     return [
-        Waiver(found[1].upper(), found[2] or "", path, number)
-        for number, line in enumerate(text.splitlines(), 1)
-        for found in _WAIVER.finditer(line)
+        Waiver(found[1].upper(), found[2] or "", path, 1 + text.count("\n", 0, token.start() + found.start()))
+        for token in _TOKEN.finditer(text)
+        if token["comment"]
+        for found in _WAIVER.finditer(token[0])
     ]
 
 

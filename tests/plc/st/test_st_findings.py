@@ -51,6 +51,11 @@ def ids(body: str) -> list[str]:
         ("IF m <> 0 THEN i := n / m; END_IF", []),
         ("IF m = 0 THEN RETURN; END_IF i := n / m;", []),
         ("i := n / TEN; i := n / SHARED; i := n / 2; i := n / MAX(m, 1);", []),
+        ("q := m <> 0 AND_THEN n / m > 3;", []),
+        ("FOR i := 1 TO 10 DO z := n / i; END_FOR", []),
+        ("i := MAX(1, m); z := n / i;", []),
+        ("i := n / 0;", ["ST106"]),
+        ("z := x / 0.0;", ["ST106"]),
         ("RETURN; i := 1;", ["ST107"]),
         ("FOR i := 1 TO 3 DO EXIT; END_FOR", []),
         ("IF FALSE THEN i := 1; END_IF", ["ST107"]),
@@ -68,11 +73,12 @@ def test_a_suspicious_construct_is_found_and_a_sound_one_is_not(body: str, expec
         ("IF go THEN t(IN := TRUE); ELSE t(IN := FALSE); END_IF u();", []),
         ("IF go THEN t(IN := TRUE); END_IF t(IN := FALSE); u();", []),
         ("CASE n OF 1: t(); u(); 2: t(); ELSE t(); END_CASE", ["u"]),
+        ("t(); u(); IF go THEN v(); END_IF", ["v"]),
         ("IF go THEN IF n = 1 THEN t(); ELSE t(); END_IF ELSE t(); END_IF u();", []),
     ],
 )
 def test_a_timer_has_to_be_called_in_every_branch(body: str, expected: list[str]) -> None:
-    variables = "VAR_INPUT go : BOOL; n : INT; END_VAR VAR t : TON; u : CTU; END_VAR"
+    variables = "VAR_INPUT go : BOOL; n : INT; END_VAR VAR t : TON; u : CTU; v : CTU_DINT; END_VAR"
     unit = parse_all(f"PROGRAM p {variables}\n{body}\nEND_PROGRAM", "p.st")
     assert [one.message.split()[0] for one in findings(unit) if one.id == "ST105"] == expected
 
@@ -106,10 +112,14 @@ def checked(*arguments: str) -> Result:
     return CliRunner().invoke(check, arguments, standalone_mode=False)
 
 
-DIVISION = """PROGRAM p VAR_INPUT a, b : INT; END_VAR VAR_OUTPUT q : INT; END_VAR
+X = "FUNCTION x VAR_INPUT s : STRING; END_VAR END_FUNCTION "
+DIVISION = (
+    X
+    + """PROGRAM p VAR_INPUT a, b : INT; END_VAR VAR_OUTPUT q : INT; END_VAR
 {before}q := a / b;{after}
 END_PROGRAM
 """
+)
 FOUND = "ST106 a division by b, which no condition tests for 0"
 
 
@@ -119,6 +129,8 @@ FOUND = "ST106 a division by b, which no condition tests for 0"
         ("", "", [f"p.st:2:10: {FOUND}"]),
         ("", " // fieldtwin: allow ST106: b is a gear ratio", []),
         ("(* fieldtwin: allow ST106: b is a gear ratio *)\n", "", []),
+        ("(* the next line\n   fieldtwin: allow ST106: b is a gear ratio *)\n", "", []),
+        ("x('// fieldtwin: allow ST106: in a string');\n", "", [f"p.st:3:10: {FOUND}"]),
         (
             "",
             " // fieldtwin: allow ST106",

@@ -7,12 +7,13 @@ declarations have precedence over those of libraries, and a library over those t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import nodes
 
 Declaration = t.TypeDecl | t.VarBlock | t.Pou
 
@@ -103,16 +104,10 @@ def _names(root: Any) -> Iterator[str]:
 
 
 def _references(root: Any, local: set[str]) -> Iterator[str]:
-    stack = [root]
-    while stack:
-        node = stack.pop()
-        if isinstance(node, tuple):
-            stack.extend(node)
-        elif is_dataclass(node):
-            if isinstance(node, t.NamedType | t.SubrangeType) or (
-                isinstance(node, t.Ref) and node.name.lower() not in local
-            ):
-                yield node.name.lower()
-            elif isinstance(node, t.Literal) and node.kind == "ENUM_REF":
-                yield node.text.partition("#")[0].lower()
-            stack.extend(getattr(node, one.name) for one in fields(node))
+    for node in nodes(root):
+        if isinstance(node, t.NamedType | t.SubrangeType) or (
+            isinstance(node, t.Ref) and node.name.lower() not in local
+        ):
+            yield node.name.lower()
+        elif isinstance(node, t.Literal) and node.kind == "ENUM_REF":
+            yield node.text.partition("#")[0].lower()

@@ -110,11 +110,7 @@ class _Unit:
         self.env.missing = {m.name.lower(): m for m in unit.missing if m.name.lower() not in declared}
         self._check_names()
         self._check_configuration()
-        for pou in unit.pous:
-            for variable, first in shared_addresses(pou):
-                message = f"{variable.name} and {first.name} have one address"
-                expected = "one variable for each address"
-                self.env.collected(self.env.error(variable.pos, message, expected=expected, got=variable.location))
+        self._check_addresses(unit)
         self.declarations = Declarations(self.env, self.unit, self.out)
         self._declare_global_constants()
         self.declarations.resolve()
@@ -165,6 +161,14 @@ class _Unit:
                 message = f"a program {instance.program!r} is not declared"
                 expected = ", ".join(programs.values())
                 self.env.collected(self.env.error(instance.pos, message, expected=expected))
+
+    def _check_addresses(self, unit: t.SourceUnit) -> None:
+        """Check that the variables of a POU have different addresses. `unit` still has the addresses."""
+        for pou in unit.pous:
+            for variable, first in shared_addresses(pou):
+                message = f"{variable.name} and {first.name} have one address"
+                expected = "one variable for each address"
+                self.env.collected(self.env.error(variable.pos, message, expected=expected, got=variable.location))
 
     def _code(self, text: str) -> tuple[CodeType, ...]:
         places = self._places()

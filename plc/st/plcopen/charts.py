@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.plcopen.elements import Element
 from fieldtwin.plc.st.plcopen.networks import Drawing, Drawn
-from fieldtwin.plc.st.plcopen.nodes import Node, Unsupported, nodes_of, pin_of
+from fieldtwin.plc.st.plcopen.nodes import Node, nodes_of, pin_of, refuse_elements
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_expression
 
@@ -45,13 +45,7 @@ def read_chart(
 
     Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
     """
-    for element in body.children:
-        if element.tag in _UNSUPPORTED:
-            local = element.attributes.get("localId", "")
-            raise Unsupported(
-                f"{of} has the element {element.tag} (localId {local}) in a chart, which is not supported",
-                path=path, line=element.line, column=element.column,
-            )  # fmt: skip
+    refuse_elements(body, _UNSUPPORTED, of, path, " in a chart")
     return _Reader(nodes_of(body, of, path), standard, named).read()
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fieldtwin.plc.st.plcopen.elements import Element
-from fieldtwin.plc.st.plcopen.nodes import Node, Pin, Unsupported, in_order, nodes_of, written
+from fieldtwin.plc.st.plcopen.nodes import Node, Pin, in_order, nodes_of, refuse_elements, written
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_expression
 
@@ -32,13 +32,7 @@ def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suf
 
     Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
     """
-    for element in body.children:
-        if element.tag in ("jump", "error", "actionBlock"):
-            local = element.attributes.get("localId", "")
-            raise Unsupported(
-                f"{of} has the element {element.tag} (localId {local}), which is not supported",
-                path=path, line=element.line, column=element.column,
-            )  # fmt: skip
+    refuse_elements(body, ("jump", "error", "actionBlock"), of, path)
     return Drawing(nodes_of(body, of, path), standard, suffix).drawn()
 
 

@@ -8,7 +8,7 @@ without a function block has no such value and is refused.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 
@@ -66,6 +66,17 @@ class Node:
     def _made(self, kind: type[FileInvalid], message: str) -> FileInvalid:
         where = f"{self.pos.element}: {message}"
         return kind(where, path=self.pos.path, line=self.pos.line, column=self.pos.column)
+
+
+def refuse_elements(body: Element, tags: Container[str], of: str, path: str, where: str = "") -> None:
+    """Raise `Unsupported` for the first element of a body that is one of `tags`. `of` is the name of the POU or action."""
+    for element in body.children:
+        if element.tag in tags:
+            local = element.attributes.get("localId", "")
+            raise Unsupported(
+                f"{of} has the element {element.tag} (localId {local}){where}, which is not supported",
+                path=path, line=element.line, column=element.column,
+            )  # fmt: skip
 
 
 def nodes_of(body: Element, of: str, path: str) -> dict[str, Node]:

@@ -7,12 +7,13 @@ can contain it.
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import with_parts
 
 _BLOCKS = {"R_EDGE": "R_TRIG", "F_EDGE": "F_TRIG"}
 
@@ -80,11 +81,6 @@ def _called(variable: t.VarDecl) -> t.CallStatement:
 
 def _reading(node: Any, edges: dict[str, t.VarDecl]) -> Any:
     """Return a part of the tree that reads Q of the block in place of an input. Targets of assignments are not replaced."""
-    if isinstance(node, tuple):
-        return tuple(_reading(part, edges) for part in node)
     if isinstance(node, t.Ref) and node.name.lower() in edges:
         return t.Ref(node.pos, _trigger(node.name), (t.Member(node.pos, "Q"), *_reading(node.selectors, edges)))
-    if is_dataclass(node) and not isinstance(node, type | t.Pos):
-        changed = {one.name: _reading(getattr(node, one.name), edges) for one in fields(node) if one.name != "target"}
-        return replace(node, **changed)
-    return node
+    return with_parts(node, lambda part: _reading(part, edges), but="target")

@@ -7,7 +7,7 @@ Names that begin with 0 belong to this translation; no source can contain them.
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.charts.reachability import check_reachability
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse
-from fieldtwin.plc.st.syntax.walk import nodes
+from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
 _TIMED = ("L", "D", "SD", "DS", "SL")
 _QUALIFIERS = ("N", "R", "S", "P", "P0", "P1", *_TIMED)
@@ -278,8 +278,4 @@ def _blocks() -> tuple[t.Pou, ...]:
 def _renamed(node: Any) -> Any:
     if isinstance(node, str):
         return f"0{node.removeprefix(_HIDDEN)}" if node.startswith(_HIDDEN) else node
-    if isinstance(node, tuple):
-        return tuple(_renamed(part) for part in node)
-    if is_dataclass(node) and not isinstance(node, type):
-        return replace(node, **{field.name: _renamed(getattr(node, field.name)) for field in fields(node)})
-    return node
+    return with_parts(node, _renamed)

@@ -1,9 +1,9 @@
-"""Walks through a tree."""
+"""Walks through a tree, and changes of its parts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from fieldtwin.plc.st.syntax.tree import Pos
@@ -19,3 +19,12 @@ def nodes(root: Any) -> Iterator[Any]:
         elif is_dataclass(node) and not isinstance(node, Pos):
             yield node
             stack.extend(getattr(node, one.name) for one in fields(node))
+
+
+def with_parts(node: Any, change: Callable[[Any], Any], but: str = "") -> Any:
+    """Return a node or tuple with each of its parts as `change` returns it; the field `but` stays. Other values have no parts."""
+    if isinstance(node, tuple):
+        return tuple(change(part) for part in node)
+    if is_dataclass(node) and not isinstance(node, type):
+        return replace(node, **{one.name: change(getattr(node, one.name)) for one in fields(node) if one.name != but})
+    return node

@@ -28,7 +28,8 @@ from fieldtwin.plc.program import (
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
-from fieldtwin.plc.st.compiler.compile import CompiledProgram, CompiledUnit, ProgramVariable
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source

@@ -10,17 +10,14 @@ from typing import Any
 
 from lark import Token, v_args
 from lark.tree import Meta
-from lark.visitors import Transformer_NonRecursive
 
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.rules.base import Rules
 
 
 @v_args(meta=True)
-class ChartRules(Transformer_NonRecursive[Token, Any]):
+class ChartRules(Rules):
     """The methods of the transformer for steps and transitions."""
-
-    def _pos(self, where: Meta | Token) -> t.Pos:
-        raise NotImplementedError
 
     def step(self, meta: Meta, items: list[Any]) -> t.Step:
         word, name, *associations = items

@@ -1,0 +1,1 @@
+"""The Python code of variables, functions, function blocks and programs."""

@@ -1,0 +1,84 @@
+"""The code of function blocks (IEC 61131-3:2013, 6.6.3) and of the actions of POUs. A FUNCTION_BLOCK becomes a class."""
+
+from __future__ import annotations
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.pous.variables import Variables
+from fieldtwin.plc.st.compiler.scope import Symbol, by_reference
+from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.syntax import tree as t
+
+
+class Bodies:
+    """The compiler of what function blocks and programs have in common: bodies and actions."""
+
+    def __init__(self, variables: Variables) -> None:
+        self.env, self.declarations, self.out = variables.env, variables.declarations, variables.out
+        self.variables = variables
+
+    def body_of(self, pou: t.Pou, symbols: dict[str, Symbol], name: str) -> Statements:
+        """Return the compiler of a body of a POU. `name` is that of the POU, or of an action with the POU before it."""
+        body = Statements(self.env, symbols, self.out, name)
+        body.owner = pou.name.lower()
+        body.actions = frozenset(action.name.lower() for action in pou.actions)
+        return body
+
+    def write_actions(self, pou: t.Pou, symbols: dict[str, Symbol], inputs: frozenset[str] = frozenset()) -> None:
+        """Write a method for each action of a POU."""
+        seen: set[str] = set()
+        for action in pou.actions:
+            key = action.name.lower()
+            if key in seen or key in symbols:
+                self.env.collected(self.env.error(action.pos, f"{action.name} is declared twice"))
+            seen.add(key)
+            with self.out.block(f"def a_{key}(self):", action.pos):
+                self.out.step(action.pos)
+                body = self.body_of(pou, symbols, f"{pou.name.lower()}.{key}")
+                body.program_inputs = set(inputs)
+                body.body(action.body)
+
+    def note_parts(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
+        """Add the function blocks that a POU contains to those that it may call."""
+        for kind, v in (
+            (symbols[v.name.lower()].type, v) for b in pou.blocks for v in b.variables if v.name.lower() in symbols
+        ):
+            if by_reference(kind) and isinstance(kind, ty.Block):
+                self.env.calls.setdefault(pou.name.lower(), {}).setdefault(kind.name.lower(), v.pos)
+
+
+class Blocks(Bodies):
+    """The compiler of the function blocks of a unit."""
+
+    def __init__(self, variables: Variables) -> None:
+        super().__init__(variables)
+        self.kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
+        """By function block: its variables that keep their values."""
+
+    def write(self, pou: t.Pou) -> None:
+        """Write the class of a FUNCTION_BLOCK."""
+        symbols = self.variables.symbols_of(pou, "self.")
+        self.note_parts(pou, symbols)
+        held = [s for s in symbols.values() if s.code.startswith("self.")]
+        kept = [s.code.split(".")[1] for s in held]
+        in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
+        self.kept[pou.name.lower()] = tuple(
+            (s.name, s.type) for s, attribute in zip(held, kept, strict=True) if attribute not in in_outs
+        )
+        with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
+            self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
+            self.out.line(f"in_outs = {tuple(in_outs)}")
+            with self.out.block("def __init__(self):"):
+                self.variables.initialise(
+                    pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou))
+                )
+                for attribute in in_outs:
+                    self.out.line(f"self.{attribute} = None")
+            with self.out.block("def execute(self, now_ns):"):
+                self.out.step(pou.pos)
+                self.variables.initialise(pou, symbols, ("VAR_TEMP",))
+                self.body_of(pou, symbols, pou.name.lower()).body(pou.body)
+            self.write_actions(pou, symbols)
+
+    def _kept_temporaries(self, pou: t.Pou) -> tuple[str, ...]:
+        """Return VAR_TEMP if the POU has actions: one may be called before the POU, so the variables have to exist."""
+        return ("VAR_TEMP",) if pou.actions else ()

@@ -1,0 +1,56 @@
+"""The code of functions (IEC 61131-3:2013, 6.6.2). A FUNCTION becomes a Python function."""
+
+from __future__ import annotations
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.pous.variables import Variables
+from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol
+from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.syntax import tree as t
+
+
+class Functions:
+    """The compiler of the functions of a unit."""
+
+    def __init__(self, variables: Variables) -> None:
+        self.env, self.declarations, self.out = variables.env, variables.declarations, variables.out
+        self.variables = variables
+
+    def signature(self, pou: t.Pou) -> Signature:
+        """Return the signature of a FUNCTION, whose body may not have been compiled yet."""
+        found: dict[str, list[Parameter]] = {"VAR_INPUT": [], "VAR_IN_OUT": [], "VAR_OUTPUT": []}
+        for block in pou.blocks:
+            for v in block.variables:
+                if block.kind in found:
+                    kind = self.declarations.type_of(v.type)
+                    initial = self.declarations.shared(self.declarations.initial(kind, v.initial, v.type))
+                    found[block.kind].append(Parameter(v.name, kind, initial))
+        return Signature(
+            pou.name,
+            self.declarations.type_of(pou.returns) if pou.returns is not None else ty.NOTHING,
+            tuple(found["VAR_INPUT"]),
+            tuple(found["VAR_IN_OUT"]),
+            tuple(found["VAR_OUTPUT"]),
+        )
+
+    def write(self, pou: t.Pou) -> None:
+        """Write the Python function of a FUNCTION."""
+        signature = self.env.functions[pou.name.lower()]
+        key = pou.name.lower()
+        symbols = self.variables.symbols_of(pou, "")
+        if key in symbols:
+            self.env.fail(pou.pos, f"{pou.name} is the name of the function's result, and is declared again")
+        result = "None" if pou.returns is None else f"v_{key}"
+        if pou.returns is not None:
+            symbols.setdefault(key, Symbol(pou.name, signature.returns, result))
+        arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
+        body = Statements(self.env, symbols, self.out, pou.name.lower())
+        results = [result, *(f"v_{p.name.lower()}" for p in signature.outputs)]
+        body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
+        with self.out.block(f"def f_{key}({arguments}):", pou.pos):
+            self.out.step(pou.pos)
+            if pou.returns is not None:
+                self.out.line(f"{result} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
+            self.variables.initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
+            body.body(pou.body)
+            self.out.line(body.leave, pou.pos)

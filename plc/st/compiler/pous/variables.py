@@ -1,0 +1,164 @@
+"""The variables of a unit: the global ones, and those of each POU, with the code of their initial values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
+from fieldtwin.plc.st.syntax import tree as t
+
+
+class Variables:
+    """The compiler of the variables of a unit."""
+
+    def __init__(self, env: Environment, unit: t.SourceUnit, declarations: Declarations, out: CodeWriter) -> None:
+        self.env, self.unit, self.declarations, self.out = env, unit, declarations, out
+        self._globals: dict[tuple[str, str], Symbol] = {}
+        """The global variables by list and name, in lower case."""
+        self._lists = list(dict.fromkeys(block.list.lower() for block in unit.globals))
+
+    # -- global variables -------------------------------------------------------------------------------------------------
+
+    def declare_global_constants(self) -> None:
+        """Declare the constants whose value is known at once, because types may use them in their limits.
+
+        A constant may refer to one that is declared after it, so those with an error are tried again after the others.
+        """
+        pending = [
+            (block, v)
+            for block in self.unit.globals
+            for v in block.variables
+            if "CONSTANT" in block.qualifiers
+            and isinstance(v.type, t.NamedType)
+            and v.type.name.upper() in ty.ELEMENTARY
+        ]
+        count = len(pending) + 1
+        while len(pending) < count:
+            count, unknown = len(pending), set(self.env.faulty_here)
+            pending = [(block, v) for block, v in pending if not self._declare_constant(block, v)]
+            self.env.faulty_here = unknown
+        for block, v in pending:
+            with self.env.declaring(v.name, self.env.faulty):
+                self.declarations.constant(v, self._global_code(block, v))
+
+    def _declare_constant(self, block: t.VarBlock, v: t.VarDecl) -> bool:
+        """Declare a global constant; return False if it has an error, also one that later declarations may remove."""
+        try:
+            symbol = self.declarations.constant(v, self._global_code(block, v))
+        except FileInvalid:
+            return False
+        if symbol is not None:
+            self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
+        return True
+
+    def _global_code(self, block: t.VarBlock, v: t.VarDecl) -> str:
+        """Return the Python expression of a global variable; two lists may have variables of one name."""
+        return f"_G.v{self._lists.index(block.list.lower()) if block.list else ''}_{v.name.lower()}"
+
+    def declare_globals(self) -> None:
+        """Declare all global variables, after the types are known."""
+        for block in self.unit.globals:
+            self._no_retain(block, "a VAR_GLOBAL")
+            for v in block.variables:
+                with self.env.declaring(v.name, self.env.faulty):
+                    self._no_address(v)
+                    key = block.list.lower(), v.name.lower()
+                    if key in self._globals:
+                        self.env.fail(v.pos, f"{v.name} is declared twice")
+                    symbol = self._symbol(v, block, self._global_code(block, v))
+                    self._globals[key] = symbol
+                    self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
+        if self._globals:
+            first = self.unit.globals[0].pos
+            self.declarations.bounded(first, (symbol.type for symbol in self._globals.values()))
+
+    def write_globals(self) -> None:
+        """Write the code of the global variables, after all code that they may need and before any program is created."""
+        self.out.line("class _Globals: pass")
+        self.out.line("_G = _Globals()")
+        for block in self.unit.globals:
+            for v in block.variables:
+                symbol = self._globals.get((block.list.lower(), v.name.lower()))
+                if symbol is not None:
+                    self.write_initial(v, symbol)
+
+    # -- variables of POUs ------------------------------------------------------------------------------------------------
+
+    def symbols_of(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
+        """Return all variables of a POU. `prefix` comes before their names in Python, such as ``self.``; a VAR_TEMP has none,
+        because it is local to a call, unless the POU has actions, which use it too.
+        """
+        symbols: dict[str, Symbol] = {}
+        for block in pou.blocks:
+            if pou.kind != "PROGRAM":
+                self._no_retain(block, f"a variable of a {pou.kind}")
+            for v in block.variables:
+                with self.env.declaring(v.name, self.env.faulty_here):
+                    self._no_address(v)
+                    if v.name.lower() in symbols:
+                        self.env.fail(v.pos, f"{v.name} is declared twice")
+                    before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
+                    symbols[v.name.lower()] = self._variable(v, block, before)
+        own = (
+            symbols[v.name.lower()].type
+            for b in pou.blocks
+            if b.kind != "VAR_EXTERNAL"
+            for v in b.variables
+            if v.name.lower() in symbols
+        )
+        self.declarations.bounded(pou.pos, own)
+        return symbols
+
+    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str) -> Symbol:
+        if block.kind == "VAR_EXTERNAL":
+            return self._external(v)
+        code = f"{prefix}v_{v.name.lower()}"
+        symbol = self._symbol(v, block, code)
+        if block.kind == "VAR_IN_OUT" and not by_reference(symbol.type):
+            return replace(symbol, code=f"{code}.v", reference=code)
+        return symbol
+
+    def _external(self, v: t.VarDecl) -> Symbol:
+        found = self.env.globals.get(v.name.lower())
+        if found is None:
+            self.env.unknown(v.pos, "a global variable", v.name, [s.name for s in self.env.globals.values()])
+        if found.type != self.declarations.type_of(v.type):
+            self.env.fail(v.pos, f"{v.name} is declared with another type", expected=str(found.type))
+        return found
+
+    def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
+        kind = self.declarations.type_of(v.type, block.kind)
+        if "CONSTANT" not in block.qualifiers:
+            is_input = block.kind == "VAR_INPUT"
+            return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)
+        return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
+
+    def initialise(self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...]) -> None:
+        """Write the initial values of the variables in the blocks of these kinds, such as VAR and VAR_OUTPUT."""
+        for block in pou.blocks:
+            for v in block.variables if block.kind in kinds else ():
+                symbol = symbols.get(v.name.lower())
+                if symbol is not None:
+                    self.write_initial(v, symbol)
+
+    def write_initial(self, v: t.VarDecl, symbol: Symbol) -> None:
+        """Write the assignment of a variable's initial value. A constant needs none, because its value is written at each use."""
+        if symbol.constant is None:
+            with self.env.errors.collect():
+                value = self.declarations.initial(symbol.type, v.initial, v.type)
+                self.out.line(f"{symbol.code} = {value}", v.pos)
+
+    def _no_retain(self, block: t.VarBlock, what: str) -> None:
+        if block.qualifiers & {"RETAIN", "PERSISTENT"}:
+            hint = "a PROGRAM's VAR RETAIN can, also a block in it"
+            self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
+
+    def _no_address(self, v: t.VarDecl) -> None:
+        if v.location:
+            self.env.fail(
+                v.pos, f"{v.name} AT {v.location}: addresses are not supported",
+                hint="declare it as VAR_INPUT or VAR_OUTPUT and bind it to a tag in the system file",
+            )  # fmt: skip

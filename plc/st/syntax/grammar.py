@@ -1,0 +1,96 @@
+"""The parser of the grammar, and the errors of texts that the grammar does not accept."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+
+from lark import Lark, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken
+from lark.exceptions import UnexpectedInput
+from lark.lexer import PatternStr
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.syntax.source import shortened
+
+MAX_EXPECTED = 8
+"""How many of the expected tokens an error names."""
+
+_UNSUPPORTED = {
+    word: construct
+    for construct, words in {
+        "classes and methods": (
+            "METHOD END_METHOD CLASS END_CLASS EXTENDS THIS SUPER ABSTRACT FINAL PUBLIC PRIVATE PROTECTED INTERNAL VAR_INST"
+        ),
+        "interfaces": "INTERFACE END_INTERFACE IMPLEMENTS",
+        "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
+        "namespaces": "NAMESPACE END_NAMESPACE USING",
+        "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
+        "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
+        "labels and jumps": "JMP",
+    }.items()
+    for word in words.split()
+}
+"""The words of constructs that other compilers know, by which an error names the construct."""
+
+_READABLE = {
+    "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
+    "DURATION": "a duration", "DATE": "a date", "TIME_OF_DAY": "a time of day", "DATE_AND_TIME": "a date",
+    "STRING_LITERAL": "a string", "WSTRING_LITERAL": "a string", "ENUM_REF": "a name", "VAR_KIND": "VAR", "SEMICOLON": ";",
+    "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
+    "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
+    "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
+}  # fmt: skip
+
+
+@cache
+def parser() -> Lark:
+    """Return the parser, with the rules `start` and `expression` as its starts."""
+    grammar = resources.files("fieldtwin.plc.st.syntax").joinpath("grammar.lark").read_text(encoding="utf-8")
+    starts = ["start", "expression"]
+    return Lark(
+        grammar, start=starts, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII
+    )
+
+
+def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
+    """Return the error of the parser as an error in the file, with the readable names of the expected tokens."""
+    if isinstance(e, UnexpectedToken) and e.token.type != "$END":
+        got, line, column = str(e.token), e.line, e.column
+        names = e.accepts or e.expected
+    elif isinstance(e, UnexpectedCharacters):
+        got, line, column = e.char, e.line, e.column
+        names = e.allowed or set()
+    else:  # the end of the text
+        before = text.rstrip()
+        got, line, column = "the end of the file", before.count("\n") + 1, len(before) - before.rfind("\n")
+        names = getattr(e, "accepts", None) or (set() if isinstance(e, UnexpectedEOF) else e.expected)  # type: ignore[attr-defined]
+    construct = _unsupported(got, text, line, column)
+    if construct:
+        return FileInvalid(f"{construct} are not supported", path=path, line=line, column=column, got=shortened(got))
+    readable = sorted({_readable(name) for name in names})
+    more = f" and {len(readable) - MAX_EXPECTED} more" if len(readable) > MAX_EXPECTED else ""
+    return FileInvalid(
+        "not Structured Text",
+        path=path,
+        line=line,
+        column=column,
+        got=shortened(got if got.isprintable() else repr(got)),
+        expected=", ".join(readable[:MAX_EXPECTED]) + more,
+    )
+
+
+def _unsupported(got: str, text: str, line: int, column: int) -> str:
+    """Return the construct that the unexpected token `got`, or the word before it, belongs to; "" for an ordinary error."""
+    lines = text.split("\n")[:line]
+    lines[-1] = lines[-1][: column - 1]
+    before = re.search(r"([A-Za-z_]\w*)\s*\Z", "\n".join(lines[-2:]))
+    return _UNSUPPORTED.get(got.upper()) or (_UNSUPPORTED.get(before[1].upper(), "") if before else "")
+
+
+@cache
+def _readable(name: str) -> str:
+    for terminal in parser().terminals:
+        if terminal.name == name and isinstance(terminal.pattern, PatternStr):
+            return str(terminal.pattern.value)
+    return _READABLE.get(name, name)

@@ -1,0 +1,120 @@
+"""The rules of the grammar for types and variables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lark import Token, v_args
+from lark.tree import Meta
+
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.rules.base import Bad, Rules, integer
+
+
+@v_args(meta=True)
+class DeclarationRules(Rules):
+    """The methods of the transformer for types and variables."""
+
+    def global_vars(self, meta: Meta, items: list[Any]) -> t.VarBlock:
+        return self.var_block(meta, items)
+
+    def var_block(self, meta: Meta, items: list[Any]) -> t.VarBlock:
+        kind, *rest = items
+        qualifiers = frozenset(i.upper() for i in rest if isinstance(i, str))
+        variables = tuple(v for i in rest if not isinstance(i, str) for v in i)
+        return t.VarBlock(self._pos(kind), kind.upper(), qualifiers, variables)
+
+    def qualifier(self, meta: Meta, items: list[Any]) -> str:
+        return str(items[0])
+
+    def var_decl(self, meta: Meta, items: list[Any]) -> list[t.VarDecl]:
+        names = [i for i in items if isinstance(i, Token)]
+        location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
+        spec, initial = spec_of(items), initial_of(items)
+        edge = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "edge"), "")
+        return [t.VarDecl(self._pos(n), str(n), spec, initial, location, edge) for n in names]
+
+    def location(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
+        return "at", str(items[0])
+
+    def edge(self, meta: Meta, items: list[Any]) -> tuple[str, str]:
+        return "edge", str(items[0]).upper()
+
+    def initial(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
+        return "initial", items[0]
+
+    def field(self, meta: Meta, items: list[Any]) -> list[t.VarDecl]:
+        return self.var_decl(meta, items)
+
+    def type_block(self, meta: Meta, items: list[Any]) -> list[Any]:
+        return items
+
+    def struct_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
+        name, *fields = items
+        return t.StructDecl(self._pos(name), str(name), tuple(f for group in fields for f in group))
+
+    def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
+        name, *rest = items
+        bases = [t.NamedType(self._pos(i), str(i)) for i in rest if isinstance(i, Token)]
+        if len(bases) > 1:
+            raise Bad(name, "an enumeration with two types of its values")
+        values = tuple(i for i in rest if isinstance(i, tuple) and i[0] != "initial")
+        return t.EnumDecl(self._pos(name), str(name), values, initial_of(rest), bases[0] if bases else None)
+
+    def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
+        return str(items[0]), items[1] if len(items) > 1 else None
+
+    def signed_integer(self, meta: Meta, items: list[Any]) -> int:
+        number = integer(items[-1])
+        return -number if str(items[0]) == "-" else number
+
+    def alias_decl(self, meta: Meta, items: list[Any]) -> t.AliasDecl:
+        return t.AliasDecl(self._pos(items[0]), str(items[0]), spec_of(items), initial_of(items))
+
+    def named_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
+        return t.NamedType(self._pos(meta), str(items[0]))
+
+    def subrange_type(self, meta: Meta, items: list[Any]) -> t.SubrangeType:
+        return t.SubrangeType(self._pos(meta), str(items[0]), items[1], items[2])
+
+    def string_type(self, meta: Meta, items: list[Any]) -> t.StringType:
+        return t.StringType(self._pos(meta), items[0].upper() == "WSTRING", items[1] if len(items) > 1 else None)
+
+    def messages_type(self, meta: Meta, items: list[Any]) -> t.MessagesType:
+        sizes = [*items[1:], None, None]
+        return t.MessagesType(self._pos(meta), sizes[0], sizes[1])
+
+    def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
+        return t.ArrayType(self._pos(meta), tuple(items[:-1]), items[-1])
+
+    def range(self, meta: Meta, items: list[Any]) -> tuple[t.Expr, t.Expr]:
+        return items[0], items[1]
+
+    def bound(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return items[0]  # type: ignore[no-any-return]
+
+    def init_expression(self, meta: Meta, items: list[Any]) -> t.Expr:
+        return items[0]  # type: ignore[no-any-return]
+
+    def init_array(self, meta: Meta, items: list[Any]) -> t.InitArray:
+        return t.InitArray(self._pos(meta), tuple(items))
+
+    def one_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init]:
+        return 1, items[0]
+
+    def repeated_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init | None]:
+        return integer(items[0]), items[1] if len(items) > 1 else None
+
+    def init_struct(self, meta: Meta, items: list[Any]) -> t.InitStruct:
+        return t.InitStruct(self._pos(meta), tuple(items))
+
+    def member_init(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
+        return str(items[0]), items[1]
+
+
+def spec_of(items: list[Any]) -> t.TypeSpec:
+    return next(i for i in items if isinstance(i, t.TypeSpec))
+
+
+def initial_of(items: list[Any]) -> t.Init | None:
+    return next((i[1] for i in items if isinstance(i, tuple) and i[0] == "initial"), None)

@@ -1,0 +1,52 @@
+"""The rules of the grammar for expressions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lark import v_args
+from lark.tree import Meta
+
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.rules.base import Rules, integer
+
+
+@v_args(meta=True)
+class ExpressionRules(Rules):
+    """The methods of the transformer for expressions."""
+
+    def binary(self, meta: Meta, items: list[Any]) -> t.Binary:
+        return t.Binary(self._pos(items[1]), items[1].upper(), items[0], items[2])
+
+    def unary(self, meta: Meta, items: list[Any]) -> t.Unary:
+        return t.Unary(self._pos(meta), items[0].upper(), items[1])
+
+    def call(self, meta: Meta, items: list[Any]) -> t.Call:
+        return t.Call(self._pos(meta), items[0], tuple(items[1:]))
+
+    def operator(self, meta: Meta, items: list[Any]) -> t.Ref:
+        return t.Ref(self._pos(meta), str(items[0]))
+
+    def positional(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(self._pos(meta), "", items[0])
+
+    def named(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(self._pos(meta), str(items[0]), items[1])
+
+    def output(self, meta: Meta, items: list[Any]) -> t.Argument:
+        return t.Argument(self._pos(meta), str(items[-2]), None, items[-1], inverted=len(items) == 3)
+
+    def reference(self, meta: Meta, items: list[Any]) -> t.Ref:
+        return t.Ref(self._pos(meta), str(items[0]), tuple(items[1:]))
+
+    def member(self, meta: Meta, items: list[Any]) -> t.Member:
+        return t.Member(self._pos(meta), str(items[0]))
+
+    def bit(self, meta: Meta, items: list[Any]) -> t.Bit:
+        return t.Bit(self._pos(meta), integer(items[0]))
+
+    def index(self, meta: Meta, items: list[Any]) -> t.Index:
+        return t.Index(self._pos(meta), tuple(items))
+
+    def literal(self, meta: Meta, items: list[Any]) -> t.Literal:
+        return t.Literal(self._pos(meta), items[0].type, str(items[0]))

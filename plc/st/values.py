@@ -12,27 +12,47 @@ import re
 import struct
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
-from fieldtwin.gateway.core.errors import Blame, FieldtwinError
-from fieldtwin.plc.st.references import Cell, Cut, Element, MemberReference
+from fieldtwin.plc.st.runtime.logic_error import LogicError
+from fieldtwin.plc.st.runtime.moments import (
+    date_of,
+    date_text,
+    day_of_week,
+    dt_of,
+    moment_text,
+    split_date,
+    split_dt,
+    split_tod,
+    tod_of,
+    tod_text,
+)
+from fieldtwin.plc.st.runtime.references import Cell, Cut, Element, MemberReference
 
-__all__ = ["Cell", "Cut", "Element", "LogicError", "MemberReference"]  # and all names that compiled code calls
+__all__ = [  # and all names that compiled code calls
+    "Cell",
+    "Cut",
+    "Element",
+    "LogicError",
+    "MemberReference",
+    "date_of",
+    "date_text",
+    "day_of_week",
+    "dt_of",
+    "moment_text",
+    "split_date",
+    "split_dt",
+    "split_tod",
+    "tod_of",
+    "tod_text",
+]
 
 _FLOAT = struct.Struct("<f")
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
 _BASED = re.compile(r"(2|8|16)#([0-9a-f][0-9a-f_]{0,79})", re.ASCII | re.IGNORECASE)
 _REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
 MAX_SHOWN = 60
-
-
-class LogicError(FieldtwinError):
-    """An operation of the program has no result."""
-
-    exit_code = 1
-    blame = Blame.FILE
 
 
 def real(x: float) -> float:
@@ -322,25 +342,6 @@ def duration_text(ns: int, prefix: str) -> str:
         if n:
             out.append(f"{n}{unit}")
     return f"{prefix}#{'-' if ns < 0 else ''}{''.join(out) or '0s'}"
-
-
-def date_text(ns: int) -> str:
-    return f"D#{_moment(ns):%Y-%m-%d}"
-
-
-def moment_text(ns: int) -> str:
-    return f"DT#{_moment(ns):%Y-%m-%d-%H:%M:%S}"
-
-
-def tod_text(ns: int) -> str:
-    return f"TOD#{_moment(ns):%H:%M:%S}"
-
-
-def _moment(ns: int) -> datetime:
-    try:
-        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=ns // 1000)
-    except OverflowError as e:
-        raise LogicError("a date outside the calendar", got=f"{ns} ns since 1970") from e
 
 
 def number_of(text: str, low: int, high: int) -> int:

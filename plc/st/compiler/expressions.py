@@ -8,6 +8,7 @@ from math import isfinite
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
 from fieldtwin.plc.st.compiler.implicit import converted
 from fieldtwin.plc.st.compiler.literals import Malformed, constant
 from fieldtwin.plc.st.compiler.operators import binary, unary
@@ -21,7 +22,6 @@ from fieldtwin.plc.st.compiler.scope import (
     by_reference,
     wrapped,
 )
-from fieldtwin.plc.st.compiler.standard import FUNCTIONS
 from fieldtwin.plc.st.compiler.variables import bit, lookup, variable
 from fieldtwin.plc.st.syntax import tree as t
 

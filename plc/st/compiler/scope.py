@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning, WarningCollector
 from fieldtwin.plc.st.syntax.source import shortened
-from fieldtwin.plc.st.syntax.tree import Expr, Missing, Pos
+from fieldtwin.plc.st.syntax.tree import Argument, Expr, Missing, Pos, Ref
 
 COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 """Operators of Structured Text and their Python form."""
@@ -24,7 +24,7 @@ COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="
 class Symbol:
     """A variable: its Python expression, and its value if it is a constant. `reference`: for a VAR_IN_OUT of an
     elementary type, the expression of the object that refers to the caller's variable
-    (`fieldtwin.plc.st.references`)."""
+    (`fieldtwin.plc.st.runtime.references`)."""
 
     name: str
     type: ty.Type
@@ -191,6 +191,10 @@ class Compiling(Protocol):
     def coerced(self, value: Value, target: ty.Type, pos: Pos, what: str = "") -> str: ...
 
     def condition(self, expr: Expr, what: str) -> str: ...
+
+    def type_of(self, ref: Ref) -> ty.Type | None: ...
+
+    def take(self, argument: Argument, value: Value) -> None: ...
 
 
 def wrapped(code: str, kind: ty.Elementary) -> str:

@@ -7,14 +7,12 @@ bit string types, however, keeps only the bits that fit, as the standard require
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.functions.bcd import BCD
+from fieldtwin.plc.st.compiler.functions.library import Write
 from fieldtwin.plc.st.compiler.scope import Compiling, Value
 from fieldtwin.plc.st.syntax import tree as t
 
-Write = Callable[[Compiling, t.Call, list[t.Expr]], Value]
-"""A function that writes the Python code of a call. The list holds the arguments in the order of the parameters."""
 _NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
 _DIGITS = {32: 7, 64: 15}
 
@@ -23,8 +21,8 @@ def conversion(name: str) -> Write | None:
     """Return the conversion function with this name (in capitals), or None."""
     if name == "TRUNC":
         return lambda x, call, given: _convert(x, call, given[0], None, ty.DINT, cut=True)
-    if "BCD_" in name and (found := _BCD.get(name)) is not None:
-        return found
+    if name in BCD:
+        return BCD[name]
     source, word, target = name.rpartition("_TRUNC_")
     if word and target in _NAMES:
         return _made(_NAMES.get(source), _NAMES[target], cut=True) if source in _NAMES else None
@@ -158,41 +156,3 @@ def _text(code: str, kind: ty.Elementary) -> str | None:
         return f"_v.duration_text({code}, {chr(39)}{'LT' if kind.name == 'LTIME' else 'T'}{chr(39)})"
     name = {"date": "date_text", "tod": "tod_text", "dt": "moment_text"}.get(kind.kind)
     return f"_v.{name}({code})" if name else f"str({code})"
-
-
-# -- binary coded decimals (Table 22): a digit in four bits ---------------------------------------------------------------
-
-_UNSIGNED, _BITS = ("USINT", "UINT", "UDINT", "ULINT"), ("BYTE", "WORD", "DWORD", "LWORD")
-
-
-def _from_bcd(source: str, target: ty.Elementary) -> Write:
-    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-        value = x.value(given[0])
-        wanted = ty.ELEMENTARY[source] if source else None
-        if wanted is not None:
-            code = x.coerced(value, wanted, given[0].pos, f"the argument of {call.ref.name}")
-        elif ty.is_kind(value.type, "bits"):
-            code = value.code
-        else:
-            x.env.fail(given[0].pos, f"the argument of {call.ref.name}", expected="a bit string", got=str(value.type))
-        return Value(f"_v.of_bcd({code}, {target.high})", target)
-
-    return write
-
-
-def _to_bcd(source: str, target: ty.Elementary) -> Write:
-    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-        value = x.value(given[0])
-        kind = ty.ELEMENTARY[source] if source else ty.ULINT
-        code = x.coerced(value, kind, given[0].pos, f"the argument of {call.ref.name}")
-        return Value(f"_v.to_bcd({code}, {target.bits})", target)
-
-    return write
-
-
-_BCD: dict[str, Write] = {
-    **{f"{bits}_BCD_TO_{number}": _from_bcd(bits, ty.ELEMENTARY[number]) for bits in _BITS for number in _UNSIGNED},
-    **{f"BCD_TO_{number}": _from_bcd("", ty.ELEMENTARY[number]) for number in _UNSIGNED},
-    **{f"{number}_TO_BCD_{bits}": _to_bcd(number, ty.ELEMENTARY[bits]) for number in _UNSIGNED for bits in _BITS},
-    **{f"TO_BCD_{bits}": _to_bcd("", ty.ELEMENTARY[bits]) for bits in _BITS},
-}

@@ -1,0 +1,1 @@
+"""What compiled Structured Text uses while it runs, other than the arithmetic of `fieldtwin.plc.st.values`."""

@@ -1,1 +1,1 @@
-"""What compiled Structured Text uses while it runs, other than the arithmetic of `fieldtwin.plc.st.values`."""
+"""The parts of running Structured Text that are not arithmetic: references, dates, and the error that stops a task."""

@@ -148,6 +148,8 @@ def image_for(
     for bound in programs:
         _check_names(bound)
         for variable in bound.variables(Role.INPUT):
+            if variable.name not in bound.inputs:
+                continue
             if bound.inputs[variable.name].tag in own:
                 _plant_tag(bound, variable, bound.inputs[variable.name].tag, own)
                 continue
@@ -184,7 +186,7 @@ def _check_names(bound: BoundProgram) -> None:
                     f"program {bound.name} has no {what} {name!r}", expected=", ".join(sorted(declared)) or "none"
                 )
     for variable in bound.variables(Role.INPUT):
-        if variable.name not in bound.inputs:
+        if variable.name not in bound.inputs and variable.needs_tag:
             raise FileInvalid(f"input {variable.name!r} of program {bound.name} is bound to no tag")
 
 

@@ -160,8 +160,9 @@ def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -
 
 
 def _check(proof: Proof, program: Program) -> None:
-    inputs = {v.name for v in program.variables.values() if v.role is Role.INPUT}
-    if proof.domain.keys() != inputs:
+    inputs = {v.name: v for v in program.variables.values() if v.role is Role.INPUT}
+    needed = {name for name, v in inputs.items() if v.needs_tag}
+    if not needed <= proof.domain.keys() <= inputs.keys():
         raise UsageError(
             "the domain of a proof names the program's inputs",
             expected=", ".join(sorted(inputs)) or "none",

@@ -143,6 +143,8 @@ class Scan:
         shape, own = self._reader.shape, {}
         for variable in bound.variables(Role.INPUT):
             binding = bound.inputs.get(variable.name)
+            if binding is None and not variable.needs_tag:
+                continue
             if binding is None:
                 raise FileInvalid(f"input {variable.name!r} of program {bound.name} is bound to no tag")
             if binding.tag not in shape.index and binding.tag in self.output_image.writer.shape.index:
@@ -165,7 +167,7 @@ class Scan:
                 if value is None and not forced:
                     return NEVER
                 return TagValue(value, Quality.SIMULATED if forced else Quality.GOOD)
-            return own[name].apply(self._looked_up(own[name]))
+            return own[name].apply(self._looked_up(own[name])) if name in own else NEVER
 
         bound.program._lookup = lookup
 

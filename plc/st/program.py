@@ -53,11 +53,14 @@ class StProgram(Program):
         self.st_inputs = [_Input(v) for v in self.st_declared.variables if v.role == "input"]
         self.st_variables = {v.name: v for v in self.st_declared.variables}
         self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
+        self.st_shared: list[tuple[str, str, Callable[[Any], Any] | None]] = []
+        """The outputs and locals that are global variables with an address."""
         for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
-                setattr(self.st_body, _attribute(v), self.__dict__[v.name])
+                setattr(self.st_body, v.attribute, self.__dict__[v.name])
             elif v.role != "input" and _tag_kind(v.kind) is not None:
-                self.st_outputs.append((v.name, _attribute(v), _to_tag(v.kind)))
+                shown = self.st_shared if v.shared else self.st_outputs
+                shown.append((v.name, v.attribute, _to_tag(v.kind)))
         self.st_show()
 
     def execute(self, scan: ScanInfo) -> None:
@@ -66,16 +69,16 @@ class StProgram(Program):
         for item in self.st_inputs:
             value = namespace[item.name]
             if value is not None:
-                setattr(body, item.attribute, item.taken(value) if item.convert else value)
+                holder = self.st_resource.globals if item.shared else body
+                setattr(holder, item.attribute, item.taken(value) if item.convert else value)
         body.execute()
         self.st_show()
 
     def whole_state(self, now_ns: int) -> Any:
         """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global variables."""
         resource = self.st_resource
-        body = {name: value for name, value in vars(self.st_body).items() if not is_line(name)}
-        held = [body, vars(resource.globals)]
-        own = tuple([tuple([state_of(v, now_ns) for v in variables.values()]) for variables in held])
+        held = [vars(self.st_body), vars(resource.globals)]
+        own = tuple([tuple([state_of(v, now_ns) for name, v in of.items() if not is_line(name)]) for of in held])
         return (own, now_ns) if resource.absolute else own
 
     def st_show(self) -> None:
@@ -83,21 +86,31 @@ class StProgram(Program):
         for name, attribute, convert in self.st_outputs:
             value = getattr(body, attribute)
             namespace[name] = convert(value) if convert else value
+        for name, attribute, convert in self.st_shared:
+            value = getattr(self.st_resource.globals, attribute)
+            namespace[name] = convert(value) if convert else value
+
+    def st_holder(self, variable: ProgramVariable) -> Any:
+        """Return the object that holds a variable's value as the attribute `variable.attribute`."""
+        return self.st_resource.globals if variable.shared else self.st_body
 
     def put(self, name: str, value: Scalar) -> None:
         super().put(name, value)
         found = self.st_variables.get(name)
         if found is not None:
             convert = _from_tag(found.kind)
-            setattr(self.st_body, _attribute(found), convert(value) if convert else value)
+            holder = self.st_holder(found)
+            setattr(holder, found.attribute, convert(value) if convert else value)
             if found.role == "output":
-                setattr(self.st_body, line_of(_attribute(found)), 0)
+                setattr(holder, line_of(found.attribute), 0)
 
     def place(self, name: str) -> SourceLine | None:
         """Return the line that assigned the output; for an output with its initial value, the line of its
         declaration."""
         found = self.st_variables.get(name)
-        line = getattr(self.st_body, line_of(_attribute(found)), 0) if found is not None else 0
+        line = getattr(self.st_holder(found), line_of(found.attribute), 0) if found is not None else 0
+        if isinstance(line, tuple):
+            return SourceLine(*line)
         return SourceLine(self.source_path, line) if line else None
 
     def check(self, name: str, value: Scalar) -> None:
@@ -122,14 +135,15 @@ class StProgram(Program):
 
     def retained(self) -> dict[str, Any]:
         """Return every VAR RETAIN by name, as data for JSON, including those that are not tags."""
-        return {v.name: _dump(getattr(self.st_body, _attribute(v))) for v in self.st_declared.variables if v.retain}
+        kept = (v for v in self.st_declared.variables if v.retain)
+        return {v.name: _dump(getattr(self.st_holder(v), v.attribute)) for v in kept}
 
     def retain_layout(self) -> Any:
         return [[v.name, _described(v.kind)] for v in self.st_declared.variables if v.retain]
 
     def retain_bytes(self) -> int:
         return sum(
-            10 + len(v.name) + _most(v.kind, _dump(getattr(self.st_body, _attribute(v))))
+            10 + len(v.name) + _most(v.kind, _dump(getattr(self.st_holder(v), v.attribute)))
             for v in self.st_declared.variables
             if v.retain
         )
@@ -138,19 +152,19 @@ class StProgram(Program):
         """Restore what `retained` returned: variables that are in `kept` take its values."""
         for v in self.st_declared.variables:
             if v.retain and v.name in kept:
-                attribute = _attribute(v)
-                setattr(self.st_body, attribute, _load(getattr(self.st_body, attribute), kept[v.name]))
+                holder = self.st_holder(v)
+                setattr(holder, v.attribute, _load(getattr(holder, v.attribute), kept[v.name]))
         self.st_show()
 
 
 class _Input:
     """An input: how the value in the image is converted to the program's value."""
 
-    __slots__ = ("attribute", "convert", "name")
+    __slots__ = ("attribute", "convert", "name", "shared")
 
     def __init__(self, variable: ProgramVariable) -> None:
         self.name = variable.name
-        self.attribute = _attribute(variable)
+        self.attribute, self.shared = variable.attribute, variable.shared
         self.convert = _from_tag(variable.kind)
 
     def taken(self, value: Any) -> Any:
@@ -182,7 +196,9 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
     body: dict[str, Any] = {
         "st_unit": unit,
         "st_declared": found,
-        "st_inspection": Inspection(unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None]),
+        "st_inspection": Inspection(
+            unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None and not v.shared]
+        ),
         "source_path": found.path,
         "source_files": files,
         "source_warnings": tuple(map(str, unit.warnings)),
@@ -199,7 +215,15 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             words = tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else ()
             limits = (float(v.kind.low), float(v.kind.high)) if isinstance(v.kind, ty.Subrange) else None
             body[v.name] = Variable(
-                v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain, limits=limits, words=words
+                v.name,
+                _ROLES[v.role],
+                kind,
+                unit=unit_of,
+                retain=v.retain,
+                limits=limits,
+                words=words,
+                address=v.location,
+                needs_tag=not v.optional,
             )
     return type(found.name, (StProgram,), body)
 
@@ -209,10 +233,6 @@ def load_source(
 ) -> type[StProgram]:
     """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
     return program_class(compile_source(path, dialect, libraries), name)
-
-
-def _attribute(variable: ProgramVariable) -> str:
-    return f"v_{variable.name.lower()}"
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:

@@ -112,7 +112,13 @@ def program_warnings(system: System) -> tuple[str, ...]:
     folder = (str(system.path.parent),)
     texts = [config for config in programs_of(system) if config.source.partition(":")[0].strip() != "python"]
     programs = [config.bind(folder).program for config in texts]
-    return tuple(dict.fromkeys(warning for program in programs for warning in program.source_warnings))
+    unbound = [
+        f"input {v.name} ({v.address}) of program {config.name} is bound to no tag, so it keeps its initial value"
+        for config, program in zip(texts, programs, strict=True)
+        for v in program.variables.values()
+        if v.role is Role.INPUT and v.address and v.name not in config.inputs
+    ]
+    return tuple(dict.fromkeys([*(warning for program in programs for warning in program.source_warnings), *unbound]))
 
 
 def _start_policy(form: StartForm) -> StartPolicy:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import ast
 
 _PREFIX = "line_"
+GLOBALS = "_G"
+"""The name of the object that holds the global variables in the Python code."""
 
 
 def line_of(attribute: str) -> str:
@@ -22,10 +24,14 @@ def is_line(attribute: str) -> bool:
 
 
 class Assignments(ast.NodeTransformer):
-    """The pass that adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``."""
+    """The pass that adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``.
 
-    def __init__(self, outputs: frozenset[str]) -> None:
-        self._outputs = outputs
+    `shared` are the outputs among the global variables. Code of several files assigns them, so their lines have the file `path`.
+    """
+
+    def __init__(self, outputs: frozenset[str], shared: frozenset[str], path: str) -> None:
+        self._outputs = {"self": outputs, GLOBALS: shared}
+        self._path = path
 
     def visit_Assign(self, node: ast.Assign) -> list[ast.stmt]:
         found = [name for target in node.targets for name in self._assigned(target)]
@@ -36,19 +42,21 @@ class Assignments(ast.NodeTransformer):
         node.body[:0] = self._lines(self._assigned(node.target), node.lineno)
         return node
 
-    def _assigned(self, target: ast.expr) -> list[str]:
+    def _assigned(self, target: ast.expr) -> list[tuple[str, str]]:
+        """Return the object and the attribute of each output that `target` assigns."""
         if isinstance(target, ast.Tuple | ast.List):
             return [name for part in target.elts for name in self._assigned(part)]
-        if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name) and target.value.id == "self":
-            return [target.attr] if target.attr in self._outputs else []
+        if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name):
+            owner = target.value.id
+            return [(owner, target.attr)] if target.attr in self._outputs.get(owner, ()) else []
         return []
 
-    @staticmethod
-    def _lines(names: list[str], line: int) -> list[ast.stmt]:
+    def _lines(self, found: list[tuple[str, str]], line: int) -> list[ast.stmt]:
         made: list[ast.stmt] = []
-        for name in names:
-            target = ast.Attribute(ast.Name("self", ast.Load()), line_of(name), ast.Store())
-            statement = ast.Assign([target], ast.Constant(line), lineno=line, end_lineno=line)
+        for owner, name in found:
+            target = ast.Attribute(ast.Name(owner, ast.Load()), line_of(name), ast.Store())
+            place = ast.Constant(line if owner == "self" else (self._path, line))
+            statement = ast.Assign([target], place, lineno=line, end_lineno=line)
             for node in ast.walk(statement):
                 if isinstance(node, ast.stmt | ast.expr):
                     node.lineno = node.end_lineno = line

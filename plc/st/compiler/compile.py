@@ -88,7 +88,7 @@ class _Unit:
         self.variables.declare_globals()
         self.functions = Functions(self.variables)
         self.blocks = Blocks(self.variables)
-        self.programs = Programs(self.variables)
+        self.programs = Programs(self.variables, self.unit)
         for pou in self.unit.pous:
             if pou.kind == "FUNCTION":
                 with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
@@ -112,7 +112,7 @@ class _Unit:
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
-        code = SourceLines(self.out, self.path, self.programs.outputs).code(text)
+        code = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs).code(text)
         return CompiledUnit(
             self.path, self.files, code, text, tuple(programs), self.blocks.kept, kinds, warnings, missing
         )
@@ -139,9 +139,21 @@ class _Unit:
                 self.env.collected(self.env.error(instance.pos, message, expected=expected))
 
     def _check_addresses(self, unit: t.SourceUnit) -> None:
-        """Check that the variables of a POU have different addresses. `unit` still has the addresses."""
+        """Check that addresses are where they are allowed, and that the variables of a POU, and the global ones, have different
+        addresses. `unit` still has the addresses.
+        """
         for pou in unit.pous:
-            for variable, first in shared_addresses(pou):
+            for block in pou.blocks:
+                for variable in block.variables if pou.kind != "PROGRAM" or block.kind != "VAR" else ():
+                    if variable.location:
+                        message = f"{variable.name} AT {variable.location}: an address in {block.kind} of a {pou.kind}"
+                        expected, hint = (
+                            "addresses in VAR of a PROGRAM or in VAR_GLOBAL",
+                            "bind an input to a tag in the system file",
+                        )
+                        self.env.collected(self.env.error(variable.pos, message, expected=expected, hint=hint))
+        for blocks in (unit.globals, *(pou.blocks for pou in unit.pous)):
+            for variable, first in shared_addresses(blocks):
                 message = f"{variable.name} and {first.name} have one address"
                 expected = "one variable for each address"
                 self.env.collected(self.env.error(variable.pos, message, expected=expected, got=variable.location))

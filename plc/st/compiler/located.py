@@ -1,54 +1,188 @@
-"""Directly represented variables of a PROGRAM (IEC 61131-3, 6.5.5: ``VAR lamp AT %QX0.0 : BOOL;``) as inputs and
-outputs.
+"""Directly represented variables (IEC 61131-3, 6.5.5: ``VAR lamp AT %QX0.0 : BOOL;``, ``%QX0.0 := TRUE;``) as inputs and outputs.
 
 OpenPLC and other systems bind a program to its hardware by addresses; here the system file binds it, by name. So a
-variable at %I is an input, at %Q an output, at %M an ordinary variable; the rest of the address is ignored. Two
-outputs or two %M variables with one address would be one variable in those systems, so a program that has them is refused.
+variable at %I is an input, at %Q an output, at %M an ordinary variable.
+
+An address that one PROGRAM alone uses is a variable of that program. Any other address is a global variable, which each program
+that uses it, directly or through function blocks and functions, offers as its input or output. All declarations of one address
+are then this one variable, as in OpenPLC. A global variable that only an address names has the address as its name.
+
+Addresses of different sizes, such as %QX0.0 and %QW0, are different variables. The standard leaves the correspondence between
+an address and its place to the manufacturer; OpenPLC has one area for each size.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
+from fieldtwin.plc.st.syntax.walk import nodes
 
-_KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
+KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
+RETAIN = frozenset({"RETAIN", "PERSISTENT"})
+_TYPES = {"X": "BOOL", "B": "BYTE", "W": "WORD", "D": "DWORD", "L": "LWORD"}
+"""The type of a variable that is not declared, by the size in its address (IEC 61131-3:2013, table 16)."""
 
 
-_ADDRESS = re.compile(r"%([QM])([XBWDL]?)(\d+(?:\.\d+)*)", re.IGNORECASE)
-
-
-def shared_addresses(pou: t.Pou) -> Iterator[tuple[t.VarDecl, t.VarDecl]]:
-    """Return the outputs and %M variables of a POU whose address an earlier variable has, with that variable."""
-    first: dict[tuple[str, str, tuple[int, ...]], t.VarDecl] = {}
-    for variable in (v for block in pou.blocks for v in block.variables):
-        found = _ADDRESS.fullmatch(variable.location)
-        if found is None:
-            continue
-        area, size, numbers = found.groups()
-        address = (area.upper(), size.upper() or "X", tuple(int(number) for number in numbers.split(".")))
-        if (other := first.setdefault(address, variable)) is not variable:
+def shared_addresses(blocks: Iterable[t.VarBlock]) -> Iterator[tuple[t.VarDecl, t.VarDecl]]:
+    """Return the outputs and %M variables in `blocks` whose address an earlier variable has, with that variable."""
+    first: dict[str, t.VarDecl] = {}
+    for variable in (v for block in blocks for v in block.variables):
+        address = address_of(variable.location)
+        if address and area_of(address) != "I" and (other := first.setdefault(address, variable)) is not variable:
             yield variable, other
 
 
+@dataclass(frozen=True, slots=True)
+class Offered:
+    """A global variable with an address that a program offers as an input, an output or a local variable.
+
+    `name` is its name in the program, and `list` the name of its global list, in lower case. A `retain` variable keeps its value.
+    """
+
+    name: str
+    list: str
+    variable: t.VarDecl
+    retain: bool
+
+
 def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
-    """Return `unit` with the located variables of its programs in the blocks where they belong, in their order."""
-    return replace(unit, pous=tuple(_program(pou) if pou.kind == "PROGRAM" else pou for pou in unit.pous))
+    """Return `unit` with the located variables of its programs in the blocks where they belong, in their order.
+
+    A variable whose address is used elsewhere becomes a VAR_EXTERNAL that keeps its location. The address is then a global
+    variable, which is declared here if no VAR_GLOBAL has it.
+    """
+    uses = _uses(unit)
+    shared = {address for address, places in uses.items() if len(places) > 1 or not places[0]}
+    declared = set(_addresses(unit.globals))
+    programs = [pou for pou in unit.pous if pou.kind == "PROGRAM"]
+    local = {
+        address_of(v.location): (v, block.qualifiers & RETAIN)
+        for pou in reversed(programs)
+        for block in pou.blocks
+        for v in _located([block])
+    }
+    added = []
+    for address in uses:
+        if address in shared | (uses.keys() - local.keys()) and address not in declared:
+            v, qualifiers = local.get(address) or (_undeclared(unit, address), frozenset())
+            variable = replace(v, name=address, location=address)
+            added.append(t.VarBlock(v.pos, "VAR_GLOBAL", qualifiers, (variable,)))
+    known = frozenset(declared | {block.variables[0].name for block in added})
+    pous = tuple(_program(pou, known) if pou.kind == "PROGRAM" else pou for pou in unit.pous)
+    return replace(unit, globals=(*unit.globals, *added), pous=pous)
 
 
-def _program(pou: t.Pou) -> t.Pou:
+def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
+    """Return the addresses that a unit uses, each with the POUs that use it; "" stands for VAR_GLOBAL."""
+    found: dict[str, list[str]] = {}
+    places = [("", address) for address in _addresses(unit.globals)]
+    for pou in unit.pous:
+        names = [*_addresses(pou.blocks)] if pou.kind == "PROGRAM" else []
+        names += [node.name for node in nodes(pou) if isinstance(node, t.Ref) and node.name.startswith("%")]
+        places += [(pou.name.lower(), name) for name in names]
+    for place, address in places:
+        if place not in found.setdefault(address, []):
+            found[address].append(place)
+    return found
+
+
+def _addresses(blocks: Iterable[t.VarBlock]) -> Iterator[str]:
+    return (address for v in _located(blocks) if (address := address_of(v.location)))
+
+
+def _located(blocks: Iterable[t.VarBlock]) -> Iterator[t.VarDecl]:
+    return (v for block in blocks for v in block.variables if v.location)
+
+
+def _undeclared(unit: t.SourceUnit, address: str) -> t.VarDecl:
+    """Return the declaration of an address that has none, at its first use."""
+    uses = (node for pou in unit.pous for node in nodes(pou) if isinstance(node, t.Ref) and node.name == address)
+    pos = min((use.pos for use in uses), key=lambda pos: (pos.line, pos.column))
+    return t.VarDecl(pos, address, t.NamedType(pos, _TYPES[address[2]]), None, address)
+
+
+def _program(pou: t.Pou, known: frozenset[str]) -> t.Pou:
     blocks: list[t.VarBlock] = []
     for block in pou.blocks:
         if block.kind != "VAR" or not any(v.location for v in block.variables):
             blocks.append(block)
             continue
         for v in block.variables:
-            kind = _KINDS.get(v.location[1:2].upper(), block.kind) if v.location else block.kind
-            variable = replace(v, location="" if v.location[1:2].upper() in _KINDS else v.location)
+            kind = KINDS[area_of(v.location)] if v.location else block.kind
+            if address_of(v.location) in known:
+                kind = "VAR_EXTERNAL"
             if blocks and (blocks[-1].pos, blocks[-1].kind) == (block.pos, kind):
-                blocks[-1] = replace(blocks[-1], variables=(*blocks[-1].variables, variable))
+                blocks[-1] = replace(blocks[-1], variables=(*blocks[-1].variables, v))
             else:
-                blocks.append(t.VarBlock(block.pos, kind, block.qualifiers, (variable,)))
+                blocks.append(t.VarBlock(block.pos, kind, block.qualifiers, (v,)))
     return replace(pou, blocks=tuple(blocks))
+
+
+def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
+    """Return the located global variables that a program uses. `unit` is the result of `without_addresses`."""
+    retained = {v.name.lower() for block in unit.globals if block.qualifiers & RETAIN for v in block.variables}
+    located = {
+        (block.list.lower(), v.name.lower()): v
+        for block in unit.globals
+        if "CONSTANT" not in block.qualifiers
+        for v in _located([block])
+    }
+    by_address = {address_of(v.location): key for key, v in reversed(located.items()) if address_of(v.location)}
+    found: dict[tuple[str, str], str] = {}
+    """The used variables with their names in the program."""
+    for pou in _reached(unit, program):
+        own = {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+        for v in (v for b in pou.blocks if b.kind == "VAR_EXTERNAL" for v in _located([b]) if pou is program):
+            found[by_address[address_of(v.location)]] = v.name
+            own.add(v.name.lower())
+        for ref in (node for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Ref)):
+            key = _global(ref, own, located, by_address)
+            if key is not None:
+                name = located[key].name
+                found.setdefault(key, short_name(name) if name.startswith("%") else name)
+    taken = {v.name.lower() for b in program.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+    ordered = [key for key in located if key in found]
+    names = {}
+    for key in ordered:
+        address = address_of(located[key].location)
+        names[key] = found[key] if found[key].lower() not in taken or not address else short_name(address)
+    return [Offered(names[key], key[0], located[key], key[1] in retained) for key in ordered]
+
+
+def _global(
+    ref: t.Ref, own: set[str], located: dict[tuple[str, str], t.VarDecl], by_address: dict[str, tuple[str, str]]
+) -> tuple[str, str] | None:
+    """Return the list and the name of the located global variable to which `ref` refers; None for any other reference."""
+    if ref.name.startswith("%"):
+        return by_address.get(ref.name)
+    name = ref.name.lower()
+    if name in own:
+        return None
+    first = ref.selectors[0] if ref.selectors else None
+    if isinstance(first, t.Member) and (name, first.name.lower()) in located:
+        return name, first.name.lower()
+    return next((key for key in located if key[1] == name), None)
+
+
+def _reached(unit: t.SourceUnit, program: t.Pou) -> list[t.Pou]:
+    """Return a program and the POUs that it calls, directly or through others."""
+    pous = {pou.name.lower(): pou for pou in unit.pous}
+    instances = {v.name.lower(): v.type for block in unit.globals for v in block.variables}
+    found, seen, at = [program], {program.name.lower()}, 0
+    while at < len(found):
+        pou = found[at]
+        at += 1
+        used = {
+            node.name.lower() for node in nodes((pou.blocks, pou.body, pou.actions)) if isinstance(node, t.NamedType)
+        }
+        for ref in (node.ref for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Call)):
+            used.add(ref.name.lower())
+            used |= {n.name.lower() for n in nodes(instances.get(ref.name.lower())) if isinstance(n, t.NamedType)}
+        for name in used - seen:
+            seen.add(name)
+            if name in pous:
+                found.append(pous[name])
+    return found

@@ -218,12 +218,12 @@ def test_an_alarm_outlives_a_restart_and_its_delay_starts_again() -> None:
     [
         ("PROGRAM p VAR a : INTT; END_VAR END_PROGRAM", 1, "did you mean 'INT'?"),
         ("PROGRAM p VAR a : INT; A : BOOL; END_VAR END_PROGRAM", 1, "declared twice"),
-        ("VAR_GLOBAL a AT %IX0.0 : BOOL; END_VAR PROGRAM p END_PROGRAM", 1, "bind it to a tag"),
         (
             "FUNCTION_BLOCK f VAR a AT %MW0 : INT; END_VAR END_FUNCTION_BLOCK PROGRAM p END_PROGRAM",
             1,
-            "bind it to a tag",
+            "an address in VAR of a FUNCTION_BLOCK; expected addresses in VAR of a PROGRAM or in VAR_GLOBAL",
         ),
+        ("PROGRAM p VAR_INPUT a AT %IX0.0 : BOOL; END_VAR END_PROGRAM", 1, "an address in VAR_INPUT of a PROGRAM"),
         ("PROGRAM p VAR n : INT; go AT %IX0.0 : BOOL; END_VAR\ngo := TRUE; END_PROGRAM", 2, "go cannot be assigned to"),
         ("PROGRAM p VAR CONSTANT c : INT := 1; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),
         ("PROGRAM p VAR_INPUT c : INT; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),

@@ -30,8 +30,8 @@ def _scan_time(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 def _is_good(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     (expr,) = given
     if isinstance(expr, t.Ref) and not expr.selectors:
-        symbol = x.symbols.get(expr.name.lower())
-        if symbol is not None and symbol.code.startswith("self.v_") and symbol.name in x.program_inputs:
+        symbol = x.symbols.get(expr.name.lower()) or x.env.globals.get(expr.name.lower())
+        if symbol is not None and symbol.is_input and symbol.name in x.program_inputs:
             return Value(f"_c.is_good({symbol.name!r})", ty.BOOL)
     raise x.env.error(expr.pos, "IS_GOOD asks for the quality of an input", expected="a VAR_INPUT of this program")
 

@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.located import offered
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 
 _API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
+
+
+_ROLES = {"I": "input", "Q": "output", "M": "local"}
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramVariable:
     """A variable of a PROGRAM that can be bound to a tag.
 
-    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts."""
+    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts. Its value
+    is the `attribute` of the program's object, or of the object with the global variables if it is `shared`. `location` is its
+    address, if any. An `optional` input need not be bound to a tag.
+    """
 
     name: str
     role: str
     kind: ty.Type
     retain: bool
+    attribute: str
+    shared: bool = False
+    location: str = ""
+    optional: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +51,13 @@ class CompiledProgram:
 class Programs(Bodies):
     """The compiler of the programs of a unit."""
 
-    def __init__(self, variables: Variables) -> None:
+    def __init__(self, variables: Variables, unit: t.SourceUnit) -> None:
         super().__init__(variables)
+        self._unit = unit
         self.outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs."""
+        self.shared_outputs: set[str] = set()
+        """The attributes of global variables that are outputs."""
 
     def write(self, pou: t.Pou) -> CompiledProgram:
         """Write the class of a PROGRAM."""
@@ -59,12 +75,18 @@ class Programs(Bodies):
                 if "CONSTANT" not in block.qualifiers and v.name.lower() in symbols:
                     kind = symbols[v.name.lower()].type
                     self._check_interface(v, kind, role or "")
-                    if v.name in _API or v.name.startswith("st_"):
+                    if _is_reserved(v.name):
                         self.env.fail(v.pos, f"a PROGRAM's variable needs another name than {v.name}")
                     if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
                         self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
-                    variables.append(ProgramVariable(v.name, role or "", kind, retain))
-        outputs = frozenset(f"v_{v.name.lower()}" for v in variables if v.role == "output")
+                    attribute = f"v_{v.name.lower()}"
+                    address, located = address_of(v.location), bool(v.location)
+                    variables.append(
+                        ProgramVariable(v.name, role or "", kind, retain, attribute, location=address, optional=located)
+                    )
+        outputs = frozenset(v.attribute for v in variables if v.role == "output")
+        variables += self._offered(pou, {v.name.lower() for v in variables})
+        self.shared_outputs.update(v.attribute for v in variables if v.shared and v.role == "output")
         self.outputs[f"P_{pou.name.lower()}"] = outputs
         with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
             with self.out.block("def __init__(self):"):
@@ -77,6 +99,23 @@ class Programs(Bodies):
                 body.body(pou.body)
             self.write_actions(pou, symbols, inputs)
         return CompiledProgram(pou.name, pou.pos.path, tuple(variables))
+
+    def _offered(self, pou: t.Pou, taken: set[str]) -> Iterator[ProgramVariable]:
+        """Yield the located global variables that a program uses. `taken` has the names of variables that the program declares, in lower case."""
+        for one in offered(self._unit, pou):
+            symbol, v = self.variables.offered(one), one.variable
+            if symbol is None or symbol.constant is not None:
+                continue
+            address = address_of(v.location)
+            name = short_name(address) if _is_reserved(one.name) and address else one.name
+            if name.lower() in taken or _is_reserved(name):
+                expected = f"a name that {pou.name} does not use"
+                self.env.fail(v.pos, f"the global variable {v.name} needs another name", expected=expected)
+            taken.add(name.lower())
+            role = _ROLES[area_of(v.location)]
+            self._check_interface(v, symbol.type, role)
+            attribute = symbol.code.rpartition(".")[2]
+            yield ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
 
     def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
         """Initialise all variables with their initial values; messages are passed in from outside."""
@@ -98,3 +137,8 @@ class Programs(Bodies):
                 expected="BOOL, a number, a time, an enumeration or MESSAGES",
                 got=str(kind),
             )
+
+
+def _is_reserved(name: str) -> bool:
+    """Return whether a variable of a program must not have this name, because the class of programs uses it."""
+    return name in _API or name.startswith("st_")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import CodeType
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -15,8 +15,11 @@ from fieldtwin.plc.st.syntax import tree as t
 class SourceLines:
     """The lines of the source from which the code in `out` was written. `path` is that of code without a file."""
 
-    def __init__(self, out: CodeWriter, path: str, outputs: Mapping[str, frozenset[str]]) -> None:
-        self.out, self.path, self.outputs = out, path, outputs
+    def __init__(
+        self, out: CodeWriter, path: str, outputs: Mapping[str, frozenset[str]], shared: Collection[str]
+    ) -> None:
+        """`outputs` has the attributes that hold outputs by class of a PROGRAM; `shared` are those of global variables."""
+        self.out, self.path, self.outputs, self.shared = out, path, outputs, frozenset(shared)
 
     def code(self, text: str) -> tuple[CodeType, ...]:
         """Return the code of each file, in the order of the Python code `text`. Raises `FileInvalid` beyond Python's limits."""
@@ -28,7 +31,7 @@ class SourceLines:
                 path = places[statement.lineno - 1].path
                 if not parts or parts[-1][0] != path:
                     parts.append((path, []))
-                parts[-1][1].append(self._at_source(statement, places))
+                parts[-1][1].append(self._at_source(statement, places, path))
             return tuple(compile(ast.Module(body, []), path or "<st>", "exec") for path, body in parts)
         except (SyntaxError, MemoryError, RecursionError) as e:  # Python's limits; those of this compiler are narrower
             at = e.lineno if isinstance(e, SyntaxError) and e.lineno else 1
@@ -43,12 +46,14 @@ class SourceLines:
             places.append(last)
         return places
 
-    def _at_source(self, statement: ast.stmt, places: list[t.Pos]) -> ast.stmt:
+    def _at_source(self, statement: ast.stmt, places: list[t.Pos], path: str) -> ast.stmt:
         """Return a class or function of the Python code with the line numbers of the source."""
         for node in ast.walk(statement):
             if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
                 node.lineno = node.end_lineno = places[min(node.lineno, len(places)) - 1].line
                 node.col_offset = node.end_col_offset = 0
-        if isinstance(statement, ast.ClassDef) and statement.name in self.outputs:
-            Assignments(self.outputs[statement.name]).visit(statement)
+        if isinstance(statement, ast.ClassDef | ast.FunctionDef):
+            own = self.outputs.get(statement.name, frozenset())
+            if own or self.shared:
+                Assignments(own, self.shared, path).visit(statement)
         return ast.fix_missing_locations(statement)

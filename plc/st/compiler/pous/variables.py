@@ -7,8 +7,10 @@ from dataclasses import replace
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.located import Offered
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 
 
 class Variables:
@@ -56,24 +58,43 @@ class Variables:
 
     def _global_code(self, block: t.VarBlock, v: t.VarDecl) -> str:
         """Return the Python expression of a global variable; two lists may have variables of one name."""
-        return f"_G.v{self._lists.index(block.list.lower()) if block.list else ''}_{v.name.lower()}"
+        name = short_name(v.name) if v.name.startswith("%") else v.name.lower()
+        return f"_G.v{self._lists.index(block.list.lower()) if block.list else ''}_{name}"
 
     def declare_globals(self) -> None:
         """Declare all global variables, after the types are known."""
         for block in self.unit.globals:
-            self._no_retain(block, "a VAR_GLOBAL")
+            if not all(v.location for v in block.variables):
+                self._no_retain(block, "a VAR_GLOBAL")
             for v in block.variables:
                 with self.env.declaring(v.name, self.env.faulty):
-                    self._no_address(v)
                     key = block.list.lower(), v.name.lower()
                     if key in self._globals:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
-                    symbol = self._symbol(v, block, self._global_code(block, v))
+                    symbol = self._global_symbol(v, block)
                     self._globals[key] = symbol
                     self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
         if self._globals:
             first = self.unit.globals[0].pos
             self.declarations.bounded(first, (symbol.type for symbol in self._globals.values()))
+
+    def _global_symbol(self, v: t.VarDecl, block: t.VarBlock) -> Symbol:
+        """Return a global variable. One with an address is also known by its address, and all with one address are the same."""
+        symbol, address = self._symbol(v, block, self._global_code(block, v)), address_of(v.location)
+        if area_of(v.location) == "I" and symbol.constant is None:
+            symbol = replace(symbol, writable=False, is_input=True)
+        if not address:
+            return symbol
+        known = self.env.globals.setdefault(address.lower(), symbol)
+        if known.type != symbol.type:
+            self.env.fail(
+                v.pos, f"{v.name} and {known.name} have one address", expected=str(known.type), got=str(symbol.type)
+            )
+        return replace(known, name=v.name)
+
+    def offered(self, variable: Offered) -> Symbol | None:
+        """Return the symbol of a global variable that a program offers; None if its declaration has an error."""
+        return self._globals.get((variable.list, variable.variable.name.lower()))
 
     def write_globals(self) -> None:
         """Write the code of the global variables, after all code that they may need and before any program is created."""
@@ -97,11 +118,12 @@ class Variables:
                 self._no_retain(block, f"a variable of a {pou.kind}")
             for v in block.variables:
                 with self.env.declaring(v.name, self.env.faulty_here):
-                    self._no_address(v)
                     if v.name.lower() in symbols:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
-                    symbols[v.name.lower()] = self._variable(v, block, before)
+                    symbol = symbols[v.name.lower()] = self._variable(v, block, before)
+                    if v.location:
+                        symbols.setdefault(address_of(v.location).lower(), symbol)
         own = (
             symbols[v.name.lower()].type
             for b in pou.blocks
@@ -122,12 +144,12 @@ class Variables:
         return symbol
 
     def _external(self, v: t.VarDecl) -> Symbol:
-        found = self.env.globals.get(v.name.lower())
+        found = self.env.globals.get(address_of(v.location).lower() or v.name.lower())
         if found is None:
             self.env.unknown(v.pos, "a global variable", v.name, [s.name for s in self.env.globals.values()])
         if found.type != self.declarations.type_of(v.type):
             self.env.fail(v.pos, f"{v.name} is declared with another type", expected=str(found.type))
-        return found
+        return replace(found, name=v.name) if v.location else found
 
     def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
         kind = self.declarations.type_of(v.type, block.kind)
@@ -153,12 +175,5 @@ class Variables:
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
-            hint = "a PROGRAM's VAR RETAIN can, also a block in it"
+            hint = "a PROGRAM's VAR RETAIN can, also a block in it, and global variables with addresses"
             self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
-
-    def _no_address(self, v: t.VarDecl) -> None:
-        if v.location:
-            self.env.fail(
-                v.pos, f"{v.name} AT {v.location}: addresses are not supported",
-                hint="declare it as VAR_INPUT or VAR_OUTPUT and bind it to a tag in the system file",
-            )  # fmt: skip

@@ -8,7 +8,8 @@ from lark import v_args
 from lark.tree import Meta
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.rules.base import Rules, integer
+from fieldtwin.plc.st.syntax.addresses import address_of
+from fieldtwin.plc.st.syntax.rules.base import Bad, Rules, integer
 
 
 @v_args(meta=True)
@@ -37,7 +38,13 @@ class ExpressionRules(Rules):
         return t.Argument(self._pos(meta), str(items[-2]), None, items[-1], inverted=len(items) == 3)
 
     def reference(self, meta: Meta, items: list[Any]) -> t.Ref:
-        return t.Ref(self._pos(meta), str(items[0]), tuple(items[1:]))
+        name, *selectors = items
+        if name.type != "DIRECT":
+            return t.Ref(self._pos(meta), str(name), tuple(selectors))
+        address = address_of(name)
+        if not address:
+            raise Bad(name, "an address without a number is allowed in a declaration only")
+        return t.Ref(self._pos(meta), address, tuple(selectors))
 
     def member(self, meta: Meta, items: list[Any]) -> t.Member:
         return t.Member(self._pos(meta), str(items[0]))

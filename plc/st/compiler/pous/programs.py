@@ -101,7 +101,7 @@ class Programs(Bodies):
         return CompiledProgram(pou.name, pou.pos.path, tuple(variables))
 
     def _offered(self, pou: t.Pou, taken: set[str]) -> Iterator[ProgramVariable]:
-        """Yield the located global variables that a program uses. `taken` has the names of variables that the program declares, in lower case."""
+        """Yield the located global variables that a program uses. `taken` has the names of its variables, in lower case."""
         for one in offered(self._unit, pou):
             symbol, v = self.variables.offered(one), one.variable
             if symbol is None or symbol.constant is not None:

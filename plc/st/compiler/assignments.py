@@ -55,7 +55,9 @@ class Assignments(ast.NodeTransformer):
         made: list[ast.stmt] = []
         for owner, name in found:
             target = ast.Attribute(ast.Name(owner, ast.Load()), line_of(name), ast.Store())
-            place = ast.Constant(line if owner == "self" else (self._path, line))
+            place: ast.expr = ast.Constant(line)
+            if owner == GLOBALS:
+                place = ast.Tuple([ast.Constant(self._path), place], ast.Load())
             statement = ast.Assign([target], place, lineno=line, end_lineno=line)
             for node in ast.walk(statement):
                 if isinstance(node, ast.stmt | ast.expr):

@@ -16,6 +16,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.execution_control import with_execution_control
 from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.pous.blocks import Blocks
 from fieldtwin.plc.st.compiler.pous.functions import Functions
@@ -76,6 +77,8 @@ class _Unit:
             self.env.warnings.add(warning)
         self.out = CodeWriter()
         self.unit = without_edges(without_charts(without_addresses(unit)))
+        if not dialect.vendor:
+            self.unit = with_execution_control(self.unit)
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
         self.env.missing = {m.name.lower(): m for m in unit.missing if m.name.lower() not in declared}
         self._check_names()

@@ -9,8 +9,8 @@ from fieldtwin.gateway.core.image.layout import MAX_DEPTH, MAX_MESSAGE_BYTES
 from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.expressions import Expressions
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, simple_default
+from fieldtwin.plc.st.compiler.calls import Calls
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_REPEATED = 100
@@ -74,8 +74,8 @@ class Declarations:
             return None
         return Symbol(v.name, kind, text, writable=False, constant=value.constant)
 
-    def _expressions(self) -> Expressions:
-        compiler = Expressions(self.env, self.scope, CodeWriter())
+    def _expressions(self) -> Calls:
+        compiler = Calls(self.env, self.scope, CodeWriter())
         compiler.only_constants = True
         return compiler
 
@@ -268,7 +268,7 @@ class Declarations:
         """Return the Python expression of a new variable's value."""
         if init is None:
             named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
-            return self.env.type_initials.get(named) or self._default(kind)
+            return self.env.type_initials.get(named) or default_value(kind)
         if isinstance(init, t.InitArray):
             return self._initial_array(kind, init)
         if isinstance(init, t.InitStruct):
@@ -277,20 +277,6 @@ class Declarations:
         code = compiler.coerced(compiler.value(init, kind), kind, init.pos, "an initial value")
         if compiler.out.lines:
             self.env.fail(init.pos, "too deep an expression for an initial value")
-        return code
-
-    def _default(self, kind: ty.Type) -> str:
-        simple = simple_default(kind)
-        if simple is not None:
-            return simple
-        if isinstance(kind, ty.Struct):
-            return f"S_{kind.name.lower()}()"
-        if isinstance(kind, ty.Block):
-            return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{kind.name.lower()}()"
-        assert isinstance(kind, ty.Array)
-        code = self._default(kind.of)
-        for low, high in reversed(kind.ranges):
-            code = f"[{code} for _ in range({high - low + 1})]"
         return code
 
     def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
@@ -305,7 +291,7 @@ class Declarations:
             code = self.initial(kind.of, item)
             items.append(code if often == 1 else f"*({code} for _ in range({often}))")
         if count < total:
-            items.append(f"*({self._default(kind.of)} for _ in range({total - count}))")
+            items.append(f"*({default_value(kind.of)} for _ in range({total - count}))")
         sizes = tuple(high - low + 1 for low, high in kind.ranges[1:])
         return f"_v.shaped([{', '.join(items)}], {sizes})" if sizes else f"[{', '.join(items)}]"
 
@@ -322,7 +308,7 @@ class Declarations:
             if isinstance(kind, ty.Block) and kind.standard:
                 attribute = member
             given.append(f"{attribute}={self.initial(of, item)}")
-        return f"_v.with_members({', '.join([self._default(kind), *given])})"
+        return f"_v.with_members({', '.join([default_value(kind), *given])})"
 
     def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
         out, names = self.out, [f"m_{name}" for name in struct.fields]

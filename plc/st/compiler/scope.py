@@ -70,6 +70,10 @@ class Signature:
     in_outs: tuple[Parameter, ...]
     outputs: tuple[Parameter, ...]
 
+    def names(self) -> set[str]:
+        """Return the names of all parameters in lower case."""
+        return {p.name.lower() for p in (*self.inputs, *self.in_outs, *self.outputs)}
+
 
 def simple_default(kind: ty.Type) -> str | None:
     """Return the initial value of a type without parts as Python code; None for other types."""
@@ -80,6 +84,23 @@ def simple_default(kind: ty.Type) -> str | None:
     if isinstance(kind, ty.String):
         return "''"
     return str(kind.initial) if isinstance(kind, ty.Enum) else None
+
+
+def default_value(kind: ty.Type) -> str:
+    """Return the Python expression of a new variable with the initial value of its type."""
+    simple = simple_default(kind)
+    if simple is not None:
+        return simple
+    if isinstance(kind, ty.Struct):
+        return f"S_{kind.name.lower()}()"
+    if isinstance(kind, ty.Block):
+        return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{kind.name.lower()}()"
+    if isinstance(kind, ty.Array):
+        code = default_value(kind.of)
+        for low, high in reversed(kind.ranges):
+            code = f"[{code} for _ in range({high - low + 1})]"
+        return code
+    return "0" if isinstance(kind, ty.AnyInt | ty.AnyReal) else "None"
 
 
 def by_reference(kind: ty.Type) -> bool:

@@ -8,9 +8,10 @@ from contextlib import ExitStack, contextmanager
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
-from fieldtwin.plc.st.compiler.expressions import Expressions
+from fieldtwin.plc.st.compiler.calls import Calls
+from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.implicit import meeting
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, simple_default, wrapped
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, default_value, wrapped
 from fieldtwin.plc.st.compiler.variables import variable
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -24,7 +25,7 @@ _CHAIN = 48
 """The longest chain of elif: a longer chain is split, because Python nests each branch in the one before."""
 
 
-class Statements(Expressions):
+class Statements(Calls):
     """The compiler of the statements of a POU. `leave` is the Python statement for RETURN."""
 
     leave = "return"
@@ -69,7 +70,7 @@ class Statements(Expressions):
         with self.out.block(f"if {self.condition(s.enabled, 'EN')}:", s.pos):
             kept = self._held(s, code)
         with self.out.block("else:", s.pos):
-            self.out.line(f"{code} = {self._initial(kept.type, s)}", s.pos)
+            self.out.line(f"{code} = {default_value(kept.type)}", s.pos)
         return kept
 
     def _held(self, s: t.Hold, code: str) -> Value:
@@ -78,12 +79,6 @@ class Statements(Expressions):
             value = Value(self.coerced(value, ty.BOOL, s.pos, f"the state of {s.boolean}"), ty.BOOL)
         self.out.line(f"{code} = {value.code}", s.pos)
         return value
-
-    def _initial(self, kind: ty.Type, s: t.Hold) -> str:
-        """Return the value of the result of a function with EN while it is not executed."""
-        if isinstance(kind, ty.Struct | ty.Array):
-            self.env.fail(s.pos, "the result of a function with EN", expected="an elementary type", got=str(kind))
-        return simple_default(kind) or "0"  # the type of a literal has no initial value
 
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call
@@ -129,6 +124,10 @@ class Statements(Expressions):
 
     def _block_call(self, call: t.Call, code: str, block: ty.Block, action: str = "") -> None:
         """Write the call of a function block, or of one of its actions."""
+        call, en, eno = split_control(self.env, call, {*block.inputs, *block.outputs, *block.in_outs})
+        if en is not None or eno is not None:
+            self.controlled(call.pos, en, eno, lambda: self._block_call(call, code, block, action))
+            return
         if action:
             self._note_action(block.name.lower(), action, call)
         if "[" in code:  # compute the place once

@@ -123,7 +123,7 @@ def _unwritten_outputs(about: _About) -> Iterator[Finding]:
             written.update(a.value.name.lower() for a in one.arguments if isinstance(a.value, t.Ref))
     for block in about.pou.blocks:
         for variable in block.variables if block.kind == "VAR_OUTPUT" else ():
-            if variable.name.lower() not in written and variable.initial is None:
+            if variable.name.lower() not in {*written, "eno"} and variable.initial is None:
                 yield "ST104", variable.pos, f"the output {variable.name} is never written"
 
 

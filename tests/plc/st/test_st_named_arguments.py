@@ -183,8 +183,8 @@ def test_a_gap_in_the_numbered_parameters_is_refused() -> None:
 
 
 def test_a_standard_function_has_no_outputs() -> None:
-    with pytest.raises(FileInvalid, match="ADD has no output ENO"):
-        run("x : INT; ok : BOOL;", "x := ADD(1, 2, ENO => ok);")
+    with pytest.raises(FileInvalid, match="ADD has no output OUT"):
+        run("x : INT; ok : BOOL;", "x := ADD(1, 2, OUT => ok);")
 
 
 def test_the_names_of_this_plcs_own_functions() -> None:

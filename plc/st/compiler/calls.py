@@ -1,0 +1,204 @@
+"""Compiles calls of functions, output arguments, and assignments to variables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.execution_control import split_control
+from fieldtwin.plc.st.compiler.expressions import Expressions
+from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
+from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Value, by_reference, default_value, wrapped
+from fieldtwin.plc.st.compiler.variables import bit, variable
+from fieldtwin.plc.st.syntax import tree as t
+
+_OF_ADDRESSES = frozenset({"ADR", "BITADR", "INDEXOF", "REF", "SIZEOF", "XSIZEOF", "__NEW", "__DELETE"})
+"""Functions of other tools that need the memory of a controller."""
+
+
+class Calls(Expressions):
+    """The compiler of expressions with calls, and of assignments."""
+
+    def call(self, call: t.Call) -> Value:
+        name = call.ref.name.lower()
+        signature = self.env.functions.get(name)
+        inner, en, eno = split_control(self.env, call, signature.names() if signature is not None else ())
+        if en is not None or eno is not None:
+            return self._controlled_call(inner, en, eno)
+        if not call.ref.selectors and name in self.env.functions:
+            if self.only_constants:
+                self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
+            return self._user_function(call, self.env.functions[name])
+        if not call.ref.selectors:
+            self.env.refuse_missing(name, call.pos)
+        own = self.symbols.get(name)
+        if not call.ref.selectors and (own is None or not isinstance(own.type, ty.Block)):
+            standard = FUNCTIONS.find(name.upper())
+            if standard is not None:
+                return standard(self, call)
+            if name.upper() in _OF_ADDRESSES:
+                message = "addresses and sizes of variables are not supported"
+                self.env.fail(call.pos, message, got=call.ref.name)
+            known = (
+                [s.name for s in self.env.functions.values()]
+                + FUNCTIONS.names()
+                + [s.name for s in self.symbols.values()]
+            )
+            self.env.unknown(call.pos, "a function", call.ref.name, known)
+        raise self.env.error(call.pos, "a function block is called in a separate statement", got=call.ref.name)
+
+    def _controlled_call(self, call: t.Call, en: t.Expr | None, eno: t.Argument | None) -> Value:
+        """Write the call of a function with EN or ENO before the expression of which it is a part."""
+        if self.only_constants:
+            self.env.fail(call.pos, "EN or ENO", expected="a constant expression")
+        result, made = self.out.temporary(), Value("None", ty.NOTHING)
+
+        def executed() -> None:
+            nonlocal made
+            made = self.typed(self.call(call), call.pos)
+            self.out.line(f"{result} = {made.code}", call.pos)
+
+        self.controlled(
+            call.pos, en, eno, executed, lambda: self.out.line(f"{result} = {default_value(made.type)}", call.pos)
+        )
+        return Value(result, made.type)
+
+    def controlled(
+        self,
+        pos: t.Pos,
+        en: t.Expr | None,
+        eno: t.Argument | None,
+        executed: Callable[[], None],
+        otherwise: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Write what `executed` writes under the condition EN, and the assignments of ENO (`execution_control`)."""
+
+        def branch(write: Callable[[], None], done: bool) -> None:
+            write()
+            if eno is not None:
+                self.take(eno, Value(repr(done), ty.BOOL))
+
+        if en is None:
+            branch(executed, True)
+            return
+        with self.out.block(f"if {self.condition(en, 'EN')}:", pos):
+            branch(executed, True)
+        with self.out.block("else:", pos):
+            branch(otherwise, False)
+
+    def _user_function(self, call: t.Call, signature: Signature) -> Value:
+        self.env.calls.setdefault(self.pou, {}).setdefault(signature.name.lower(), call.pos)
+        given = bind(self.env, call, [p.name for p in (*signature.inputs, *signature.in_outs)], signature.name)
+        codes = []
+        for p in signature.inputs:
+            expr = _value_of(given.get(p.name.lower()))
+            codes.append(
+                p.initial
+                if expr is None
+                else self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
+            )
+        cells: dict[str, str] = {}
+        for p in signature.in_outs:
+            expr = _value_of(given.get(p.name.lower()))
+            codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
+        code = f"f_{signature.name.lower()}({', '.join(codes)})"
+        outputs = [a for a in call.arguments if a.target is not None]
+        more = bool(signature.outputs)
+        if not outputs and all(by_reference(p.type) for p in signature.in_outs):
+            return Value(f"{code}[0]" if more else code, signature.returns)
+        result = self.out.temporary()
+        self.out.line(f"{result} = {code}", call.pos)
+        self.take_back(cells, call.pos)
+        places = {p.name.lower(): n for n, p in enumerate(signature.outputs, 1)}
+        types = {p.name.lower(): p.type for p in signature.outputs}
+        for argument in outputs:
+            key = argument.name.lower()
+            if key not in types:
+                self.env.unknown(
+                    argument.pos, f"in {signature.name}, an output", argument.name, [p.name for p in signature.outputs]
+                )
+            self.take(argument, Value(f"{result}[{places[key]}]", types[key]))
+        return Value(f"{result}[0]" if more else result, signature.returns)
+
+    def take(self, argument: t.Argument, value: Value) -> None:
+        """Compile the output argument ``name => target``: write the assignment of `value` to the target."""
+        assert argument.target is not None
+        if argument.inverted:
+            value = Value(f"(not {value.code})", value.type)
+        self.assign(argument.target, value, argument.pos)
+
+    def assign(self, ref: t.Ref, value: Value, pos: t.Pos) -> None:
+        """Write an assignment. An assignment to a bit of a variable keeps all other bits."""
+        if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
+            whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
+            bit(self, whole, ref.selectors[-1])
+            code = f"_v.set_bit({whole.code}, {ref.selectors[-1].number}, {self.coerced(value, ty.BOOL, pos)})"
+            kind = ty.plain(whole.type)
+            assert isinstance(kind, ty.Elementary)
+            code = wrapped(code, kind)
+            if isinstance(whole.type, ty.Subrange):
+                code = f"_v.inside({code}, {whole.type.low}, {whole.type.high})"
+            self.out.line(f"{whole.code} = {code}", pos)
+            return
+        target = self.writable(ref)
+        code = self.coerced(value, target.type, pos, f"assigned to {ref.name}")
+        if isinstance(target.type, ty.Array):  # in place, because a VAR_IN_OUT may refer to it
+            self.out.line(f"_v.fill({target.code}, {code})", pos)
+        elif isinstance(target.type, ty.Struct):
+            self.out.line(f"_v.put({target.code}, {code})", pos)
+        else:
+            self.out.line(f"{target.code} = {code}", pos)
+
+    def writable(self, ref: t.Ref) -> Value:
+        target = variable(self, ref)
+        allowed = target.writable or (
+            target.is_input and self.env.accepts("ST001", ref.pos, f"{ref.name} is an input and is assigned to")
+        )
+        if not allowed:
+            hint = "it is a constant, an input, or a block's output"
+            if target.is_input:
+                hint = "it is an input; the dialects codesys, twincat and matiec accept this with a warning"
+            self.env.fail(ref.pos, f"{ref.name} cannot be assigned to", hint=hint)
+        if any(control == target.code or control.startswith(f"{target.code}.") for control in self.controls):
+            self.env.fail(
+                ref.pos,
+                f"{ref.name} is the control variable of the FOR around this statement and cannot be altered here",
+                hint="leave the loop with EXIT, or use WHILE",
+            )
+        return target
+
+    def in_out(
+        self, expr: t.Expr | None, name: str, kind: ty.Type, call: t.Call, of: str, cells: dict[str, str]
+    ) -> str:
+        """Return the Python expression of the argument for VAR_IN_OUT `name` of `of`. A function's own variables are passed in
+        cells: `cells` receives each variable with its cell, so that `take_back` can assign the values back after the call."""
+        if not isinstance(expr, t.Ref):
+            self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
+        target = self.writable(expr)
+        if target.type != kind and not (isinstance(kind, ty.String) and ty.fits(target.type, kind)):
+            self.env.fail(expr.pos, f"VAR_IN_OUT {name} of {of}", expected=str(kind), got=str(target.type))
+        if by_reference(kind):
+            return target.code
+        reference = target.reference
+        if not reference:
+            if target.code not in cells:
+                cells[target.code] = self.out.temporary()
+                self.out.line(f"{cells[target.code]} = _v.Cell({target.code})", expr.pos)
+            reference = cells[target.code]
+        if isinstance(kind, ty.String) and isinstance(target.type, ty.String) and target.type.length < kind.length:
+            return f"_v.Cut({reference}, {target.type.length})"
+        return reference
+
+    def take_back(self, cells: dict[str, str], pos: t.Pos) -> None:
+        """Assign the values in the cells back to the variables after the call."""
+        for code, cell in cells.items():
+            self.out.line(f"{code} = {cell}.v", pos)
+
+
+def _value_of(argument: t.Argument | None) -> t.Expr | None:
+    return None if argument is None else argument.value
+
+
+def _into(p: Parameter, signature: Signature) -> str:
+    return f"{p.name} of {signature.name}"

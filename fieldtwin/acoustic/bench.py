@@ -143,6 +143,10 @@ class NetworkBench:
         part, local = self._part(device)
         await part.bench.set_value(local, tag, value)
 
+    async def acknowledge(self, alarm: str) -> None:
+        part, local = self._part(alarm)
+        await part.bench.acknowledge(local)
+
     async def inject(self, fault: dict[str, Any]) -> None:
         where, local = self.network.place_of(fault)
         if where == WATER:

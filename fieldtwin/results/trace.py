@@ -36,6 +36,8 @@ class TraceKind(Enum):
     STEP    a step's number ``text``, ``verdict`` once it has one
     REFUSED  DEVICE.TAG     a write that did not reach its device: ``value``, ``cause``, ``reason``, ``by``, ``program``,
                             ``place`` (FILE:LINE of the program), ``fault`` program | device | "" (by design, or tried again)
+    ALARM   alarm.NAME      a change of an alarm: ``value`` is its state, ``active`` its condition after the delays, ``quality``,
+                            ``reason``, and ``by``, the user who acknowledged or shelved it, "" if its condition changed
     NOTE    its author      ``text``; of the remote client (`TOPSIDE`) ``period_s``, when it commands one
     """
 
@@ -45,6 +47,7 @@ class TraceKind(Enum):
     FAULT = "fault"
     STEP = "step"
     REFUSED = "refused"
+    ALARM = "alarm"
     NOTE = "note"
 
 
@@ -190,6 +193,11 @@ def refusal_text(where: str, data: Mapping[str, Any]) -> str:
 
 def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def alarm_data(event: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the data of an ALARM event from a change of an alarm as plain data."""
+    return {"value": event["state"], **{key: event[key] for key in ("active", "quality", "reason", "by")}}
 
 
 def read_trace(lines: list[bytes]) -> list[TraceEvent]:

@@ -13,9 +13,14 @@ from enum import Enum
 from typing import Any, Literal, Protocol
 
 from fieldtwin.conformance.core.case import Impact
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.runtime.gateway_status import AlarmEvent
 from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import Trace
+
+SCENARIO = "scenario"
+"""The user in whose name a scenario acknowledges alarms."""
 
 
 class Can(Enum):
@@ -32,6 +37,8 @@ class Can(Enum):
     PROBE = "probe"
     FRESH_START = "fresh_start"
     """Restart PLC, simulations and devices before the scenario (`start: fresh`)."""
+    ACKNOWLEDGE = "acknowledge"
+    """Acknowledge alarms."""
     JUDGE_RUN = "judge_run"
     """Apply the checks of `run` (`judge: run`): every value published as good is compared with what its device held."""
 
@@ -58,6 +65,13 @@ class TagReading:
 def variable(value: Any, *, runs: bool) -> TagReading:
     """Return the reading of a program's variable. If the PLC does not run, it is bad: the value must not be used."""
     return TagReading(value, "good" if runs else "bad", "" if runs else "not_operational", 0.0, 0)
+
+
+def alarm_reading(event: AlarmEvent, now_ns: int) -> TagReading | None:
+    """Return the reading of an alarm after its last change; None if its condition has never been known."""
+    if not event.number:
+        return None
+    return TagReading(event.state, event.quality, event.reason, (now_ns - event.t_ns) / NS_PER_S, event.number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +107,8 @@ class Bench(Protocol):
 
     @property
     def allowed(self) -> Impact:
-        """Return the highest impact level that steps may have: `expect`, `wait` and `pause` only observe; probes read; `send`
-        and `set` write; `fault` and `clear` disrupt.
+        """Return the highest impact level that steps may have: `expect`, `wait` and `pause` only observe; probes read; `send`,
+        `set` and `acknowledge` write; `fault` and `clear` disrupt.
         """
         ...
 
@@ -110,7 +124,7 @@ class Bench(Protocol):
         ...
 
     def names(self) -> list[str]:
-        """Return the names that `reading` accepts: DEVICE.TAG and PROGRAM.VARIABLE."""
+        """Return the names that `reading` accepts: DEVICE.TAG, PROGRAM.VARIABLE and alarm.NAME."""
         ...
 
     def reading(self, name: str) -> TagReading | None:
@@ -160,6 +174,10 @@ class Bench(Protocol):
 
     async def inject(self, fault: dict[str, Any]) -> None:
         """Inject a fault, which is described as in a fault file: `id`, `name`, its target and its parameters."""
+        ...
+
+    async def acknowledge(self, alarm: str) -> None:
+        """Acknowledge an alarm by its name in expressions. Raises `UsageError` if there is nothing to acknowledge."""
         ...
 
     async def failures(self) -> dict[str, str]:

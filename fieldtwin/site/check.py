@@ -31,7 +31,7 @@ from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.scenarios.language.names import invariants_of
 from fieldtwin.site.compose.check import CommandLines, ComposeCheck
 from fieldtwin.site.compose.service import is_compose
-from fieldtwin.twin.plant.physical import image_layout, program_warnings
+from fieldtwin.twin.plant.physical import alarms_of, image_layout, program_warnings
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.group import read_group
@@ -180,6 +180,7 @@ class _Site:
             system = load_system(str(path), self._profiles, self._errors)
             self._systems[path] = system
             invariants_of(system, errors=self._errors)
+            alarms_of(system, self._errors)
             complete = system.devices.keys() == system.file.data["devices"].keys()  # else a device has an error
             if complete and len(self._errors.errors) == before:
                 self._found.warnings += system.warnings

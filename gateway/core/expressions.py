@@ -2,7 +2,7 @@
 
 It is a part of Python's expressions, read by Python's parser; no code is ever executed. A time such as ``1.5 s`` is a number
 of seconds. Two modules evaluate it: conditions of scenarios, invariants and what-if questions, where a value may be unknown or
-a text (`fieldtwin.scenarios.language.expression`), and formulas of simulations, which are compiled, with floats only
+a text (`fieldtwin.gateway.core.conditions.expression`), and formulas of simulations, which are compiled, with floats only
 (`fieldtwin.emulators.simulation.formula`). The only names that this module knows are those of the functions of numbers.
 """
 

@@ -20,6 +20,7 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.alarms.alarm_list import AlarmConfig, AlarmList
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
 from fieldtwin.gateway.runtime.buses.bus import Bus
@@ -60,6 +61,7 @@ class GatewayConfig:
     bridges: tuple[BridgeConfig, ...] = ()
     delegated: frozenset[str] = frozenset()
     """Names of the transmitters (modems) whose mailboxes a digital thread reads and writes instead of the gateway."""
+    alarms: tuple[AlarmConfig, ...] = ()
 
     def may_write(self, bus: str) -> bool:
         """Return whether the gateway may write to the devices of a bus."""
@@ -142,6 +144,7 @@ class Gateway:
         self.servers = [TagServer(s, self.tags, self.outputs, clock, listen, audit) for s in config.serve]
         sources = self._message_sources()
         self.exchange = ImageExchange(image, self.tags, sources)
+        self.alarms = AlarmList(config.alarms, self.tags, audit)
         self.plc_alive = False
         self.plc_losses = 0
         self.period_ns = config.cycle_ms * NS_PER_MS
@@ -275,6 +278,7 @@ class Gateway:
             self.plc_alive
             and not self._stopping
             and self.exchange.repeats_until(until_ns)
+            and self.alarms.repeats_until(until_ns)
             and until_ns - self.exchange.plc_heard_ns <= lost_ns
             and self.outputs.is_idle
             and all(pump.is_idle for pump in self.pumps)
@@ -306,6 +310,7 @@ class Gateway:
             if tag in self.config.log_tags:
                 self.log.append([(tag, m.seq, m.t_ns, m.data) for m in messages])
         self._check_plc(now_ns)
+        self.alarms.tick(now_ns, self.exchange.outputs, plc_alive=self.plc_alive)
         self.outputs.tick(now_ns)
         for pump in self.pumps:
             pump.tick(now_ns, self.exchange.all_consumed(pump.driver.message_tag))

@@ -227,6 +227,44 @@ class PlcSeen(msgspec.Struct, frozen=True, kw_only=True):
     stopped: bool
 
 
+class AlarmStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """An alarm of the alarm list.
+
+    `state` is one of `fieldtwin.gateway.runtime.alarms.state_machine.ALARM_STATES`. `active` is its condition after the delays.
+    """
+
+    state: str
+    active: bool
+    quality: str
+    """Bad if the condition is unknown; the alarm then keeps its state."""
+    reason: str
+    priority: str
+    text: str
+    condition: str
+    acknowledge: bool
+    """Whether the alarm needs an acknowledgement."""
+    by: str
+    """The user whose action caused the last change; empty if the condition did."""
+    in_state_s: float | None
+    """The seconds since the last change of the state; None if it has not changed."""
+    shelved_for_s: float | None
+    """The seconds until shelving ends; None if the alarm is not shelved."""
+
+
+class AlarmEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """A change of an alarm: its number, monotonic time (ns) and name, and state, condition, quality and reason after it."""
+
+    number: int
+    t_ns: int
+    name: str
+    state: str
+    active: bool
+    quality: str
+    reason: str
+    by: str
+    """The user whose action it was; empty if the condition caused the change."""
+
+
 class ConfigStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The files that the gateway has applied: name and hash of the system, number of reloads, and changes of the last reload."""
 
@@ -255,6 +293,8 @@ class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
     log_dropped: int
     learnt: dict[str, LearntStatus] = {}
     """By device: the gaps that the gateway has found."""
+    alarms: dict[str, AlarmStatus] = {}
+    """The alarm list, in the order of the system file."""
     store_error: str = ""
     config: ConfigStatus | UnsetType = UNSET
 

@@ -70,6 +70,7 @@ def describe(gateway: Gateway, now_ns: int, *, brief: bool = False) -> GatewaySt
         published=gateway.tags.published,
         logged=gateway.log.stored,
         log_dropped=gateway.log.dropped,
+        alarms=gateway.alarms.statuses(now_ns),
     )
 
 

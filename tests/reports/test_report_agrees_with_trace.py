@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.capture.decoding.decoder import exchanges
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
 SYSTEM = Path(__file__).parents[1] / "emulators" / "faults" / "scenarios" / "line.yaml"

@@ -2,7 +2,7 @@
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
 instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
-write, client_tags, refuse, command, report, reload, stop.
+write, client_tags, acknowledge, shelve, unshelve, refuse, command, report, reload, stop.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreacha
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.modbus.learnt_gaps import LearntFile, learnt_statuses
-from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus, StoppedGateway
+from fieldtwin.gateway.runtime.gateway_status import AlarmStatus, ConfigStatus, GatewayStatus, StoppedGateway
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
@@ -142,7 +142,7 @@ class GatewayProcess:
                 journal = self._gateway.outputs.journal
                 self._places = RefusalPlaces(journal, run_dir / "plc.sock", tap.on_refusal if tap else None)
                 self._reports = ServerReports(system.serving, self._clock)
-                self._watching = TagWatch(self._gateway.tags, self._clock, journal)
+                self._watching = TagWatch(self._gateway.tags, self._clock, journal, self._gateway.alarms)
                 await self._serve(run_dir / "gateway.sock")
         finally:
             log.close()
@@ -161,6 +161,9 @@ class GatewayProcess:
                 "gate": self._gate,
                 "write": self._write,
                 "client_tags": self._client_tags,
+                "acknowledge": self._acknowledge,
+                "shelve": self._shelve,
+                "unshelve": self._unshelve,
                 "refuse": self._refuse,
                 "command": self._command,
                 "report": self._reports.report,
@@ -278,6 +281,33 @@ class GatewayProcess:
     async def _client_tags(self, args: dict[str, Any]) -> list[str]:
         """Return the tags that a client may write now. A reload may change them."""
         return self._gateway.client_tags()
+
+    async def _acknowledge(self, args: dict[str, Any]) -> AlarmStatus:
+        """Acknowledge the `alarm` for a user (``by``), and return its new status.
+
+        Raises `UsageError` if there is nothing to acknowledge, as the next two commands do if they cannot be carried out.
+        """
+        alarm, by, now_ns = self._alarm_request(args)
+        self._gateway.alarms.acknowledge(alarm, by, now_ns)
+        return self._gateway.alarms.statuses(now_ns)[alarm]
+
+    async def _shelve(self, args: dict[str, Any]) -> AlarmStatus:
+        """Shelve the `alarm` for `for_s` seconds for a user (``by``), and return its new status."""
+        alarm, by, now_ns = self._alarm_request(args)
+        for_s = args.get("for_s")
+        if isinstance(for_s, bool) or not isinstance(for_s, int | float):
+            raise UsageError("the time for which an alarm is shelved", expected="seconds", got=repr(for_s)[:80])
+        self._gateway.alarms.shelve(alarm, for_s, by, now_ns)
+        return self._gateway.alarms.statuses(now_ns)[alarm]
+
+    async def _unshelve(self, args: dict[str, Any]) -> AlarmStatus:
+        """End the shelving of the `alarm` for a user (``by``), and return its new status."""
+        alarm, by, now_ns = self._alarm_request(args)
+        self._gateway.alarms.unshelve(alarm, by, now_ns)
+        return self._gateway.alarms.statuses(now_ns)[alarm]
+
+    def _alarm_request(self, args: dict[str, Any]) -> tuple[str, str, int]:
+        return str(args.get("alarm", ""))[:MOST_NAME], str(args.get("by", ""))[:MOST_NAME], self._clock.monotonic_ns()
 
     async def _refuse(self, args: dict[str, Any]) -> dict[str, Any]:
         """Record a write that a server in a separate process has refused (``tag``, ``value``, ``reason``, ``cause``, ``by``).

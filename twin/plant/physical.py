@@ -18,13 +18,14 @@ from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Listen
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
-from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.image.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.alarms.alarm_list import AlarmConfig
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
@@ -34,6 +35,7 @@ from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_
 from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.twin.plant.alarms import load_alarms
 from fieldtwin.twin.site.schema import StartForm
 from fieldtwin.twin.site.system import System
 
@@ -181,6 +183,14 @@ def bound_programs(system: System, errors: ErrorCollector) -> list[BoundProgram]
     return bound
 
 
+def alarms_of(system: System, errors: ErrorCollector | None = None) -> tuple[AlarmConfig, ...]:
+    """Return the configuration of a system's alarms. Raises `FileInvalid`; with `errors`, the errors are added to it."""
+    if not system.alarms:
+        return ()
+    with collecting(errors) as collector:
+        return load_alarms(system, bound_programs(system, collector), collector)
+
+
 def _check_tasks(system: System, errors: ErrorCollector) -> None:
     """Check that every program's task exists and that at least one task is cyclic: cyclic tasks evaluate the triggers
     of the SINGLE tasks.
@@ -235,6 +245,7 @@ def gateway_config(
     free_ports: bool = False,
     true_silences: bool | None = None,
     delegated: Sequence[str] = (),
+    alarms: tuple[AlarmConfig, ...] = (),
 ) -> GatewayConfig:
     """Return the gateway's configuration. With `allow_writes` it may write to the devices of all buses but `read_only`.
 
@@ -258,6 +269,7 @@ def gateway_config(
         serve=serving.serve,
         bridges=serving.bridges,
         delegated=frozenset(delegated),
+        alarms=alarms,
     )
 
 
@@ -334,6 +346,7 @@ class EmbeddedControlSystem:
         self.system = system
         self.control_logic: tuple[ProgramConfig, ...] = programs_of(system)
         self.layout: ImageLayout = image_layout(system)
+        self.alarms = alarms_of(system)
 
     def gateway(
         self,
@@ -363,6 +376,7 @@ class EmbeddedControlSystem:
             free_ports=free_ports,
             true_silences=true_silences,
             delegated=delegated,
+            alarms=self.alarms,
         )
         return Gateway(config, connector, clock, image, audit, log, listen, taken)
 

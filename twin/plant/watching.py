@@ -13,6 +13,7 @@ from typing import Any
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.values import NEVER, TagValue
+from fieldtwin.gateway.runtime.alarms.alarm_list import AlarmList
 from fieldtwin.gateway.runtime.outputs.refusals import Refusals
 from fieldtwin.gateway.runtime.tags import TagTable
 
@@ -29,8 +30,11 @@ Entry = tuple[int, int, str, Any, str, str]
 class TagWatch:
     """The numbered changes of a `TagTable`. ``answer({"since": 0, "names": [...]})`` implements the control channel's `watch`."""
 
-    def __init__(self, tags: TagTable, clock: Clock, journal: Refusals | None = None) -> None:
+    def __init__(
+        self, tags: TagTable, clock: Clock, journal: Refusals | None = None, alarms: AlarmList | None = None
+    ) -> None:
         self._journal = journal
+        self._alarms = alarms
         self._tags = tags
         self._clock = clock
         self._began_ns = clock.monotonic_ns()
@@ -45,7 +49,8 @@ class TagWatch:
         ``now_ns``; ``began_ns``, since when changes are kept; ``changes`` after number `since`, the oldest first, at most
         `AT_ONCE`, none if `since` is None; ``dropped``, how many of them are no longer kept; ``last``, the newest number;
         ``tags``, with value, quality, reason and source time (ns) of each of `names`; ``refusals``, the writes that did not
-        reach their device, from the journal entry after number `refused` on.
+        reach their device, from the journal entry after number `refused` on; ``alarms``, the changes of alarms after number
+        `alarms`.
 
         A change is a value, quality or reason that differs from the last one of its tag. With ``"samples": true`` the entries
         are all samples instead, equal ones too, with numbers of their own.
@@ -53,10 +58,13 @@ class TagWatch:
         Raises `UsageError` for an unknown tag.
         """
         since, names, refused = args.get("since"), args.get("names", []), args.get("refused", 0)
-        if (since is not None and type(since) is not int) or type(refused) is not int or not isinstance(names, list):
+        alarms = args.get("alarms", 0)
+        numbers = all(type(number) is int for number in (refused, alarms, 0 if since is None else since))
+        if not numbers or not isinstance(names, list):
             raise UsageError(
                 "what to watch",
-                expected='{"since": NUMBER or null, "samples": true or false, "refused": NUMBER, "names": [TAG...]}',
+                expected='{"since": NUMBER or null, "samples": true or false, "refused": NUMBER, "alarms": NUMBER, '
+                '"names": [TAG...]}',
             )
         now_ns = self._clock.monotonic_ns()
         for name in names:
@@ -73,6 +81,7 @@ class TagWatch:
             "dropped": 0 if since is None else max(0, ring.oldest - since - 1),
             "tags": {name: _shown(self._tags.current(name, now_ns)) for name in names},
             "refusals": [r.status() for r in self._journal.since(refused)] if self._journal is not None else [],
+            "alarms": self._alarms.events_since(alarms) if self._alarms is not None else [],
         }
 
     def _put(self, name: str, value: TagValue) -> None:

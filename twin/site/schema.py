@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
+from fieldtwin.twin.site.alarm_forms import AlarmForm
 from fieldtwin.twin.site.base_forms import Milliseconds, Name, Pause, SiteModel, TagName
 from fieldtwin.twin.site.serve_forms import ServeForm
 
@@ -306,6 +307,7 @@ class SystemForm(SiteModel):
     invariants: InvariantsForm = Field(
         default=InvariantsForm(), description="conditions that hold in every run, scenario and campaign"
     )
+    alarms: dict[Name, AlarmForm] = Field(default={}, description="the alarm list of the gateway")
     metrics: MetricsForm | None = Field(default=None, description="default: metrics contain no values of tags")
 
 

@@ -21,6 +21,7 @@ from fieldtwin.gateway.core.files.profile_file import load_profile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.gateway.devices.data_sheet import check_data_sheet
+from fieldtwin.twin.site.alarm_forms import AlarmForm
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.exported_tags import ExportedTag, resolve_exported_tags
@@ -57,6 +58,7 @@ class System:
     warnings: tuple[str, ...] = ()
     invariants: InvariantsForm = field(default_factory=InvariantsForm)
     exported_tags: tuple[ExportedTag, ...] = ()
+    alarms: dict[str, AlarmForm] = field(default_factory=dict)
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
         """Return the devices of a bus, in the file's order."""
@@ -116,6 +118,7 @@ def _resolve(
         + read_only_once(file, devices)
         + waits_for_its_command(file, form.plc, devices),
         serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc), errors),
+        alarms=form.alarms,
         exported_tags=resolve_exported_tags(file, form.metrics, devices, errors),
     )
     _check_programs(system, errors)

@@ -139,6 +139,9 @@ class Decoder:
                 return f"{where} {self._tag_value(where, data.get('value'))}, {quality}{reason}"
             case TraceKind.STATE:
                 return f"{where} = {show_value(data.get('value'))}"
+            case TraceKind.ALARM:
+                by = f" by {data['by']}" if data.get("by") else ""
+                return f"{where}: {data.get('value')}{by}, {data.get('quality')}"
             case TraceKind.FAULT:
                 state = "on" if data.get("on") else "off"
                 return f"fault {where}: {data.get('name', '')} {state} {data.get('target') or ''}".rstrip()

@@ -97,6 +97,9 @@ def _changes(events: Iterable[TraceEvent], system: System | None, machines: dict
             case TraceKind.STATE:
                 machine, value = machines.get(event.where), data.get("value")
                 yield VcdChange(t_ns, "plc", event.where, machine.name_of(value) if machine else value)
+            case TraceKind.ALARM:
+                scope, _, name = event.where.rpartition(".")
+                yield VcdChange(t_ns, scope, name, data.get("value"))
             case TraceKind.FAULT:
                 yield VcdChange(t_ns, "faults", f"{event.where}_{data.get('name', '')}", bool(data.get("on")))
             case TraceKind.STEP:

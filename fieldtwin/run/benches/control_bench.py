@@ -30,12 +30,13 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import OUTPUTS
 from fieldtwin.gateway.core.image.region import RegionReader
-from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.gateway.runtime.alarms.alarm_list import ALARM
+from fieldtwin.gateway.runtime.gateway_status import AlarmEvent, GatewayStatus
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import TOPSIDE, Trace, TraceEvent, TraceKind, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceEvent, TraceKind, alarm_data, refusal_data
 from fieldtwin.run.benches.capture_tail import CaptureTail
 from fieldtwin.run.benches.field_lease import FieldLease
 from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
@@ -46,7 +47,7 @@ from fieldtwin.run.processes.field_contact import check_same, connect_control, r
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.processes.with_program import environment_from
-from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
+from fieldtwin.scenarios.bench import SCENARIO, Can, Stopped, TagReading, alarm_reading, variable
 from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
 from fieldtwin.twin.prototype.field_status import FieldStatus, StruckStatus
@@ -137,6 +138,10 @@ class ControlBench(AsyncResource):
         """The number of the newest change of a tag that the gateway has reported; None before its first answer."""
         self._refused = 0
         """The number, in the gateway's journal, of the newest refused output that the gateway has reported."""
+        self._alarms: dict[str, AlarmEvent | None] = {}
+        """The last change of each alarm, by its name in expressions; None before its first change."""
+        self._alarm_number = 0
+        """The number of the newest change of an alarm that the gateway has reported."""
         self._updates: dict[str, int] = {}
         self._states: dict[str, Any] = {}
         self._words: dict[str, dict[int, str]] = {}
@@ -172,6 +177,7 @@ class ControlBench(AsyncResource):
         device = next((d.name for d in self.system.devices.values() if d.profile.inbox is not None), None)
         if far is not None and device is not None and where.allowed.rank >= Impact.WRITE.rank:
             can.add(Can.SEND_COMMAND)
+        can |= {Can.ACKNOWLEDGE} if self._gateway is not None else set()
         can |= {Can.SEE_WIRE} if where.capture is not None else set()
         can |= {Can.PROBE} if self._probe else set()
         self.can = frozenset(can)
@@ -225,6 +231,7 @@ class ControlBench(AsyncResource):
         self._plc = await self._connect("plc")
         known = set((await self._gateway.ask("get", GatewayStatus)).tags)
         self._asked = [name for name in self._names if name in known]
+        self._alarms = {f"{ALARM}.{name}": None for name in self.system.alarms}
         image = self._stack.enter_context(attached(layout, where.run_dir / "image"))
         self._outputs = image.reader(OUTPUTS)
         self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
@@ -304,6 +311,9 @@ class ControlBench(AsyncResource):
                 return None
             age_s = (self._seen_ns - t_ns) / NS_PER_S if t_ns else float("inf")
             return TagReading(value, quality, reason.replace(" ", "_"), age_s, self._updates.get(name, 0))
+        if name in self._alarms:
+            changed = self._alarms[name]
+            return None if changed is None else alarm_reading(changed, self._seen_ns)
         if name not in self._names:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
         value = self._states.get(name)
@@ -338,6 +348,11 @@ class ControlBench(AsyncResource):
         answer = await self._put("set", device=device, tag=tag, value=value)
         if value is not None:
             self._fault_numbers.add(answer["number"])
+
+    async def acknowledge(self, alarm: str) -> None:
+        assert self._gateway is not None
+        async with naming_failures(self._failure):
+            await self._gateway.call("acknowledge", alarm=alarm.removeprefix(f"{ALARM}."), by=SCENARIO)
 
     async def inject(self, fault: dict[str, Any]) -> None:
         answer = await self._put("fault", fault=fault, start_ns=self._start_ns)
@@ -426,7 +441,12 @@ class ControlBench(AsyncResource):
         if self._gateway is None:
             return []
         answer = await self._gateway.call(
-            "watch", samples=True, since=self._since, names=self._asked, refused=self._refused
+            "watch",
+            samples=True,
+            since=self._since,
+            names=self._asked,
+            refused=self._refused,
+            alarms=self._alarm_number,
         )
         self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
         events = []
@@ -437,6 +457,12 @@ class ControlBench(AsyncResource):
                 t_ns >= 0 or self.target == "local" or entry["standing"]
             ):  # the output was refused earlier in this run, or it is refused again now
                 events.append(TraceEvent(max(0, t_ns), TraceKind.REFUSED, entry["tag"], refusal_data(entry)))
+        for change in msgspec.convert(answer["alarms"], list[AlarmEvent]):
+            name, self._alarm_number = f"{ALARM}.{change.name}", change.number
+            self._alarms[name] = change
+            if change.t_ns >= self._start_ns:
+                data = alarm_data(msgspec.structs.asdict(change))
+                events.append(TraceEvent(change.t_ns - self._start_ns, TraceKind.ALARM, name, data))
         for number, t_ns, tag, value, quality, reason in answer["changes"]:
             self._since = number
             self._updates[tag] = self._updates.get(tag, 0) + 1

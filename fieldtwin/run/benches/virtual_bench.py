@@ -23,16 +23,18 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.alarms.alarm_list import ALARM
+from fieldtwin.gateway.runtime.gateway_status import AlarmEvent
 from fieldtwin.gateway.runtime.outputs.refusals import RefusedOutput
 from fieldtwin.plc.cycle.publishing import TagChange
 from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Trace, TraceKind, alarm_data, refusal_data
 from fieldtwin.run.benches.probes import Probes
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import Scripted, TopsideController
-from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
+from fieldtwin.scenarios.bench import SCENARIO, Can, Stopped, TagReading, alarm_reading, variable
 from fieldtwin.scenarios.language.probe_form import ScenarioProbe
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
@@ -106,6 +108,7 @@ class VirtualBench(AsyncResource):
             Can.SEE_HELD,
             Can.EXACT_TIME,
             Can.FRESH_START,
+            Can.ACKNOWLEDGE,
             Can.JUDGE_RUN,
         }
     )
@@ -113,6 +116,7 @@ class VirtualBench(AsyncResource):
     async def _start(self) -> None:
         await self._stack.enter_async_context(self.run)
         self.run.gateway.tags.subscribe(self._put)
+        self.run.gateway.alarms.on_event = self._alarm
         device = next(iter(self.run.field.far), None)
         if device is not None and self._has_topside:
             self.topside = TopsideController(
@@ -170,6 +174,9 @@ class VirtualBench(AsyncResource):
     def _refused(self, entry: RefusedOutput) -> None:
         self.note(TraceKind.REFUSED, entry.tag, refusal_data(asdict(entry.status())))
 
+    def _alarm(self, event: AlarmEvent) -> None:
+        self.note(TraceKind.ALARM, f"{ALARM}.{event.name}", alarm_data(asdict(event)))
+
     def _named(self, tag: str, value: Any) -> Any:
         """Return `value`, or the name of the state if `tag` is a state that has names."""
         return self._words[tag].get(value, value) if tag in self._words else value
@@ -193,11 +200,15 @@ class VirtualBench(AsyncResource):
 
     def names(self) -> list[str]:
         probed = self._probes.names if self._probes is not None else []
-        return [*self.run.gateway.tags.names, *self.run.plc.outputs.last(), *probed]
+        alarms = [f"{ALARM}.{name}" for name in self.run.gateway.alarms.names]
+        return [*self.run.gateway.tags.names, *self.run.plc.outputs.last(), *alarms, *probed]
 
     def reading(self, name: str) -> TagReading | None:
         if self._probes is not None and name in self._probes.names:
             return self._probes.reading(name)
+        first, _, alarm = name.partition(".")
+        if first == ALARM and alarm in self.run.gateway.alarms.names:
+            return alarm_reading(self.run.gateway.alarms.present(alarm), self.loop.now_ns)
         outputs = self.run.plc.outputs.last()
         if name in outputs and name not in self.run.gateway.tags:
             value = self._named(name, outputs[name])
@@ -249,6 +260,9 @@ class VirtualBench(AsyncResource):
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
         self.run.field.faults.set_value(device, tag, value)
+
+    async def acknowledge(self, alarm: str) -> None:
+        self.run.gateway.alarms.acknowledge(alarm.removeprefix(f"{ALARM}."), SCENARIO, self.loop.now_ns)
 
     async def inject(self, fault: dict[str, Any]) -> None:
         id = self.run.field.faults.inject(fault)

@@ -56,7 +56,7 @@ class Progress:
         line = {"scenario": scenario.form.scenario, "target": target, "steps": steps, "checks": checks}
         self._write("scenario", None, line)
         trace.listen(self._step, TraceKind.STEP)
-        trace.listen(self._value, TraceKind.TAG, TraceKind.STATE)
+        trace.listen(self._value, TraceKind.TAG, TraceKind.STATE, TraceKind.ALARM)
 
     def end(self, result: ScenarioResult) -> None:
         """Write the verdicts on the checks of the whole run, and the result."""

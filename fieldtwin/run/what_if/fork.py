@@ -19,6 +19,7 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.wallclock import WallClock
@@ -30,7 +31,6 @@ from fieldtwin.run.what_if.begin import begin, not_restored, retain_for
 from fieldtwin.run.what_if.outcome import PlanOutcome, Requirement, Series
 from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
 

@@ -12,9 +12,9 @@ from typing import Any
 from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
 from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.scenarios.bench import Bench, TagReading
-from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.language.words import BoundsForm, Expect, WireForm
 from fieldtwin.twin.site.system import System
 

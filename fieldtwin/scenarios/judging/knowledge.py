@@ -11,11 +11,11 @@ from typing import Any
 
 from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.judging.expectation import is_secret
-from fieldtwin.scenarios.language.decimals import as_decimal
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.twin.site.system import System
 
 PENDING_S = 5.0
@@ -40,7 +40,7 @@ class Knowledge:
 
     def hear(self, event: TraceEvent) -> None:
         """Process an event of the trace."""
-        if event.kind in (TraceKind.TAG, TraceKind.STATE):
+        if event.kind in (TraceKind.TAG, TraceKind.STATE, TraceKind.ALARM):
             self._last[event.where] = event
             if event.data.get("value") is not None:
                 self._valued.add(event.where)
@@ -51,7 +51,7 @@ class Knowledge:
 
     def look(self, function: str, name: str) -> Any:
         """Return the current value of `function` for `name`, or None if it is unknown: a
-        `fieldtwin.scenarios.language.expression.Look`.
+        `fieldtwin.gateway.core.conditions.expression.Look`.
         """
         if name == "plc.late":
             return self._bench.late_ms() / 1000

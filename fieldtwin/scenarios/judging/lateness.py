@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.scenarios.bench import Bench, Can
-from fieldtwin.scenarios.language.expression import Expression
 
 BUDGET = 2.0
 """The limit for a late host: a check may exceed its own time limit by at most this multiple of it. After that the check is

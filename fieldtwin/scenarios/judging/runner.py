@@ -16,6 +16,7 @@ from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Struck, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
@@ -31,7 +32,6 @@ from fieldtwin.scenarios.judging.standing import Standing
 from fieldtwin.scenarios.judging.target_limits import refusal
 from fieldtwin.scenarios.judging.whole_run import WholeRun
 from fieldtwin.scenarios.language.about import result_of
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.invariants import Invariants
 from fieldtwin.scenarios.language.words import Expect, Step, word_of
@@ -267,6 +267,8 @@ class ScenarioRunner:
             await bench.inject({"id": fault_id(n, step), **step.fault})
         elif step.clear is not None:
             await bench.clear(step.clear)
+        elif step.acknowledge is not None:
+            await bench.acknowledge(step.acknowledge)
         elif step.pause is not None:
             await self._until(bench.now_s() + seconds(step.pause))
         elif step.wait is not None:

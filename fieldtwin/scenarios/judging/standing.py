@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.results.model import CheckResult, Verdict
 from fieldtwin.scenarios.bench import Bench, Part
 from fieldtwin.scenarios.judging.expectation import said, wire_matches
 from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.violation import Violation
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.invariants import Invariants, Stated
 from fieldtwin.scenarios.language.words import WireForm

@@ -13,6 +13,7 @@ from typing import Any
 
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.expression import Expression, Look
 from fieldtwin.results.model import CheckResult, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
 from fieldtwin.scenarios.bench import Bench
@@ -20,7 +21,6 @@ from fieldtwin.scenarios.judging.expectation import bounds_text, inside
 from fieldtwin.scenarios.judging.knowledge import Knowledge
 from fieldtwin.scenarios.judging.lateness import allowance
 from fieldtwin.scenarios.judging.violation import Violation
-from fieldtwin.scenarios.language.expression import Expression, Look
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.invariants import Followed, Invariants
 from fieldtwin.scenarios.language.words import Cycle, Rate
@@ -294,7 +294,7 @@ class _Cycle:
         return f"changes of {self.form.changes_of} {' and '.join(parts)} apart"
 
     def hear(self, event: TraceEvent) -> None:
-        if event.where != self.form.changes_of or event.kind not in (TraceKind.TAG, TraceKind.STATE):
+        if event.where != self.form.changes_of or event.kind not in (TraceKind.TAG, TraceKind.STATE, TraceKind.ALARM):
             return
         # After the first read, only values that were read count; commanded values do not.
         if event.kind is TraceKind.TAG and not self._read:

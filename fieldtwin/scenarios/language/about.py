@@ -16,7 +16,13 @@ from fieldtwin.scenarios.language.words import Step, word_of
 
 ROLE = "controller"
 """The role under test: the gateway and PLC of the system, or the controller that the scenario's probes read."""
-_DANGER = {"send": Impact.WRITE, "set": Impact.WRITE, "fault": Impact.DISRUPT, "clear": Impact.DISRUPT}
+_DANGER = {
+    "send": Impact.WRITE,
+    "set": Impact.WRITE,
+    "acknowledge": Impact.WRITE,
+    "fault": Impact.DISRUPT,
+    "clear": Impact.DISRUPT,
+}
 """Impact levels of steps; all other steps observe."""
 
 

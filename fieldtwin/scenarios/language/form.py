@@ -7,14 +7,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fieldtwin.emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
+from fieldtwin.gateway.core.conditions.expression import QUALITIES, Expression, Words
+from fieldtwin.gateway.core.conditions.located_expression import read_expression
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.runtime.alarms.state_machine import ALARM_STATES
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.language.expression import QUALITIES, Expression, Words
 from fieldtwin.scenarios.language.invariants import Invariants
-from fieldtwin.scenarios.language.located_expression import read_expression
 from fieldtwin.scenarios.language.names import incomplete_parts, invariants_of, names_of
 from fieldtwin.scenarios.language.probe_form import ScenarioProbe, read_probe
 from fieldtwin.scenarios.language.words import (
@@ -220,7 +221,13 @@ def _needs(file: YamlFile, form: ScenarioForm, errors: ErrorCollector) -> tuple[
     return tuple(dict.fromkeys(asked))
 
 
-_IMPLIED = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
+_IMPLIED = {
+    "send": Can.SEND_COMMAND,
+    "set": Can.SET_VALUE,
+    "fault": Can.INJECT_FAULT,
+    "clear": Can.INJECT_FAULT,
+    "acknowledge": Can.ACKNOWLEDGE,
+}
 
 
 def needs_of(step: Step) -> list[Can]:
@@ -251,6 +258,9 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
             _time(file, (*loc, "pause"), step.pause)
         if step.set is not None:
             _check_set(scenario, step.set, (*loc, "set"))
+        if step.acknowledge is not None:
+            alarms = [name for name, words in scenario.words.items() if words is ALARM_STATES]
+            _known(file, (*loc, "acknowledge"), "alarm", step.acknowledge, alarms)
         if step.expect is not None:
             _check_expect(scenario, step.expect, (*loc, "expect"))
     except UsageError as e:

@@ -8,11 +8,11 @@ from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.conditions.expression import Expression, Words
+from fieldtwin.gateway.core.conditions.located_expression import read_expression
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.scenarios.language.expression import Expression, Words
-from fieldtwin.scenarios.language.located_expression import read_expression
 from fieldtwin.twin.site.system import System
 
 

@@ -81,6 +81,7 @@ class Step(_Form):
     wait: WaitStep | None = None
     expect: Expect | None = None
     pause: Time | None = None
+    acknowledge: str | None = None
 
 
 class Within(_Form):
@@ -141,7 +142,7 @@ class ScenarioForm(_Form):
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
 
-WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
+WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause", "acknowledge")
 
 
 def word_of(step: Step) -> str:

@@ -14,10 +14,10 @@ from itertools import pairwise
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND
-from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.regression.run_history import RunHistory, ValueChange
 from fieldtwin.twin.site.system import System
 

@@ -185,7 +185,7 @@ class TraceLog:
         match kind:
             case TraceKind.TAG:
                 self._value(self.tags, where, t_ns, data, at)
-            case TraceKind.STATE:
+            case TraceKind.STATE | TraceKind.ALARM:
                 self._value(self.states, where, t_ns, data, at)
             case TraceKind.FAULT:
                 self._room(len(self.faults), MOST_EVENTS, "faults")

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
-from fieldtwin.scenarios.language.decimals import as_decimal
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
 from fieldtwin.studio.scenarios.recorder import Action, Recording, Seen, State
 
 BRIEF_NS = 500_000_000

@@ -11,9 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.simulation.formula import Formula
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.expressions import OF_NUMBERS, NotUnderstood, Parsed
-from fieldtwin.scenarios.language.expression import Expression
 
 NAMES = {"x": 2.5, "y": -3.0, "t1s": 7.0}
 LEAVES = st.sampled_from([*NAMES, "0", "1", "2.5", "500 ms", "2 min"])

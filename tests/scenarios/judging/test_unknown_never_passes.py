@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import load_scenario
 
 NAMES = ("a.x", "b.y", "c.z")

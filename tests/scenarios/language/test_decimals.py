@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.scenarios.language.decimals import as_decimal
 from fieldtwin.scenarios.language.form import load_scenario
 
 TANK = """

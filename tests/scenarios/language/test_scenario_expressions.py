@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.scenarios.language.expression import Expression
 
 KNOWN = ["ctd.pressure", "ctd.status", "relay.state"]
 NOW: dict[tuple[str, str], Any] = {

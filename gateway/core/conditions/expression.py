@@ -1,4 +1,4 @@
-"""The expressions of scenarios: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
+"""The conditions of scenarios, invariants and alarms: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
 
 `fieldtwin.gateway.core.expressions` defines their grammar. Names are tags and programs' variables, and any value may be unknown.
 """
@@ -11,10 +11,10 @@ from itertools import pairwise
 from math import isnan
 from typing import Any
 
+from fieldtwin.gateway.core.conditions.decimals import as_decimal
 from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, NotUnderstood, Parsed, dotted
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.scenarios.language.decimals import as_decimal
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
 """Functions of a tag: its quality in words, the seconds since its source's time, its value, how often it was published,
@@ -65,6 +65,8 @@ class Expression:
         """The times that the expression contains, in seconds."""
         self.asks_lateness = False
         """Whether the expression contains ``plc.late``."""
+        self.asks: set[str] = set()
+        """The functions of tags in the expression, and ``plc.late`` and ``command_pending`` if it contains them."""
         self._known = known
         self._words = words
         self._prefix = prefix
@@ -116,6 +118,7 @@ class Expression:
             for part in node.args:
                 self._check(part)
         elif name in FUNCTIONS and len(node.args) == 1 and dotted(node.args[0]):
+            self.asks.add(name)
             self._check_name(node.args[0])
         else:
             expected = ", ".join(f"{f}(TAG)" for f in FUNCTIONS)
@@ -155,6 +158,7 @@ class Expression:
         name = dotted(node)
         if name in ("true", "false", "plc.late", "command_pending"):
             self.asks_lateness |= name == "plc.late"
+            self.asks |= {name} & set(_OWN)
             return
         if name not in self._known:
             hint = did_you_mean(name, self._known)

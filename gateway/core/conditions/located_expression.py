@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Container, Mapping
 from pathlib import Path
 
+from fieldtwin.gateway.core.conditions.expression import Expression, UnknownName, Words
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.expressions import NotUnderstood
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
-from fieldtwin.scenarios.language.expression import Expression, UnknownName, Words
 
 
 def read_expression(

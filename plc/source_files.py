@@ -12,9 +12,18 @@ MAX_FILES = 2_000
 SUFFIXES = (".st", ".iecst", ".exp", ".xml", ".tcpou", ".tcdut", ".tcgvl")
 """The file names' endings in lower case: Structured Text (as written here, and by other tools), PLCopen XML, TwinCAT."""
 
+TEST_SUFFIX = ".test.st"
+"""The end of the names of files with unit tests (`fieldtwin.plc.st.unit_tests`). The source of a program does not include them."""
+
+
+def is_test_file(path: Path) -> bool:
+    """Return whether a file has the name of a file with unit tests."""
+    return path.name.lower().endswith(TEST_SUFFIX)
+
 
 def source_files(path: Path) -> tuple[Path, ...]:
-    """Return the file `path`; or, if it is a folder, the source files in it and below it, sorted, without hidden ones.
+    """Return the file `path`; or, if it is a folder, the source files in it and below it, sorted, without hidden ones
+    and unit tests.
 
     Raises `FileInvalid` for a folder without source files, or with more than `MAX_FILES` of them.
     """
@@ -31,5 +40,5 @@ def source_files(path: Path) -> tuple[Path, ...]:
 def _below(folder: Path) -> Iterator[Path]:
     for path in folder.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden:
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden and not is_test_file(path):
             yield path

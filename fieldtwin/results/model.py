@@ -14,6 +14,7 @@ from fieldtwin.results.trace import TraceEvent
 # imported for types only, because verdicts and results are also created where the modules that read systems are not
 # installed
 if TYPE_CHECKING:
+    from fieldtwin.plc.st.coverage.places import Coverage
     from fieldtwin.twin.site.system import System
 
 
@@ -223,6 +224,8 @@ class Report:
     """The buses on which a remote client sends the requests, so that the received frames are the requests."""
     machines_of: Mapping[SystemKey, Sequence[Machine]] = field(default_factory=dict)
     """The state machines of the systems of scenarios, for scenarios whose system is not `system`."""
+    logic: Coverage | None = None
+    """The coverage of Structured Text by unit tests; None for a run without unit tests."""
 
     def part_of(self, scenario: ScenarioResult) -> Report:
         """Return the part of the report that concerns the system of one scenario, with the names, secrets and state machines

@@ -58,7 +58,7 @@ class Inspection:
             found = self._member(found, step[1]) if step[1] else _element(found, step[2])
         if found is None or isinstance(found[0], ty.Struct | ty.Block):
             return None
-        return InternalVariable(path, str(found[0]), _shown(*found))
+        return InternalVariable(path, str(found[0]), shown_value(*found))
 
     def _below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
         if isinstance(kind, ty.Struct | ty.Block):
@@ -121,7 +121,7 @@ def _at(kind: ty.Array, value: Any, at: Sequence[int]) -> Any:
     return value
 
 
-def _shown(kind: ty.Type, value: Any) -> Scalar | str:
+def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
     """Return a value for display: an enumerated value by its name, a date as a literal, an array with its first elements."""
     if isinstance(kind, ty.Array):
         return _elements(kind, value)
@@ -137,7 +137,7 @@ def _shown(kind: ty.Type, value: Any) -> Scalar | str:
 def _elements(kind: ty.Array, value: list[Any]) -> str:
     count = ty.elements(ty.Array(kind.ranges, ty.INT))
     chosen = product(*(range(low, high + 1) for low, high in kind.ranges))
-    texts = [_text(_shown(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)]
+    texts = [_text(shown_value(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)]
     return f"[{', '.join(texts)}{f', ... {count} elements' if count > SHOWN_ELEMENTS else ''}]"
 
 

@@ -83,6 +83,7 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
         (*unit.warnings, *(w for one in library.units for w in one.warnings if w.path in files)),
         (*unit.missing, *(m for one in library.units for m in one.missing if _owner(m) in seen)),
         unit.instances,
+        unit.tests,
     )
 
 
@@ -93,11 +94,11 @@ def _owner(missing: t.Missing) -> str:
 
 def _names(root: Any) -> Iterator[str]:
     """Yield the names, in lower case, of types, variables and POUs to which a declaration may refer."""
-    pous = root.pous if isinstance(root, t.SourceUnit) else ()
+    pous = (*root.pous, *root.tests) if isinstance(root, t.SourceUnit) else ()
     parts = [*root.types, *root.globals] if isinstance(root, t.SourceUnit) else [root]
     for part in (*parts, *pous):
         local = set()
-        if isinstance(part, t.Pou):
+        if isinstance(part, t.Pou | t.Test):
             local = {v.name.lower() for b in part.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
             yield from (v.name.lower() for b in part.blocks if b.kind == "VAR_EXTERNAL" for v in b.variables)
         yield from _references(part, local)

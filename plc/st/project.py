@@ -6,7 +6,7 @@ In a unit, types, globals and POUs may be declared in any order and in any file,
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -48,6 +48,21 @@ def read_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, 
     return _unit_of(_texts((path,)), _texts(libraries), dialect)
 
 
+def read_with(
+    path: Path,
+    beside: tuple[Path, ...],
+    libraries: tuple[Path, ...],
+    dialect: Dialect,
+    changed: Callable[[SourceUnit], SourceUnit],
+) -> tuple[SourceUnit, list[SourceUnit]]:
+    """Read the file `path` with the declarations of the files `beside` it and of `libraries` that it uses.
+
+    `changed` is applied to each file. Also return the other files as they were read. Raises `FileInvalid`.
+    """
+    library = _library(_texts((*beside, *libraries)), dialect, changed)
+    return with_library(changed(_parsed(_texts((path,)), dialect)), library), library.units
+
+
 def _texts(paths: tuple[Path, ...]) -> Texts:
     return tuple((str(file), _text(file)) for path in paths for file in source_files(path))
 
@@ -74,16 +89,20 @@ def _unit_of(texts: Texts, libraries: Texts, dialect: Dialect) -> SourceUnit:
     return with_library(_parsed(texts, dialect), _library(libraries, dialect))
 
 
-def _library(texts: Texts, dialect: Dialect) -> Library:
-    """Return the declarations of libraries. An error counts only if the program uses the part with the error."""
+def _library(
+    texts: Texts, dialect: Dialect, changed: Callable[[SourceUnit], SourceUnit] = lambda unit: unit
+) -> Library:
+    """Return the declarations of libraries, each file as `changed` returns it. An error counts only if the program uses the part
+    with the error.
+    """
     library = Library()
     for path, text in texts:
         try:
-            library.add(_unit(path, text, dialect))
+            library.add(changed(_unit(path, text, dialect)))
         except FileInvalid as whole:
             try:
                 for unit, names, error in _parts(path, text, dialect):
-                    library.add(unit)
+                    library.add(changed(unit))
                     library.fail(names, error or whole)
             except FileInvalid as e:  # not even text of the language: the file's name is that of its declaration
                 library.fail((Path(path).stem,), e)
@@ -105,6 +124,7 @@ def _parsed(texts: Texts, dialect: Dialect) -> SourceUnit:
         tuple(warning for unit in units for warning in unit.warnings),
         tuple(missing for unit in units for missing in unit.missing),
         tuple(instance for unit in units for instance in unit.instances),
+        tuple(test for unit in units for test in unit.tests),
     )
 
 

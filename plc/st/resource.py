@@ -60,8 +60,8 @@ class Context:
 class Resource:
     """One execution of a compiled unit: its classes and functions, and its global variables with their initial values."""
 
-    def __init__(self, unit: CompiledUnit) -> None:
-        self.context = Context()
+    def __init__(self, unit: CompiledUnit, context: Context | None = None) -> None:
+        self.context = context or Context()
         self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
         for part in unit.code:
             exec(part, self.space)

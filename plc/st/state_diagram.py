@@ -41,21 +41,45 @@ class StateDiagram:
         return [transition for transition in self.transitions if transition.source == state]
 
 
+@dataclass(frozen=True, slots=True)
+class StateAssignment:
+    """An assignment of the state `target` that leaves one of the states `sources`."""
+
+    pou: str
+    variable: str
+    sources: tuple[str, ...]
+    target: str
+    pos: t.Pos
+
+
 def state_diagrams(unit: t.SourceUnit) -> Iterator[StateDiagram]:
     """Return the state machines of all POUs in the order of the unit, and within a POU in the order of their first CASE."""
+    for pou, found in _machines(unit):
+        yield found.diagram() if isinstance(found, _Machine) else _chart(pou.name, found)
+
+
+def state_assignments(unit: t.SourceUnit) -> Iterator[StateAssignment]:
+    """Return the assignments of states that are transitions of a CASE. Charts have none."""
+    for _, found in _machines(unit):
+        if isinstance(found, _Machine):
+            yield from found.assignments()
+
+
+def _machines(unit: t.SourceUnit) -> Iterator[tuple[t.Pou, t.Chart | _Machine]]:
+    """Return the charts, and the state machines of CASEs, of all POUs."""
     enums = {declared.name.lower(): declared for declared in unit.types if isinstance(declared, t.EnumDecl)}
     globals_ = {v.name.lower(): v for block in unit.globals for v in block.variables}
     for pou in unit.pous:
         if pou.chart is not None:
-            yield _chart(pou.name, pou.chart)
+            yield pou, pou.chart
         own = {v.name.lower(): v for block in pou.blocks for v in block.variables}
         bodies = [pou.body, *(action.body for action in pou.actions)]
         cases = [case for body in bodies for case in _cases(body)]
         for name in dict.fromkeys(name for case in cases if (name := _variable(case.selector))):
             declared = own.get(name) or globals_.get(name)
-            found = _Machine(pou, name, declared, enums, [c for c in cases if _variable(c.selector) == name]).diagram()
-            if found is not None:
-                yield found
+            found = _Machine(pou, name, declared, enums, [c for c in cases if _variable(c.selector) == name])
+            if found.search():
+                yield pou, found
 
 
 def _chart(pou: str, chart: t.Chart) -> StateDiagram:
@@ -118,31 +142,47 @@ class _Machine:
     cases: list[t.Case]
     states: dict[str, str] = field(default_factory=dict)
     """The states by their names in lower case."""
-    found: list[tuple[tuple[str, ...] | None, str, str]] = field(default_factory=list)
-    """Sources (None: every other state), target and condition of each transition."""
+    found: list[tuple[tuple[str, ...] | None, str, str, t.Pos]] = field(default_factory=list)
+    """Sources (None: every other state), target, condition and place of each transition."""
     computed: list[t.Pos] = field(default_factory=list)
     _calling: list[str] = field(default_factory=list)
 
-    def diagram(self) -> StateDiagram | None:
-        """Return the state machine; None if no branch assigns a state."""
+    def search(self) -> bool:
+        """Search the bodies of the POU. Return whether a branch assigns a state."""
         enum = self._enum()
         names = [value for value, _ in enum.values] if enum else []
         labels = [self._state_name(label) for case in self.cases for each, _ in case.branches for label in each]
         self.states = {name.lower(): name for name in [*names, *labels]}
         self._walk(self.pou.body, None, ())
-        if not any(sources for sources, _, _ in self.found):
-            return None
-        states = [*self.states.values()] + [OTHER] * any(OTHER in (sources or ()) for sources, _, _ in self.found)
+        return any(sources for sources, _, _, _ in self.found)
+
+    def diagram(self) -> StateDiagram:
+        """Return the state machine that `search` has found."""
         transitions = [
             Transition(source, target, when)
-            for sources, target, when in self.found
-            for source in (sources if sources is not None else [s for s in states if s != target])
+            for sources, target, when, _ in self.found
+            for source in self._sources(sources, target)
         ]
-        variable = self.declared.name if self.declared else self.name
-        initial = self._initial(enum)
+        initial = self._initial(self._enum())
         return StateDiagram(
-            self.pou.name, variable, tuple(states), initial, tuple(dict.fromkeys(transitions)), tuple(self.computed)
-        )
+            self.pou.name, self._variable_name(), self._all_states(), initial, tuple(dict.fromkeys(transitions)),
+            tuple(self.computed),
+        )  # fmt: skip
+
+    def assignments(self) -> Iterator[StateAssignment]:
+        """Return the assignments that `search` has found."""
+        for sources, target, _, pos in self.found:
+            yield StateAssignment(self.pou.name, self._variable_name(), self._sources(sources, target), target, pos)
+
+    def _sources(self, sources: tuple[str, ...] | None, target: str) -> tuple[str, ...]:
+        return sources if sources is not None else tuple(state for state in self._all_states() if state != target)
+
+    def _all_states(self) -> tuple[str, ...]:
+        other = any(OTHER in (sources or ()) for sources, _, _, _ in self.found)
+        return (*self.states.values(), OTHER) if other else tuple(self.states.values())
+
+    def _variable_name(self) -> str:
+        return self.declared.name if self.declared else self.name
 
     def _enum(self) -> t.EnumDecl | None:
         kind = self.declared.type if self.declared else None
@@ -193,7 +233,7 @@ class _Machine:
         if target is None:
             self.computed.append(statement.pos)
             return
-        self.found.append((sources, target, _cut(" AND ".join(conditions))))
+        self.found.append((sources, target, _cut(" AND ".join(conditions)), statement.pos))
 
     def _called(self, call: t.Call, sources: tuple[str, ...] | None, conditions: tuple[str, ...]) -> None:
         """Follow the call of an action of the POU, and note a call that can change the variable."""

@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 import sys
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,9 +29,19 @@ from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.plain_result import plain_result
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
+from fieldtwin.cli.test.unit_tests import (
+    UnitTestOptions,
+    coverage_of,
+    is_unit_test,
+    load_suites,
+    run_suites,
+    show_coverage,
+)
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stderr, stdout
+from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.source_files import TEST_SUFFIX
 from fieldtwin.scenarios.language.file_name import SUFFIX
 
 if TYPE_CHECKING:
@@ -74,6 +85,7 @@ class _WithCommand(GroupedCommand):
     ),
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
+@group("Unit tests in Structured Text", units=UnitTestOptions)
 @group("Profiles and templates", sources=TemplateSearchOptions)
 @group("Output", junit=JunitOptions)
 @group(
@@ -105,6 +117,7 @@ def command(
     retries: int,
     waivers: str | None,
     campaign: CampaignOptions,
+    units: UnitTestOptions,
     sources: TemplateSearchOptions,
     junit: JunitOptions,
     html: str | None,
@@ -113,10 +126,10 @@ def command(
     progress: str | None,
     as_json: bool,
 ) -> int:
-    """Run the scenarios in FILES (*.scenario.yaml; for a folder, all in it; default: those of the working directory).
+    """Run the scenarios and unit tests in FILES (for a folder, all in it; default: those of the working directory).
 
-    The exit code is 0 if all scenarios passed, and 1 otherwise: a scenario that was skipped or is inconclusive has not
-    passed.
+    Scenarios are files *.scenario.yaml. Unit tests are TEST blocks in Structured Text, in files *.test.st; they run without
+    a system. The exit code is 0 if all passed, and 1 otherwise: a scenario that was skipped or is inconclusive has not passed.
 
     \b
     --target local    gateway, PLC and emulators as processes, on ptys and
@@ -141,7 +154,7 @@ def command(
     from fieldtwin.scenarios.language.form import load_scenario
 
     target, controller = _controller(at.target, at.with_command)
-    paths = _found(files)
+    paths, unit_tests = _found(files, with_unit_tests=target == "virtual" and not campaign.seeds)
     for option, given in (("--trace", trace), ("--progress", progress)):
         if given and len(paths) != 1:
             raise UsageError(f"{option} needs a single scenario", got=f"{len(paths)} of them")
@@ -157,9 +170,11 @@ def command(
     for path in paths:
         agree_to_scenario(sources.ask(), path, folders, plant=target == "real", virtual=target == "virtual")
     scenarios = [load_scenario(path, folders) for path in paths]
+    suites = load_suites(unit_tests, units)
     show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
     show_warnings(warnings_of(one.system for one in scenarios))
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
+    known += [test.name for suite in suites for test in suite.tests]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
     where = ScenarioTarget(
         target,
@@ -200,20 +215,31 @@ def command(
                 _show(results[-1])
     if shown is not None:
         shown.close()
+    for unit_test in run_suites(suites, units):
+        results.append(waive(unit_test, waived, datetime.now(UTC).date()))
+        if not as_json:
+            _show(results[-1])
+    covered = coverage_of(suites)
     draws = html is not None and not campaign.seeds
     machines = _machines([one.system for one in scenarios]) if draws else {}
+    system = scenarios[0].system if scenarios else None
     report = Report(
-        "scenarios",
+        "scenarios" if scenarios else "unit tests",
         results,
-        scenarios[0].system,
-        target,
+        system,
+        target if scenarios else "",
         seed,
         reproduce=shlex.join(["fieldtwin", *sys.argv[1:]]),
         versions={"fieldtwin": __version__},
-        machines=machines[key_of(scenarios[0].system)] if draws else (),
+        machines=machines[key_of(system)] if draws and system is not None else (),
         machines_of=machines,
         served=(),
+        logic=covered,
     )
+    if covered is not None and units.coverage is not None:
+        from fieldtwin.reports.cobertura import write_cobertura
+
+        write_cobertura(covered, units.coverage, time.time_ns() // NS_PER_MS)
     if junit.junit is not None:
         from fieldtwin.reports.junit import Flavour, write_junit
 
@@ -234,6 +260,8 @@ def command(
         json.dump([plain_result(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
+        if covered is not None:
+            show_coverage(covered)
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
         if not campaign.seeds:
             _tell_how_to_see_more(results)
@@ -302,14 +330,27 @@ def _check(target: str, at: TargetOptions) -> None:
         )
 
 
-def _found(files: tuple[str, ...]) -> list[Path]:
-    paths: list[Path] = []
+def _found(files: tuple[str, ...], *, with_unit_tests: bool) -> tuple[list[Path], list[Path]]:
+    """Return the scenarios and the files of unit tests that the user named, and those in the folders that the user named."""
+    scenarios: list[Path] = []
+    unit_tests: list[Path] = []
     for name in files or (".",):
         path = Path(name)
-        paths += sorted(path.rglob(f"*{SUFFIX}")) if path.is_dir() else [path]
-    if not paths:
-        raise UsageError("no scenarios", expected=f"files that end in {SUFFIX}")
-    return paths
+        if path.is_dir():
+            scenarios += sorted(path.rglob(f"*{SUFFIX}"))
+            unit_tests += sorted(path.rglob(f"*{TEST_SUFFIX}")) if with_unit_tests else []
+        elif not is_unit_test(path):
+            scenarios.append(path)
+        elif with_unit_tests:
+            unit_tests.append(path)
+        else:
+            raise UsageError(
+                "a unit test runs without a system, in its own virtual time", expected="no --target, --with and --seeds",
+                got=name,
+            )  # fmt: skip
+    if not scenarios and not unit_tests:
+        raise UsageError("no scenarios and no unit tests", expected=f"files that end in {SUFFIX} or {TEST_SUFFIX}")
+    return scenarios, unit_tests
 
 
 def _show(result: object) -> None:

@@ -18,6 +18,7 @@ from fieldtwin.reports.file import put
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import cut, fill
 from fieldtwin.reports.run.coverage_tables import coverage_section
+from fieldtwin.reports.run.logic import logic_section
 from fieldtwin.reports.run.diagram import timing_diagram
 from fieldtwin.reports.run.requirements import requirement_matrix
 from fieldtwin.reports.run.window import MOST_FRAMES, FrameLine, Study, Window
@@ -67,6 +68,7 @@ def render_html(report: Report) -> str:
             )
             for part, counts in studied.parts.values()
         ],
+        logic=logic_section(report.logic) if report.logic is not None else "",
         listed=_listed(report),
         MOST_SCENARIOS=MOST_SCENARIOS,
         MOST_CHECKS=MOST_CHECKS,
@@ -118,6 +120,10 @@ def _study(report: Report) -> _Studied:
     if not report.scenarios or report.system is not None:
         studied.parts[key_of(report.system) if report.system is not None else None] = report, AccessCounts()
     for number, scenario in enumerate(report.scenarios):
+        if scenario.system is None and report.logic is not None:  # a unit test, which has no buses
+            if scenario.verdict.bad:
+                studied.failures.append(_failure(report, number, scenario, [], opened=len(studied.failures) < 4))
+            continue
         own_part = report.part_of(scenario)
         key = None if own_part.system is None else key_of(own_part.system)
         part, counts = studied.parts.setdefault(key, (own_part, AccessCounts()))

@@ -205,7 +205,8 @@ class _Translation:
         ]
         cleared = [_assign(pos, name, "0lost", _true(pos)) for name in transition.sources]
         cleared += [_assign(pos, name, "0gained", _true(pos)) for name in transition.targets]
-        inner = t.If(pos, ((transition.condition, tuple(cleared)),))
+        recorded = (transition.probe,) if transition.probe is not None else ()
+        inner = t.If(pos, ((transition.condition, (*recorded, *cleared)),))
         return t.If(pos, ((_all(pos, "AND", enabled), (inner,)),))
 
     def _control(self, name: str) -> list[t.Statement]:

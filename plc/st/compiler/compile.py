@@ -9,7 +9,7 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import CodeType
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -51,6 +51,10 @@ class CompiledUnit:
     warnings: tuple[StWarning, ...] = ()
     missing: tuple[t.Missing, ...] = ()
     """The declarations that were not imported and are not used."""
+    recorded: Mapping[int, tuple[ty.Type, ...]] = field(default_factory=dict)
+    """By number of an assertion of a unit test: the types of the values that it shows."""
+    probed: Mapping[int, ty.Type] = field(default_factory=dict)
+    """By number of a probe for coverage with a value: the type of the value."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -116,8 +120,9 @@ class _Unit:
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
         code = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs).code(text)
+        recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
-            self.path, self.files, code, text, tuple(programs), self.blocks.kept, kinds, warnings, missing
+            self.path, self.files, code, text, tuple(programs), self.blocks.kept, kinds, warnings, missing, recorded, probed
         )
 
     def _kinds(self) -> tuple[str, ...]:

@@ -131,6 +131,10 @@ class Environment:
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
     missing: dict[str, Missing] = field(default_factory=dict)
     """The declarations that were not imported, because a part of them is not supported."""
+    recorded: dict[int, tuple[ty.Type, ...]] = field(default_factory=dict)
+    """By number of an assertion: the types of the values that it shows."""
+    probed: dict[int, ty.Type] = field(default_factory=dict)
+    """By number of a probe with a value: the type of the value."""
     calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
     """By POU: the POUs that it calls or contains, with the first position of each."""
 

@@ -58,6 +58,28 @@ class Statements(Calls):
     def _assign(self, s: t.Assign) -> None:
         self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
+    # -- unit tests and coverage --------------------------------------------------------------------------------------
+
+    def _assertion(self, s: t.Assertion) -> None:
+        condition = self.condition(s.condition, "an assertion")
+        shown = [self.value(expr) for expr in s.shown]
+        self.env.recorded[s.number] = tuple(value.type for value in shown)
+        self.out.line(f"_c.asserted({s.number}, {condition}, ({''.join(f'{v.code}, ' for v in shown)}))", s.pos)
+
+    def _advance(self, s: t.Advance) -> None:
+        by = self.coerced(self.value(s.by), ty.LTIME, s.pos, "BY of ADVANCE_TIME")
+        self.out.line(f"_c.advance({by})", s.pos)
+
+    def _probe(self, s: t.Probe) -> None:
+        if s.value is None:
+            self.out.line(f"_c.executed({s.number})", s.pos)
+            return
+        value = self.value(s.value)
+        self.env.probed[s.number] = value.type
+        self.out.line(f"_c.executed(({s.number}, {value.code}))", s.pos)
+
+    # -- values of networks and tests ---------------------------------------------------------------------------------
+
     def _hold(self, s: t.Hold) -> None:
         code = "w_" + s.name.replace(".", "_")
         with self.env.declaring(s.name, self.env.faulty_here):

@@ -22,7 +22,7 @@ from fieldtwin.plc.st.syntax.rules.units import UnitRules
 from fieldtwin.plc.st.syntax.source import blanked, shortened
 
 _ENDS = re.compile(
-    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"|\b(?P<end>END_(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|TYPE|CONFIGURATION))\b|\S\s*\Z""",
+    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"|\b(?P<end>END_(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|TYPE|CONFIGURATION|TEST))\b|\S\s*\Z""",
     re.IGNORECASE,
 )
 """The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped."""

@@ -170,6 +170,7 @@ class Transition:
     sources: tuple[str, ...]
     targets: tuple[str, ...]
     condition: Expr
+    probe: Probe | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +198,16 @@ class Pou:
     body: tuple[Statement, ...]
     actions: tuple[Action, ...] = ()
     chart: Chart | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """A unit test (``TEST 'name' ... END_TEST``), which `fieldtwin.plc.st.unit_tests` runs. A program ignores it."""
+
+    pos: Pos
+    name: str
+    blocks: tuple[VarBlock, ...]
+    body: tuple[Statement, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +243,7 @@ class SourceUnit:
     warnings: tuple[StWarning, ...] = ()
     missing: tuple[Missing, ...] = ()
     instances: tuple[Instance, ...] = ()
+    tests: tuple[Test, ...] = ()
 
 
 # -- expressions --------------------------------------------------------------------------------------------------------
@@ -398,4 +410,31 @@ class Hold:
     enabled: Expr | None = None
 
 
-Statement = Hold | Assign | CallStatement | If | Case | For | While | Repeat | Jump
+@dataclass(frozen=True, slots=True)
+class Assertion:
+    """An assertion of a unit test. `number` identifies it in the unit; `shown` are the values that a failure shows."""
+
+    pos: Pos
+    number: int
+    condition: Expr
+    shown: tuple[Expr, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Advance:
+    """An advance of the time of a unit test by a TIME."""
+
+    pos: Pos
+    by: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """A place whose execution is recorded for coverage. `number` identifies it in the unit. `value`, if any, is recorded too."""
+
+    pos: Pos
+    number: int
+    value: Expr | None = None
+
+
+Statement = Assertion | Advance | Probe | Hold | Assign | CallStatement | If | Case | For | While | Repeat | Jump

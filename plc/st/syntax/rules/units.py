@@ -46,7 +46,12 @@ class UnitRules(Rules):
             tuple(each for each in _flat(items) if isinstance(each, t.VarBlock)),
             tuple(i for i in items if isinstance(i, t.Pou)),
             instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
+            tests=tuple(i for i in items if isinstance(i, t.Test)),
         )
+
+    def test(self, meta: Meta, items: list[Any]) -> t.Test:
+        word, name, *blocks, body = items
+        return t.Test(self._pos(word), str(name)[1:-1].replace("$'", "'"), tuple(blocks), body)
 
     def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock | t.Instance, ...]:
         """Return the globals and the programs of a configuration, with those of its resources."""

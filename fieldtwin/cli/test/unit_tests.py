@@ -1,0 +1,158 @@
+"""The part of `fieldtwin test` that runs unit tests in Structured Text (*.test.st)."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from fieldtwin.cli.option_groups import option
+from fieldtwin.console import stdout
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.source_files import SUFFIXES, is_test_file
+from fieldtwin.plc.st.dialects import DIALECTS, dialect_of
+
+if TYPE_CHECKING:
+    from fieldtwin.plc.st.coverage.places import Coverage
+    from fieldtwin.plc.st.unit_tests.run import AssertionResult, TestResult
+    from fieldtwin.plc.st.unit_tests.suite import Suite
+    from fieldtwin.results.model import CheckResult, ScenarioResult
+
+TARGET = "unit test"
+"""The target of a unit test in reports, where a scenario has virtual, local, compose or real."""
+
+
+@dataclass(frozen=True)
+class UnitTestOptions:
+    """The dialect and the libraries of the tested programs, and the file for their coverage, None for none."""
+
+    dialect: str = option(
+        "--dialect",
+        type=click.Choice(list(DIALECTS)),
+        default="standard",
+        show_default=True,
+        help="The dialect of unit tests and of the programs that they test.",
+    )
+    libraries: tuple[Path, ...] = option(
+        "--library",
+        type=click.Path(path_type=Path, exists=True),
+        multiple=True,
+        help="A file or folder whose declarations unit tests may use, besides the files in their folder. Can be repeated.",
+    )
+    coverage: Path | None = option(
+        "--coverage",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Write the coverage of statements and branches by unit tests as Cobertura XML.",
+    )
+
+    def words(self) -> tuple[str, ...]:
+        """Return the options as words of a command line."""
+        dialect = ("--dialect", self.dialect) if self.dialect != "standard" else ()
+        return (*dialect, *(word for one in self.libraries for word in ("--library", str(one))))
+
+
+def is_unit_test(path: Path) -> bool:
+    """Return whether a file that the user named holds unit tests, not a scenario."""
+    return is_test_file(path) or path.suffix.lower() in SUFFIXES
+
+
+def load_suites(paths: list[Path], options: UnitTestOptions) -> list[Suite]:
+    """Read and compile the files of unit tests. Raises `FileInvalid`."""
+    from fieldtwin.plc.st.unit_tests.suite import load_suite
+
+    if options.coverage is not None and not paths:
+        raise UsageError("--coverage needs unit tests in Structured Text", expected="files that end in .test.st")
+    return [load_suite(path, dialect_of(options.dialect), options.libraries) for path in paths]
+
+
+def run_suites(suites: list[Suite], options: UnitTestOptions) -> Iterator[ScenarioResult]:
+    """Run the tests of all files, one after the other."""
+    for suite in suites:
+        reproduce = shlex.join(["fieldtwin", "test", str(suite.path), *options.words()])
+        began = time.perf_counter()
+        for result in suite.run():
+            now = time.perf_counter()
+            yield _as_result(result, suite.path, reproduce, now - began)
+            began = now
+
+
+def coverage_of(suites: list[Suite]) -> Coverage | None:
+    """Return the coverage by all tests; None without tests."""
+    from fieldtwin.plc.st.coverage.places import Coverage
+
+    if not suites:
+        return None
+    found = Coverage()
+    for suite in suites:
+        found.add(suite.coverage())
+    return found
+
+
+def show_coverage(coverage: Coverage) -> None:
+    """Print a line for each file."""
+    from fieldtwin.plc.st.coverage.places import Kind, line_ranges
+
+    table = Table(box=None, pad_edge=False, show_edge=False, header_style="dim")
+    table.add_column("coverage", overflow="fold")
+    for kind in Kind:
+        table.add_column(kind.value, justify="right")
+    table.add_column("lines not executed", overflow="fold")
+    for path in coverage.paths:
+        of = coverage.of(path)
+        counts = [of.count(kind) for kind in Kind]
+        missed = line_ranges(place.line for place in of.missed(Kind.STATEMENT))
+        table.add_row(escape(path), *(f"{done}/{every}" if every else "" for done, every in counts), missed)
+    stdout.print(table)
+
+
+def _as_result(result: TestResult, path: Path, reproduce: str, took_s: float) -> ScenarioResult:
+    from fieldtwin.results.model import ScenarioResult, Verdict
+
+    verdict, reason = Verdict.PASSED, ""
+    failed = next(((n, one) for n, one in enumerate(result.assertions, 1) if one.failed), None)
+    if result.error:
+        place, line = result.error_place
+        verdict, reason = Verdict.ERROR, f"{result.error} ({place}:{line})"
+    elif failed is not None:
+        verdict, reason = Verdict.FAILED, f"{failed[0]}: {_text(failed[1])}"
+    elif not any(one.executed for one in result.assertions):
+        verdict, reason = Verdict.INCONCLUSIVE, "the test executed no assertion"
+    return ScenarioResult(
+        name=result.test.name,
+        verdict=verdict,
+        checks=tuple(_as_check(str(n), one) for n, one in enumerate(result.assertions, 1)),
+        file=str(path),
+        line=result.test.pos.line,
+        target=TARGET,
+        reason=reason,
+        reproduce=reproduce,
+        simulated_s=result.simulated_ns / NS_PER_S,
+        took_s=took_s,
+    )
+
+
+def _as_check(number: str, one: AssertionResult) -> CheckResult:
+    from fieldtwin.results.model import CheckResult, Verdict
+
+    verdict = Verdict.FAILED if one.failed else Verdict.PASSED if one.executed else Verdict.SKIPPED
+    return CheckResult(
+        number,
+        _text(one),
+        verdict,
+        t_ns=one.t_ns if one.executed else None,
+        expected=one.expected,
+        got=one.got or ("" if one.executed else "not executed"),
+        where=f"{one.text.pos.path}:{one.text.pos.line}",
+    )
+
+
+def _text(one: AssertionResult) -> str:
+    return f"{one.text.message}: {one.text.text}" if one.text.message else one.text.text

@@ -1,0 +1,1 @@
+"""Coverage of Structured Text: which statements, branches and transitions were executed."""

@@ -1,0 +1,74 @@
+"""The places of a program whose execution is recorded, and how many of them were executed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class Kind(Enum):
+    """The kind of a place. The values are the words that users see."""
+
+    STATEMENT = "statements"
+    BRANCH = "branches"
+    TRANSITION = "transitions"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """A statement, a branch of an IF or CASE, or a transition between two states, at a line of a file.
+
+    `name` names a branch ("THEN 1", "ELSE") or a transition ("Pump.state IDLE -> FILLING"), and is empty for a statement.
+    """
+
+    path: str
+    line: int
+    column: int
+    kind_name: str
+    name: str
+    pou: str
+
+    @property
+    def kind(self) -> Kind:
+        return Kind[self.kind_name]
+
+
+@dataclass
+class Coverage:
+    """For each place, whether it was executed. Coverages of several files of tests are added to each other."""
+
+    executed: dict[Place, bool] = field(default_factory=dict)
+
+    def add(self, places: Mapping[Place, bool]) -> None:
+        """Add places. A place counts as executed if it was executed at least once."""
+        for place, found in places.items():
+            self.executed[place] = found or self.executed.get(place, False)
+
+    def of(self, path: str) -> Coverage:
+        """Return the coverage of one file."""
+        return Coverage({place: found for place, found in self.executed.items() if place.path == path})
+
+    @property
+    def paths(self) -> list[str]:
+        return sorted({place.path for place in self.executed})
+
+    def count(self, kind: Kind) -> tuple[int, int]:
+        """Return how many places of a kind were executed, and how many there are."""
+        found = [executed for place, executed in self.executed.items() if place.kind is kind]
+        return sum(found), len(found)
+
+    def missed(self, kind: Kind) -> list[Place]:
+        """Return the places of a kind that were not executed, in the order of the source."""
+        return sorted(place for place, executed in self.executed.items() if place.kind is kind and not executed)
+
+
+def line_ranges(lines: Iterable[int]) -> str:
+    """Return line numbers as a text such as ``3, 7-9``."""
+    ranges: list[list[int]] = []
+    for line in sorted(set(lines)):
+        if ranges and line == ranges[-1][1] + 1:
+            ranges[-1][1] = line
+        else:
+            ranges.append([line, line])
+    return ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in ranges)

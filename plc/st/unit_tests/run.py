@@ -1,0 +1,161 @@
+"""Run the unit tests of a file, each alone in its own virtual time.
+
+Each test begins with the initial values of all variables, also the global ones, at time 0. A call of a program or function
+block in a test executes it once, as a scan does; time passes with ADVANCE_TIME only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.plc.program import ScanTooLong
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.inspection import shown_value
+from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource
+from fieldtwin.plc.st.unit_tests.translate import AssertionText, TranslatedTest
+
+MAX_ADVANCES = 1_000_000
+"""How often a test may advance its time, so that a test with an endless loop ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class AssertionResult:
+    """An assertion of a test: how often it was executed, and its first failure, if any.
+
+    `t_ns` is the time of the first failure, or else of the last execution, in ns since the test's start. `expected` and `got`
+    describe the failure.
+    """
+
+    text: AssertionText
+    executed: int
+    failed: bool
+    t_ns: int
+    expected: str = ""
+    got: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TestResult:
+    """A test that has ended. `error`: why it ended early, with the place of the statement; "" if it was executed to its end."""
+
+    __test__ = False  # no class of tests for pytest
+
+    test: TranslatedTest
+    assertions: tuple[AssertionResult, ...]
+    simulated_ns: int
+    error: str = ""
+    error_place: tuple[str, int] = ("", 0)
+
+    @property
+    def failed(self) -> list[AssertionResult]:
+        return [one for one in self.assertions if one.failed]
+
+
+@dataclass(slots=True)
+class _Count:
+    executed: int = 0
+    failed: bool = False
+    t_ns: int = 0
+    values: tuple[Any, ...] = ()
+
+
+@dataclass
+class Recorded:
+    """What the probes for coverage recorded: numbers, and pairs of a number and a value."""
+
+    executed: set[Any] = field(default_factory=set)
+
+
+class _TestContext(Context):
+    """The context of compiled code in a test: its time is that of the test."""
+
+    __slots__ = ("_advances", "counts", "executed")
+
+    def __init__(self, recorded: Recorded) -> None:
+        super().__init__()
+        self.first_scan = True
+        self.counts: dict[int, _Count] = {}
+        self.executed: Callable[[Any], None] = recorded.executed.add
+        self._advances = 0
+
+    def asserted(self, number: int, holds: bool, shown: tuple[Any, ...]) -> None:
+        """Record an execution of an assertion. The first failure is kept."""
+        count = self.counts.setdefault(number, _Count())
+        count.executed += 1
+        if not count.failed:
+            count.failed, count.t_ns, count.values = not holds, self.now_ns, shown
+
+    def advance(self, by_ns: int) -> None:
+        """Advance the time. Raises `LogicError` for a negative time, and `ScanTooLong` for a test that does not end."""
+        if by_ns < 0:
+            raise values.LogicError("ADVANCE_TIME goes back", expected="T#0s or more", got=values.duration_text(by_ns, "T"))
+        self._advances += 1
+        if self._advances > MAX_ADVANCES:
+            raise ScanTooLong(f"more than {MAX_ADVANCES:,} calls of ADVANCE_TIME in one test")
+        self.now_ns += by_ns
+        self.first_scan = False
+        self.left = MAX_STEPS
+
+
+def run_tests(unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: Recorded) -> Iterator[TestResult]:
+    """Run each test. `recorded` collects what the probes of all of them record."""
+    for test in tests:
+        yield _run(unit, test, recorded)
+
+
+def _run(unit: CompiledUnit, test: TranslatedTest, recorded: Recorded) -> TestResult:
+    context = _TestContext(recorded)
+    error, place = "", ("", 0)
+    try:
+        resource = Resource(unit, context)
+        resource.space[f"P_{test.program}"]().execute()
+    except (FieldtwinError, ArithmeticError, ValueError, RecursionError) as e:
+        error, place = _reason(e), _place(e, unit, test)
+    found = [_result(number, text, context, unit) for number, text in test.assertions.items()]
+    return TestResult(test, tuple(found), context.now_ns, error, place)
+
+
+def _result(number: int, text: AssertionText, context: _TestContext, unit: CompiledUnit) -> AssertionResult:
+    count = context.counts.get(number, _Count())
+    if not count.failed:
+        return AssertionResult(text, count.executed, False, count.t_ns)
+    shown = [_text(kind, value) for kind, value in zip(unit.recorded[number], count.values, strict=True)]
+    expected = text.expected + (shown[1] if len(shown) > 1 else "")
+    if len(shown) > 2:
+        expected += f" within {shown[2]}"
+    return AssertionResult(text, count.executed, True, count.t_ns, expected, shown[0])
+
+
+def _text(kind: ty.Type, value: Any) -> str:
+    """Return a value as in the source."""
+    if isinstance(value, bool):
+        return str(value).upper()
+    if ty.is_kind(ty.plain(kind), "duration"):
+        return values.duration_text(value, "T")
+    found = shown_value(kind, value)
+    return values.real_text(found, 12) if isinstance(found, float) else str(found)
+
+
+def _reason(error: BaseException) -> str:
+    if not isinstance(error, FieldtwinError):
+        return f"{type(error).__name__}: {error}"
+    more = "".join(f"; {name} {text}" for name, text in (("expected", error.expected), ("got", error.got)) if text)
+    return f"{error.message}{more}"
+
+
+def _place(error: BaseException, unit: CompiledUnit, test: TranslatedTest) -> tuple[str, int]:
+    """Return the innermost line of the source in which the error occurred; without one, that of the test."""
+    found = test.pos.path, test.pos.line
+    frames = error.__traceback__
+    while frames is not None:
+        path = frames.tb_frame.f_code.co_filename
+        if path in unit.files:
+            found = path, frames.tb_lineno
+        frames = frames.tb_next
+    return found
+

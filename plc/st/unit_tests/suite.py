@@ -1,0 +1,70 @@
+"""Read and compile a file of unit tests with the declarations that its tests use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.source_files import SUFFIXES, is_test_file, source_files
+from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
+from fieldtwin.plc.st.coverage.places import Place
+from fieldtwin.plc.st.coverage.probes import Probes
+from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.project import read_with
+from fieldtwin.plc.st.unit_tests.blocks import programs_as_blocks
+from fieldtwin.plc.st.unit_tests.run import Recorded, TestResult, run_tests
+from fieldtwin.plc.st.unit_tests.translate import TranslatedTest, tests_as_programs
+
+
+@dataclass
+class Suite:
+    """The tests of a file, compiled."""
+
+    path: Path
+    unit: CompiledUnit
+    tests: list[TranslatedTest]
+    _probes: Probes
+    _unused: Probes
+    """The probes of the POUs that no test uses: their places count as not executed."""
+    _recorded: Recorded
+
+    def run(self) -> Iterator[TestResult]:
+        """Run each test."""
+        yield from run_tests(self.unit, self.tests, self._recorded)
+
+    def coverage(self) -> dict[Place, bool]:
+        """Return each place of the tested files, and whether a test has executed it."""
+        return {
+            **self._unused.result(set(), {}),
+            **self._probes.result(self._recorded.executed, self.unit.probed),
+        }
+
+
+def load_suite(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> Suite:
+    """Read a file of tests. They may use the declarations of the other files in its folder, and of `libraries`.
+
+    Raises `FileInvalid` for the first error, with the others.
+    """
+    beside = tuple(_beside(path))
+    unit, others = read_with(path, beside, libraries, dialect, programs_as_blocks)
+    if not unit.tests:
+        raise FileInvalid("no test in this file", path=str(path), expected="TEST 'name' ... END_TEST")
+    probes, unused = Probes(), Probes()
+    files = [str(path), *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))]
+    libraries_files = {str(file) for library in libraries for file in source_files(library)} - set(map(str, beside))
+    for other in others:
+        unused.insert(other, [*files, *libraries_files])
+    unit, tests = tests_as_programs(probes.insert(unit, [*files, *libraries_files]))
+    used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
+    compiled = compile_unit(unit, str(path), tuple(dict.fromkeys((str(path), *sorted(used)))), dialect)
+    return Suite(path, compiled, tests, probes, unused, Recorded())
+
+
+def _beside(path: Path) -> Iterator[Path]:
+    """Return the other source files in the folder of `path`, sorted."""
+    for file in sorted(path.parent.iterdir()):
+        if file.suffix.lower() in SUFFIXES and file.is_file() and file.name != path.name and file.name[0] != ".":
+            yield file
+

@@ -1,0 +1,163 @@
+"""Translate TEST blocks into programs of the tree: assertions and the advance of time become statements of their own.
+
+A test calls ASSERT_TRUE(IN), ASSERT_FALSE(IN), ASSERT_EQ, ASSERT_NE, ASSERT_LT, ASSERT_LE, ASSERT_GT, ASSERT_GE
+(IN, EXPECTED), ASSERT_NEAR(IN, EXPECTED, TOLERANCE), each with an optional text MESSAGE, and ADVANCE_TIME(BY).
+Names that begin with 0 belong to this translation; no source can contain them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import with_parts
+from fieldtwin.plc.st.syntax.written import text_of
+
+_COMPARISONS = {
+    "ASSERT_EQ": "=", "ASSERT_NE": "<>", "ASSERT_LT": "<", "ASSERT_LE": "<=", "ASSERT_GT": ">", "ASSERT_GE": ">=",
+}  # fmt: skip
+_PARAMETERS = {
+    "ASSERT_TRUE": ("IN",),
+    "ASSERT_FALSE": ("IN",),
+    **dict.fromkeys(_COMPARISONS, ("IN", "EXPECTED")),
+    "ASSERT_NEAR": ("IN", "EXPECTED", "TOLERANCE"),
+    "ADVANCE_TIME": ("BY",),
+}
+_EXPECTED = {
+    "ASSERT_TRUE": "TRUE", "ASSERT_FALSE": "FALSE", "ASSERT_EQ": "", "ASSERT_NE": "not ", "ASSERT_LT": "less than ",
+    "ASSERT_LE": "at most ", "ASSERT_GT": "more than ", "ASSERT_GE": "at least ", "ASSERT_NEAR": "",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class AssertionText:
+    """What a report says about an assertion: its place and its text as in the source, the words before the expected value, and
+    the MESSAGE of the user.
+    """
+
+    pos: t.Pos
+    text: str
+    expected: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class TranslatedTest:
+    """A test as the PROGRAM `program` of a unit, with its assertions by their number."""
+
+    pos: t.Pos
+    name: str
+    program: str
+    assertions: dict[int, AssertionText]
+
+
+def tests_as_programs(unit: t.SourceUnit) -> tuple[t.SourceUnit, list[TranslatedTest]]:
+    """Return `unit` with a PROGRAM for each of its tests, which are removed, and the tests.
+
+    Raises `FileInvalid` with line and column for the first error in a call of an assertion, and with the others.
+    """
+    errors = ErrorCollector()
+    tests: list[TranslatedTest] = []
+    programs: list[t.Pou] = []
+    numbers = iter(range(1, 1_000_000))
+    seen: dict[str, t.Pos] = {}
+    for n, test in enumerate(unit.tests):
+        if test.name in seen:
+            errors.add(_error(test.pos, f"a second test with the name {test.name!r}", expected="different names"))
+        seen[test.name] = test.pos
+        found = TranslatedTest(test.pos, test.name, f"0test_{n}", {})
+        body = _Translation(found, numbers, errors).statements(test.body)
+        programs.append(t.Pou(test.pos, "PROGRAM", found.program, None, _variables(test, errors), body))
+        tests.append(found)
+    errors.raise_all()
+    return replace(unit, pous=(*unit.pous, *programs), tests=()), tests
+
+
+def _variables(test: t.Test, errors: ErrorCollector) -> tuple[t.VarBlock, ...]:
+    for block in test.blocks:
+        if block.kind not in ("VAR", "VAR_TEMP", "VAR_EXTERNAL"):
+            errors.add(_error(block.pos, "the variables of a test", expected="VAR or VAR_EXTERNAL", got=block.kind))
+    return test.blocks
+
+
+def _error(pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
+    return FileInvalid(
+        message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint
+    )
+
+
+class _Translation:
+    """The translation of the statements of one test."""
+
+    def __init__(self, test: TranslatedTest, numbers: Iterator[int], errors: ErrorCollector) -> None:
+        self._test, self._numbers, self._errors = test, numbers, errors
+
+    def statements(self, node: Any) -> Any:
+        """Return a part of a body with assertions and advances as statements."""
+        if not isinstance(node, tuple):
+            return with_parts(node, self.statements)
+        found: list[Any] = []
+        for part in node:
+            if isinstance(part, t.CallStatement) and self._is_of_tests(part.call):
+                try:
+                    found += self._statement(part.call)
+                except FileInvalid as e:
+                    self._errors.add(e)
+            else:
+                found.append(self.statements(part))
+        return tuple(found)
+
+    def _is_of_tests(self, call: t.Call) -> bool:
+        name = call.ref.name.upper()
+        return not call.ref.selectors and (name in _PARAMETERS or name.startswith("ASSERT_"))
+
+    def _statement(self, call: t.Call) -> list[t.Statement]:
+        name = call.ref.name.upper()
+        if name not in _PARAMETERS:
+            known = list(_PARAMETERS)
+            raise _error(call.pos, f"{call.ref.name} is no assertion", ", ".join(known), hint=did_you_mean(name, known))
+        given, message = self._arguments(call, name)
+        if name == "ADVANCE_TIME":
+            return [t.Advance(call.pos, given[0])]
+        number = next(self._numbers)
+        held = [t.Hold(value.pos, f"0value_{number}_{n}", value) for n, value in enumerate(given)]
+        shown: list[t.Expr] = [t.Ref(hold.pos, hold.name) for hold in held]
+        said = t.Call(call.pos, call.ref, tuple(t.Argument(one.pos, "", one) for one in given))
+        text = AssertionText(call.pos, text_of(said), _EXPECTED[name], message)
+        self._test.assertions[number] = text
+        return [*held, t.Assertion(call.pos, number, _condition(name, call.pos, shown), tuple(shown))]
+
+    def _arguments(self, call: t.Call, name: str) -> tuple[list[t.Expr], str]:
+        """Return the arguments in the order of the parameters, and the text of MESSAGE, which comes last."""
+        names = (*_PARAMETERS[name], "MESSAGE") if name != "ADVANCE_TIME" else _PARAMETERS[name]
+        found: dict[str, t.Expr] = {}
+        for n, argument in enumerate(call.arguments):
+            key = argument.name.upper() or (names[n] if n < len(names) else "")
+            if key not in names or key in found or argument.value is None:
+                got = argument.name or f"{len(call.arguments)} arguments"
+                raise _error(argument.pos, f"the arguments of {name}", ", ".join(names), got)
+            found[key] = argument.value
+        missing = [one for one in _PARAMETERS[name] if one not in found]
+        if missing:
+            raise _error(call.pos, f"{name} lacks {', '.join(missing)}", expected=", ".join(names))
+        message = found.pop("MESSAGE", None)
+        if message is not None and not (isinstance(message, t.Literal) and message.kind == "STRING_LITERAL"):
+            raise _error(message.pos, f"MESSAGE of {name}", expected="a text in quotation marks", got=text_of(message))
+        text = message.text[1:-1] if isinstance(message, t.Literal) else ""
+        return [found[one] for one in _PARAMETERS[name]], text
+
+
+def _condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr:
+    if name == "ASSERT_TRUE":
+        return values[0]
+    if name == "ASSERT_FALSE":
+        return t.Unary(pos, "NOT", values[0])
+    if name in _COMPARISONS:
+        return t.Binary(pos, _COMPARISONS[name], values[0], values[1])
+    difference = t.Argument(pos, "", t.Binary(pos, "-", values[0], values[1]))
+    return t.Binary(pos, "<=", t.Call(pos, t.Ref(pos, "ABS"), (difference,)), values[2])

@@ -13,7 +13,7 @@ SUFFIXES = (".st", ".iecst", ".exp", ".xml", ".tcpou", ".tcdut", ".tcgvl")
 """The file names' endings in lower case: Structured Text (as written here, and by other tools), PLCopen XML, TwinCAT."""
 
 TEST_SUFFIX = ".test.st"
-"""The end of the names of files with unit tests (`fieldtwin.plc.st.unit_tests`). The source of a program does not include them."""
+"""The end of the names of files with unit tests (`fieldtwin.plc.st.unit_tests`), which the source of a program excludes."""
 
 
 def is_test_file(path: Path) -> bool:

@@ -137,7 +137,9 @@ def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
 def _elements(kind: ty.Array, value: list[Any]) -> str:
     count = ty.elements(ty.Array(kind.ranges, ty.INT))
     chosen = product(*(range(low, high + 1) for low, high in kind.ranges))
-    texts = [_text(shown_value(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)]
+    texts = [
+        _text(shown_value(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)
+    ]
     return f"[{', '.join(texts)}{f', ... {count} elements' if count > SHOWN_ELEMENTS else ''}]"
 
 

@@ -6,7 +6,6 @@ import json
 import shlex
 import shutil
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,6 +40,7 @@ from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.source_files import TEST_SUFFIX
 from fieldtwin.scenarios.language.file_name import SUFFIX
 
@@ -239,7 +239,7 @@ def command(
     if covered is not None and units.coverage is not None:
         from fieldtwin.reports.cobertura import write_cobertura
 
-        write_cobertura(covered, units.coverage, time.time_ns() // NS_PER_MS)
+        write_cobertura(covered, units.coverage, WallClock().utc_ns() // NS_PER_MS)
     if junit.junit is not None:
         from fieldtwin.reports.junit import Flavour, write_junit
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from fieldtwin.cli.option_groups import option
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.source_files import SUFFIXES, is_test_file
 from fieldtwin.plc.st.dialects import DIALECTS, dialect_of
 
@@ -77,11 +77,11 @@ def run_suites(suites: list[Suite], options: UnitTestOptions) -> Iterator[Scenar
     """Run the tests of all files, one after the other."""
     for suite in suites:
         reproduce = shlex.join(["fieldtwin", "test", str(suite.path), *options.words()])
-        began = time.perf_counter()
+        began_ns = WallClock().monotonic_ns()
         for result in suite.run():
-            now = time.perf_counter()
-            yield _as_result(result, suite.path, reproduce, now - began)
-            began = now
+            now_ns = WallClock().monotonic_ns()
+            yield _as_result(result, suite.path, reproduce, round((now_ns - began_ns) / NS_PER_S, 3))
+            began_ns = now_ns
 
 
 def coverage_of(suites: list[Suite]) -> Coverage | None:

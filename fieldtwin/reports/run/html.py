@@ -18,8 +18,8 @@ from fieldtwin.reports.file import put
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import cut, fill
 from fieldtwin.reports.run.coverage_tables import coverage_section
-from fieldtwin.reports.run.logic import logic_section
 from fieldtwin.reports.run.diagram import timing_diagram
+from fieldtwin.reports.run.logic import logic_section
 from fieldtwin.reports.run.requirements import requirement_matrix
 from fieldtwin.reports.run.window import MOST_FRAMES, FrameLine, Study, Window
 from fieldtwin.results.model import AccessCounts, CheckResult, Report, ScenarioResult, SystemKey, Verdict, key_of

@@ -56,7 +56,8 @@ class Probes:
         chart = pou.chart
         if chart is not None:
             chart = replace(chart, transitions=tuple(self._transition(pou, one) for one in chart.transitions))
-        return replace(with_parts(pou, body.changed, but="chart"), chart=chart)
+        changed: t.Pou = with_parts(pou, body.changed, but="chart")
+        return replace(changed, chart=chart)
 
     def _transition(self, pou: t.Pou, one: t.Transition) -> t.Transition:
         name = f"{', '.join(one.sources)} -> {', '.join(one.targets)}"

@@ -17,7 +17,9 @@ from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 def programs_as_blocks(unit: t.SourceUnit) -> t.SourceUnit:
     """Return `unit` with a function block in place of each PROGRAM. One with MESSAGES, which a test cannot call, is missing."""
     unit = without_addresses(unit)
-    missing = {pou.name: reason for pou in unit.pous if pou.kind == "PROGRAM" and (reason := _no_block(pou)) is not None}
+    missing = {
+        pou.name: reason for pou in unit.pous if pou.kind == "PROGRAM" and (reason := _no_block(pou)) is not None
+    }
     pous = (pou for pou in unit.pous if pou.name not in missing)
     return replace(
         unit,
@@ -41,8 +43,11 @@ def _block(program: t.Pou) -> t.Pou:
     asked = [name for name in inputs if any(_asks(node, name) for node in nodes((program.body, program.actions)))]
     blocks = [_visible(block) for block in program.blocks]
     if asked:
-        blocks.append(t.VarBlock(program.pos, "VAR_INPUT", frozenset(), tuple(_quality(inputs[name]) for name in asked)))
-    return replace(_reading(program, set(asked)), kind="FUNCTION_BLOCK", blocks=tuple(blocks))
+        blocks.append(
+            t.VarBlock(program.pos, "VAR_INPUT", frozenset(), tuple(_quality(inputs[name]) for name in asked))
+        )
+    changed: t.Pou = _reading(program, set(asked))
+    return replace(changed, kind="FUNCTION_BLOCK", blocks=tuple(blocks))
 
 
 def _visible(block: t.VarBlock) -> t.VarBlock:

@@ -66,7 +66,7 @@ class _Count:
 
 @dataclass
 class Recorded:
-    """What the probes for coverage recorded: numbers, and pairs of a number and a value."""
+    """The records of the probes for coverage: numbers, and pairs of a number and a value."""
 
     executed: set[Any] = field(default_factory=set)
 
@@ -93,7 +93,9 @@ class _TestContext(Context):
     def advance(self, by_ns: int) -> None:
         """Advance the time. Raises `LogicError` for a negative time, and `ScanTooLong` for a test that does not end."""
         if by_ns < 0:
-            raise values.LogicError("ADVANCE_TIME goes back", expected="T#0s or more", got=values.duration_text(by_ns, "T"))
+            raise values.LogicError(
+                "ADVANCE_TIME goes back", expected="T#0s or more", got=values.duration_text(by_ns, "T")
+            )
         self._advances += 1
         if self._advances > MAX_ADVANCES:
             raise ScanTooLong(f"more than {MAX_ADVANCES:,} calls of ADVANCE_TIME in one test")
@@ -158,4 +160,3 @@ def _place(error: BaseException, unit: CompiledUnit, test: TranslatedTest) -> tu
             found = path, frames.tb_lineno
         frames = frames.tb_next
     return found
-

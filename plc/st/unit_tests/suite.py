@@ -67,4 +67,3 @@ def _beside(path: Path) -> Iterator[Path]:
     for file in sorted(path.parent.iterdir()):
         if file.suffix.lower() in SUFFIXES and file.is_file() and file.name != path.name and file.name[0] != ".":
             yield file
-

@@ -1,4 +1,4 @@
-"""Translate TEST blocks into programs of the tree: assertions and the advance of time become statements of their own.
+"""Translate TEST blocks into programs of the tree: an assertion, and an advance of the time, is a node.
 
 A test calls ASSERT_TRUE(IN), ASSERT_FALSE(IN), ASSERT_EQ, ASSERT_NE, ASSERT_LT, ASSERT_LE, ASSERT_GT, ASSERT_GE
 (IN, EXPECTED), ASSERT_NEAR(IN, EXPECTED, TOLERANCE), each with an optional text MESSAGE, and ADVANCE_TIME(BY).
@@ -36,7 +36,7 @@ _EXPECTED = {
 
 @dataclass(frozen=True, slots=True)
 class AssertionText:
-    """What a report says about an assertion: its place and its text as in the source, the words before the expected value, and
+    """The text of an assertion in a report: its place and its text as in the source, the words before the expected value, and
     the MESSAGE of the user.
     """
 
@@ -86,9 +86,7 @@ def _variables(test: t.Test, errors: ErrorCollector) -> tuple[t.VarBlock, ...]:
 
 
 def _error(pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
-    return FileInvalid(
-        message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint
-    )
+    return FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint)
 
 
 class _Translation:

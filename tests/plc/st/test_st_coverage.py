@@ -54,7 +54,10 @@ def test_statements_branches_and_transitions_are_counted(tmp_path: Path) -> None
     # IF bad: both; CASE: IDLE and ELSE of three; IF go: THEN of two; IF NOT go: none of two
     assert found.count(Kind.BRANCH) == (5, 9)
     assert found.count(Kind.TRANSITION) == (2, 4)
-    assert [place.name for place in found.missed(Kind.TRANSITION)] == ["Machine.state IDLE -> FAULT", "Machine.state RUN -> IDLE"]
+    assert [place.name for place in found.missed(Kind.TRANSITION)] == [
+        "Machine.state IDLE -> FAULT",
+        "Machine.state RUN -> IDLE",
+    ]
 
 
 def test_a_transition_of_an_assignment_outside_of_the_case_counts_by_its_source(tmp_path: Path) -> None:
@@ -86,7 +89,8 @@ def test_probes_do_not_change_what_a_program_does(tmp_path: Path) -> None:
     (tmp_path / "machine.st").write_text(loops)
     (tmp_path / "machine.test.st").write_text("TEST 'x' ASSERT_EQ(Sum(9), 1212); END_TEST")  # 1+2+4+5, 2*100, 1000
     (result,) = load_suite(tmp_path / "machine.test.st").run()
-    assert not result.failed and not result.error
+    assert not result.failed
+    assert not result.error
 
 
 def test_coverages_of_two_files_add_up(tmp_path: Path) -> None:

@@ -122,7 +122,17 @@ class _Unit:
         code = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs).code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
-            self.path, self.files, code, text, tuple(programs), self.blocks.kept, kinds, warnings, missing, recorded, probed
+            self.path,
+            self.files,
+            code,
+            text,
+            tuple(programs),
+            self.blocks.kept,
+            kinds,
+            warnings,
+            missing,
+            recorded,
+            probed,
         )
 
     def _kinds(self) -> tuple[str, ...]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fieldtwin.plc.st.compiler.located import without_addresses
+from fieldtwin.plc.st.compiler.located import KINDS
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import area_of
 from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
 
 def programs_as_blocks(unit: t.SourceUnit) -> t.SourceUnit:
     """Return `unit` with a function block in place of each PROGRAM. One with MESSAGES, which a test cannot call, is missing."""
-    unit = without_addresses(unit)
     missing = {
         pou.name: reason for pou in unit.pous if pou.kind == "PROGRAM" and (reason := _no_block(pou)) is not None
     }
@@ -41,13 +41,25 @@ def _no_block(program: t.Pou) -> t.Missing | None:
 def _block(program: t.Pou) -> t.Pou:
     inputs = {v.name.lower(): v for b in program.blocks if b.kind == "VAR_INPUT" for v in b.variables}
     asked = [name for name in inputs if any(_asks(node, name) for node in nodes((program.body, program.actions)))]
-    blocks = [_visible(block) for block in program.blocks]
+    blocks = [_visible(part) for block in program.blocks for part in _unlocated(block)]
     if asked:
         blocks.append(
             t.VarBlock(program.pos, "VAR_INPUT", frozenset(), tuple(_quality(inputs[name]) for name in asked))
         )
     changed: t.Pou = _reading(program, set(asked))
     return replace(changed, kind="FUNCTION_BLOCK", blocks=tuple(blocks))
+
+
+def _unlocated(block: t.VarBlock) -> list[t.VarBlock]:
+    """Return a block with each variable that has an address in a separate block: %I as an input, %Q as an output."""
+    if not any(v.location for v in block.variables):
+        return [block]
+    return [
+        replace(
+            block, kind=KINDS[area_of(v.location)] if v.location else block.kind, variables=(replace(v, location=""),)
+        )
+        for v in block.variables
+    ]
 
 
 def _visible(block: t.VarBlock) -> t.VarBlock:

@@ -33,8 +33,6 @@ class VirtualClock:
             return
         await self._loop.sleeper(deadline_ns)
 
-    async def sleep_cycle_ns(self, deadline_ns: int, cycle: Cycle) -> None:
-        """Sleep until the next run of `cycle`; see `fieldtwin.gateway.core.concurrency.cycle`."""
-        if deadline_ns <= self._loop.now_ns:
-            return
-        await self._loop.cycle_sleeper(deadline_ns, cycle)
+    async def run_cycle(self, cycle: Cycle) -> None:
+        """Run `cycle` at its deadlines; see `fieldtwin.gateway.core.concurrency.cycle`."""
+        await self._loop.run_cycle(cycle)

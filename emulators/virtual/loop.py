@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
-from fieldtwin.emulators.virtual.cycles import CycleSleep, skip_runs
+from fieldtwin.emulators.virtual.cycles import CycleCall, skip_runs
 from fieldtwin.emulators.virtual.interrupts import Interrupts
 from fieldtwin.emulators.virtual.scheduled_call import ScheduledCall
 from fieldtwin.emulators.virtual.waiting import waits_at
@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.errors import Bug
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-Due = ScheduledCall | CycleSleep | asyncio.Future[None]
+Due = ScheduledCall | CycleCall | asyncio.Future[None]
 
 START_NS = 1_000 * NS_PER_S
 """The start of monotonic time. It is not 0, because 0 means "never" in many places."""
@@ -70,7 +70,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.now_ns = start_ns
         self.callbacks = 0
         """The number of callbacks that have run."""
-        self._ready: deque[ScheduledCall] = deque()
+        self._ready: deque[ScheduledCall | CycleCall] = deque()
         self._timers: list[tuple[int, int, Due]] = []
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
@@ -107,7 +107,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     ) -> asyncio.TimerHandle:
         """Schedule a callback as `call_at` does, with a time in ns. A time in the past is due now, after the ready callbacks."""
         call = ScheduledCall(callback, args, copy_context() if context is None else context, when_ns / NS_PER_S)
-        self._set_timer(when_ns, call)
+        self.set_timer(when_ns, call)
         return call  # type: ignore[return-value]  # it has the methods of a timer handle
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
@@ -116,14 +116,20 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         With `call_at_ns` instead of a future among the timers, a virtual run takes 2 to 6 % longer.
         """
         future: asyncio.Future[None] = asyncio.Future(loop=self)
-        self._set_timer(when_ns, future)
+        self.set_timer(when_ns, future)
         return future
 
-    def cycle_sleeper(self, when_ns: int, cycle: Cycle) -> asyncio.Future[None]:
-        """Return a future that is done at the next run of `cycle`. That is `when_ns`, unless runs are skipped."""
-        future: asyncio.Future[None] = asyncio.Future(loop=self)
-        self._set_timer(when_ns, CycleSleep(future, cycle))
-        return future
+    async def run_cycle(self, cycle: Cycle) -> None:
+        """Run `cycle` at its deadlines until it no longer runs, and skip runs that would change nothing. The errors of a run are
+        raised.
+        """
+        ended: asyncio.Future[None] = asyncio.Future(loop=self)
+        call = CycleCall(self, cycle, ended)
+        if cycle.deadline_ns > self.now_ns:
+            self.set_timer(cycle.deadline_ns, call)
+        else:
+            call.run()
+        await ended
 
     def timer(self, delay_s: float) -> asyncio.Future[None]:
         """Return a future that is done after a delay in seconds, see `fieldtwin.gateway.core.concurrency.timeout`.
@@ -132,7 +138,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
-    def _set_timer(self, when_ns: int, due: Due) -> None:
+    def set_timer(self, when_ns: int, due: Due) -> None:
+        """Set the timer of a call or a future."""
         self._sequence += 1
         heappush(self._timers, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, due))
         if self._sequence >= self._compact_at:
@@ -230,19 +237,19 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _advance(self) -> None:
         timers, ready = self._timers, self._ready
-        if timers and type(timers[0][2]) is CycleSleep:
-            skip_runs(timers)
+        if timers and type(timers[0][2]) is CycleCall:
+            self._sequence = skip_runs(timers, self._sequence)
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
-            if isinstance(due, ScheduledCall):
-                if due.is_cancelled:
+            if isinstance(due, asyncio.Future):
+                if due.done():
                     continue
-                ready.append(due)
-            elif due.done():
+                due.set_result(None)
+            elif due.is_cancelled:
                 continue
             else:
-                due.set_result(None)
+                ready.append(due)
             self.now_ns = now_ns = when_ns
         if now_ns is None:
             raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
@@ -362,7 +369,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
 def _is_over(due: Due) -> bool:
     """Return whether the timer is no longer needed."""
-    return due.is_cancelled if isinstance(due, ScheduledCall) else due.done()
+    return due.done() if isinstance(due, asyncio.Future) else due.is_cancelled
 
 
 def culprit() -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from fieldtwin.gateway.core.concurrency.cycle import sleep_cycle
+from fieldtwin.gateway.core.concurrency.cycle import run_cycle
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector, Listen
@@ -148,8 +148,9 @@ class Gateway:
         self.plc_alive = False
         self.plc_losses = 0
         self.period_ns = config.cycle_ms * NS_PER_MS
-        self._next_ns = 0
-        """The time of the next exchange with the PLC."""
+        self.running = True
+        self.deadline_ns = 0
+        """The time (monotonic ns) of the next exchange with the PLC."""
         self._stopping = False
 
     def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
@@ -255,21 +256,20 @@ class Gateway:
         async with Nursery() as nursery:
             for name, bus in self.buses.items():
                 nursery.start(bus.run(), f"bus {name}")
-            nursery.start(self._cycle(), "exchange with the PLC")
+            self.deadline_ns = self.clock.monotonic_ns()
+            nursery.start(run_cycle(self.clock, self), "exchange with the PLC")
             for server in self.servers:
                 nursery.start(server.run(), f"server {server.config.name}")
             for bridge in self.bridges:
                 nursery.start(bridge.run(), f"bridge {bridge.config.name}")
             await nursery.wait()
 
-    async def _cycle(self) -> None:
-        self._next_ns = self.clock.monotonic_ns()
-        while True:
-            now_ns = self.clock.monotonic_ns()
-            self.tick(now_ns)
-            # missed cycles are skipped, and not made up for in a burst
-            self._next_ns = max(self._next_ns + self.period_ns, now_ns)
-            await sleep_cycle(self.clock, self._next_ns, self)
+    def run_once(self) -> None:
+        """Exchange data with the PLC now, and set the time of the next exchange."""
+        now_ns = self.clock.monotonic_ns()
+        self.tick(now_ns)
+        # missed cycles are skipped, and not made up for in a burst
+        self.deadline_ns = max(self.deadline_ns + self.period_ns, now_ns)
 
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether every `tick` before `until_ns` would only repeat the last one, see `Cycle`."""
@@ -287,8 +287,11 @@ class Gateway:
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count ticks that do not take place, see `Cycle`."""
-        self._next_ns += count * self.period_ns
+        self.deadline_ns += count * self.period_ns
         self.exchange.skip(count, last_ns)
+        self.outputs.now_ns = last_ns
+        for pump in self.pumps:
+            pump.now_ns = last_ns
 
     def _undelivered(self) -> dict[str, int]:
         """Return, by tag, how many messages of the PLC have not reached their mailbox or the exchange log."""

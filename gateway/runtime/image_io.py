@@ -73,10 +73,7 @@ class ImageExchange:
 
     def exchange(self, now_ns: int) -> None:
         """Read the PLC's outputs, then publish the inputs."""
-        snapshot = self._reader.snapshot()
-        if snapshot.counter != self.plc_counter:
-            self.plc_counter = snapshot.counter
-            self.plc_heard_ns = snapshot.t_ns
+        snapshot = self._hear()
         self.plc_stopped = snapshot.stopped
         self.new_messages = snapshot.messages
         if snapshot.counter and not self._seen_before(snapshot):
@@ -85,6 +82,14 @@ class ImageExchange:
                 value = self.outputs[consumed_name(tag)].value
                 self._consumed[tag] = int(value) if value is not None else 0
         self._publish(now_ns)
+
+    def _hear(self) -> Snapshot:
+        """Return the PLC's last publication, and note its heartbeat."""
+        snapshot = self._reader.snapshot()
+        if snapshot.counter != self.plc_counter:
+            self.plc_counter = snapshot.counter
+            self.plc_heard_ns = snapshot.t_ns
+        return snapshot
 
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether each exchange before `until_ns` would read and publish what the last one did, apart from counters and
@@ -101,6 +106,7 @@ class ImageExchange:
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count exchanges that would have repeated the last one, and publish the last of them, which was at `last_ns`."""
+        self._seen = self._hear()
         times_ns = self._columns.times_ns
         for at, _ in self._taken:
             times_ns[at] = last_ns

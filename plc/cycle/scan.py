@@ -202,10 +202,8 @@ class Scan:
         snapshot = self._reader.snapshot()
         forced = bool(forces.inputs or forces.outputs)
         if settling.settled and snapshot.values is self._columns and not forced and self._is_alive(snapshot, now_ns):
-            self._snapshot, self.gateway_alive = snapshot, True
-            for item in self._held:
-                if snapshot.qualities[item.index] != _BAD:
-                    item.held = snapshot.values[item.index], snapshot.time_ns(item.index)
+            self._keep(snapshot)
+            self.gateway_alive = True
             return True
         self._take(snapshot, now_ns)
         if not settling.possible:
@@ -237,7 +235,15 @@ class Scan:
         """Count scans that do not take place, see `Cycle`."""
         self.number += count
         self.skipped += count
+        self._keep(self._reader.snapshot())
         self.output_image.skip(count, last_ns)
+
+    def _keep(self, snapshot: Snapshot) -> None:
+        """Keep a snapshot that changes no input of the logic."""
+        self._snapshot = snapshot
+        for item in self._held:
+            if snapshot.qualities[item.index] != _BAD:
+                item.held = snapshot.values[item.index], snapshot.time_ns(item.index)
 
     def _execute_started(self, now_ns: int) -> None:
         """Execute a scan while some programs have not started, or just have started. Only started programs run."""

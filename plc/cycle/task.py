@@ -24,7 +24,7 @@ from enum import Enum
 from typing import Any, Protocol
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
-from fieldtwin.gateway.core.concurrency.cycle import Cycle, sleep_cycle
+from fieldtwin.gateway.core.concurrency.cycle import Cycle, run_cycle
 from fieldtwin.gateway.core.errors import Bug, CheckFailed, FieldtwinError
 from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
@@ -58,15 +58,7 @@ class Guard(Protocol):
 class Driven(Cycle, Protocol):
     """The interface through which a clock runs one task (`CyclicTask`) or several (`fieldtwin.plc.runtime.runner.TaskRunner`)."""
 
-    @property
-    def running(self) -> bool: ...
-
-    @property
-    def deadline_ns(self) -> int: ...
-
     def start(self) -> None: ...
-
-    def run_once(self) -> None: ...
 
     def stop(self) -> None: ...
 
@@ -204,7 +196,9 @@ class CyclicTask:
     def skip(self, count: int, last_ns: int) -> None:
         """Count scans that do not take place, see `Cycle`. They would have been punctual, and would have taken no time."""
         self._scan.skip(count, last_ns)
+        self._overruns_in_a_row = 0
         self.scans += count
+        self.ended_ns = last_ns
         self.deadline_ns += count * self._cycle_ns
         self.lateness.record(0, count)
         self.duration.record(0, count)
@@ -276,9 +270,6 @@ async def run_on_clock(task: Driven, clock: Clock) -> None:
     """
     task.start()
     try:
-        while task.running:
-            await sleep_cycle(clock, task.deadline_ns, task)
-            if task.running:
-                task.run_once()
+        await run_cycle(clock, task)
     finally:
         task.stop()

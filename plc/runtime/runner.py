@@ -251,6 +251,7 @@ class TaskRunner:
             len(self.entries) == 1
             and self._stopped is None
             and not self.starts.waiting
+            and not self._in_a_row
             and self.entries[0].task.repeats_until(until_ns)
         )
 

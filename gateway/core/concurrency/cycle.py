@@ -1,8 +1,8 @@
-"""Wait for the next run of a cyclic task, on a clock that may skip runs which would change nothing.
+"""Run a cyclic task on a clock that may skip runs which would change nothing.
 
 In virtual time most runs of the gateway's exchange with the PLC, and most scans, only repeat the one before. A clock for
-simulated time knows when the next other event is due, so it may offer ``sleep_cycle_ns(deadline_ns, cycle)`` and count such
-runs in place of running them. On every other clock each run takes place.
+simulated time may offer ``run_cycle(cycle)``, which counts such runs in place of running them. On every other clock each run
+takes place.
 """
 
 from __future__ import annotations
@@ -21,6 +21,20 @@ class Cycle(Protocol):
         """Return the time between two runs in ns."""
         ...
 
+    @property
+    def running(self) -> bool:
+        """Return whether there is a further run."""
+        ...
+
+    @property
+    def deadline_ns(self) -> int:
+        """Return the time (monotonic ns) of the next run, while `running`."""
+        ...
+
+    def run_once(self) -> None:
+        """Run once. Never waits."""
+        ...
+
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether all runs before `until_ns` would only repeat the last one, if nothing but cycles that also repeat runs
         until then. Counters and times are the only things that such runs change.
@@ -30,12 +44,18 @@ class Cycle(Protocol):
     def skip(self, count: int, last_ns: int) -> None:
         """Count `count` runs (at least 1) that do not take place; the last of them would have been at `last_ns`.
 
-        At least one run follows before anything else happens. Only counters, and what other cycles read, need to change.
+        Counters and times are then those that these runs would have left.
         """
         ...
 
 
-def sleep_cycle(clock: Clock, deadline_ns: int, cycle: Cycle) -> Awaitable[None]:
-    """Wait until the next run of `cycle`, which is at `deadline_ns` unless the clock skips runs."""
-    sleep: Callable[[int, Cycle], Awaitable[None]] | None = getattr(clock, "sleep_cycle_ns", None)
-    return clock.sleep_until_ns(deadline_ns) if sleep is None else sleep(deadline_ns, cycle)
+async def run_cycle(clock: Clock, cycle: Cycle) -> None:
+    """Run `cycle` at its deadlines until it no longer runs. The errors of a run are raised."""
+    by_clock: Callable[[Cycle], Awaitable[None]] | None = getattr(clock, "run_cycle", None)
+    if by_clock is not None:
+        await by_clock(cycle)
+        return
+    while cycle.running:
+        await clock.sleep_until_ns(cycle.deadline_ns)
+        if cycle.running:
+            cycle.run_once()

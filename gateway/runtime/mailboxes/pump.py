@@ -64,7 +64,7 @@ class MailboxPump:
         self._allow_writes = allow_writes
         self._lent = delegated
         self._sending = 0
-        self._next_ns = self._now_ns = 0
+        self._next_ns = self.now_ns = 0
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
@@ -118,7 +118,7 @@ class MailboxPump:
     ) -> None:
         if self._journal is not None:
             name = self.driver.config.name
-            self._journal.note(name, f"{name}.{tag}", value, cause, reason, by, self._now_ns, audit=audit)
+            self._journal.note(name, f"{name}.{tag}", value, cause, reason, by, self.now_ns, audit=audit)
 
     def _withhold(self) -> None:
         """Report the first message that waits on a read-only plant; it stays in the queue."""
@@ -132,7 +132,7 @@ class MailboxPump:
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next mailbox request. `all_consumed` says that the PLC has consumed all messages that were passed to it."""
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         self._keep(all_consumed)
         if not self.driver.to_acknowledge and not self.driver.consumer.queue:
             return

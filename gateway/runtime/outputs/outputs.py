@@ -55,7 +55,7 @@ class OutputWriter:
         self.safe_active = False
         self._tags = tags
         self._audit = audit
-        self._now_ns = 0
+        self.now_ns = 0
 
     def want(self, tag: str, value: float) -> None:
         """Take the PLC's command `value` for `tag`.
@@ -107,7 +107,7 @@ class OutputWriter:
             if output is not None:
                 self._note(output, value, cause, error, by)
             else:
-                self.journal.note(tag.partition(".")[0], tag, value, cause, str(error), by, self._now_ns)
+                self.journal.note(tag.partition(".")[0], tag, value, cause, str(error), by, self.now_ns)
             done(error)
         else:
             output.wanted, output.by, output.asked = value, by, done
@@ -122,7 +122,7 @@ class OutputWriter:
             return RefusalCause.NOT_WRITABLE, NotAllowed(f"{tag} is written with its group {group!r} only", where=where)
         if self.safe_active and output.safe is not None:
             return RefusalCause.NOT_NOW, EndpointBusy("the outputs are in their safe state", where=where)
-        if output.pending or self._now_ns < output.next_try_ns:
+        if output.pending or self.now_ns < output.next_try_ns:
             return RefusalCause.NOT_NOW, EndpointBusy("another write has just been made, or is under way", where=where)
         if not output.ready:
             wrong = output.driver.identity_error
@@ -196,7 +196,7 @@ class OutputWriter:
 
     def tick(self, now_ns: int) -> None:
         """Start the writes that are due now."""
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         due: list[tuple[Output, float]] = []
         unread: set[object] = set()
         """Outputs that wait for the first reading of their device, and their frames."""
@@ -243,14 +243,14 @@ class OutputWriter:
     def _waits_for_reading(self, output: Output) -> bool:
         """Return whether the first write has to wait until the device was read. A value that the device already holds
         is not written again."""
-        current = self._tags.current(output.tag, self._now_ns)
-        if waits_for_reading(output, current, self._now_ns):
+        current = self._tags.current(output.tag, self.now_ns)
+        if waits_for_reading(output, current, self.now_ns):
             return True
         output.untouched = False
         if output.wanted is not None and is_known(output, current) and self._may(output):
             sent = output.driver.command(output.local, output.wanted).data
             if int.from_bytes(current.raw) == int.from_bytes(sent):
-                output.held, output.held_since_ns, output.compared = output.wanted, self._now_ns, current
+                output.held, output.held_since_ns, output.compared = output.wanted, self.now_ns, current
         return False
 
     def _may(self, output: Output) -> bool:
@@ -274,7 +274,7 @@ class OutputWriter:
             for output in differing:
                 assert output.wanted is not None
                 self._wait(output, output.wanted)
-        elif self._now_ns >= max(o.next_try_ns for o in group.outputs):
+        elif self.now_ns >= max(o.next_try_ns for o in group.outputs):
             self._start_group(group)
 
     def _hold_back(self, group: OutputGroup, differing: list[Output], culprit: Output, why: str) -> None:
@@ -299,7 +299,7 @@ class OutputWriter:
                 self._refuse(output, wanted[output.tag], e)
                 return
         for output in group.outputs:
-            old = self._tags.current(output.tag, self._now_ns).value
+            old = self._tags.current(output.tag, self.now_ns).value
             if not self._on_record(output, output.driver.config.name, old, wanted[output.tag]):
                 return
         by = {output.tag: output.by for output in group.outputs}
@@ -318,8 +318,8 @@ class OutputWriter:
         """Note that the device accepts no write now. An output that has waited for `AWAY_AFTER_NS` is reported once."""
         since_ns = output.waits_since_ns
         if since_ns is None:
-            output.waits_since_ns = self._now_ns
-        elif since_ns != AWAY_REPORTED and self._now_ns - since_ns >= AWAY_AFTER_NS:
+            output.waits_since_ns = self.now_ns
+        elif since_ns != AWAY_REPORTED and self.now_ns - since_ns >= AWAY_AFTER_NS:
             output.waits_since_ns = AWAY_REPORTED
             config, wrong = output.driver.config, output.driver.identity_error
             if wrong:
@@ -356,7 +356,7 @@ class OutputWriter:
 
     def _start(self, output: Output, value: float) -> None:
         name = output.driver.config.name
-        old = self._tags.current(output.tag, self._now_ns).value
+        old = self._tags.current(output.tag, self.now_ns).value
         try:
             self._check(output)
             command = output.driver.command(output.local, value)
@@ -388,7 +388,7 @@ class OutputWriter:
     def _note(
         self, output: Output, value: object, cause: RefusalCause, error: FieldtwinError, by: str, *, audit: bool = True
     ) -> None:
-        name, old = output.driver.config.name, self._tags.current(output.tag, self._now_ns).value
+        name, old = output.driver.config.name, self._tags.current(output.tag, self.now_ns).value
         self.journal.note(
             name,
             output.tag,
@@ -396,7 +396,7 @@ class OutputWriter:
             cause,
             str(error),
             by,
-            self._now_ns,
+            self.now_ns,
             old=output.shown(old),
             audit=audit,
         )
@@ -417,7 +417,7 @@ class OutputWriter:
             )
         except Unreachable as e:
             self.failures += 1
-            output.next_try_ns = self._now_ns + RETRY_NS
+            output.next_try_ns = self.now_ns + RETRY_NS
             self._note(output, value, RefusalCause.FAILED, e, output.by, audit=False)
             return self.safe_active and output.asked is None
         return True
@@ -442,10 +442,10 @@ class OutputWriter:
     def _done(self, output: Output, value: float, by: str, error: FieldtwinError | None) -> None:
         """Handle the end of a write of `value` that `by` requested. A different source may command the output now."""
         output.pending = False
-        output.next_try_ns = self._now_ns + (MIN_SPACING_NS if error is None else RETRY_NS)
+        output.next_try_ns = self.now_ns + (MIN_SPACING_NS if error is None else RETRY_NS)
         if error is None:
             self.writes += 1
-            output.held, output.held_since_ns = value, self._now_ns
+            output.held, output.held_since_ns = value, self.now_ns
             if not output.read_back and output.tag in self._tags:
                 # the last reading is older than the write, and no newer reading will follow
                 self._tags.put_bad([output.tag], Reason.STALE)

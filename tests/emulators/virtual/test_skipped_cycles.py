@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.core.concurrency.cycle import sleep_cycle
+from fieldtwin.gateway.core.concurrency.cycle import run_cycle
 from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.run.virtual.fault_schedule import RandomFaults
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
@@ -24,34 +24,34 @@ class Counting:
 
     name: str
     log: list[tuple[str, int, int]]
-    period_ns: int = 10 * MS
+    period_ns: int
+    deadline_ns: int
+    running: bool = True
     news: int = 0
     seen: int = 0
     runs: int = 0
     skipped: int = 0
-    next_ns: int = 0
     read: int = 0
     others: list[Counting] = field(default_factory=list)
+
+    def run_once(self) -> None:
+        if self.seen != self.news:
+            self.log.append((self.name, self.deadline_ns, self.news))
+        self.seen = self.news
+        self._count(1)
 
     def repeats_until(self, until_ns: int) -> bool:
         return self.seen == self.news
 
     def skip(self, count: int, last_ns: int) -> None:
-        assert last_ns == self.next_ns + (count - 1) * self.period_ns
-        self.runs += count
+        assert last_ns == self.deadline_ns + (count - 1) * self.period_ns
         self.skipped += count
-        self.next_ns += count * self.period_ns
+        self._count(count)
 
-    async def run(self, clock: VirtualClock, first_ns: int, end_ns: int) -> None:
-        self.next_ns = first_ns
-        while self.next_ns < end_ns:
-            await sleep_cycle(clock, self.next_ns, self)
-            self.runs += 1
-            self.read = sum(cycle.runs for cycle in self.others)
-            if self.seen != self.news:
-                self.log.append((self.name, clock.monotonic_ns(), self.news))
-            self.seen = self.news
-            self.next_ns += self.period_ns
+    def _count(self, count: int) -> None:
+        self.runs += count
+        self.deadline_ns += count * self.period_ns
+        self.read = sum(cycle.runs for cycle in self.others)
 
 
 def log_of(phases: list[int], periods: list[int], events: list[int], *, skips: bool) -> tuple[list[object], int]:
@@ -59,28 +59,30 @@ def log_of(phases: list[int], periods: list[int], events: list[int], *, skips: b
     loop = VirtualLoop(0)
     clock = VirtualClock(loop)
     log: list[tuple[str, int, int]] = []
-    cycles = [Counting(f"c{n}", log, period * MS) for n, period in enumerate(periods)]
+    end_ns = 1000 * MS
+    cycles = [
+        Counting(f"c{n}", log, period * MS, phase * MS)
+        for n, (period, phase) in enumerate(zip(periods, phases, strict=False))
+    ]
     for cycle in cycles:
         cycle.others = cycles
-    end_ns = 1000 * MS
 
     def happen(n: int) -> None:
-        for cycle in cycles:
+        for cycle in cycles[n % len(cycles) :]:  # the other cycles would only repeat themselves
             cycle.news += 1
         log.append((f"event {[(cycle.runs, cycle.read) for cycle in cycles]}", loop.now_ns, n))
 
     async def main() -> None:
-        tasks = [
-            loop.create_task(cycle.run(clock, phase * MS, end_ns)) for cycle, phase in zip(cycles, phases, strict=False)
-        ]
+        tasks = [loop.create_task(run_cycle(clock, cycle)) for cycle in cycles]
         for n, at_ms in enumerate(events):
             loop.call_at_ns(at_ms * MS, happen, n)
         loop.call_at_ns(end_ns, happen, len(events))
+        await clock.sleep_until_ns(end_ns)
         for task in tasks:
-            await task
+            task.cancel()
 
     if not skips:
-        clock.sleep_cycle_ns = None  # type: ignore[assignment, method-assign]  # as a clock that offers no skipping
+        clock.run_cycle = None  # type: ignore[assignment, method-assign]  # as a clock that offers no skipping
     loop.run_until_complete(main())
     return [*log, *(cycle.runs for cycle in cycles)], sum(cycle.skipped for cycle in cycles)
 
@@ -103,6 +105,35 @@ def test_every_event_and_cycle_sees_the_same_with_and_without_skipped_runs(
 def test_runs_between_two_distant_events_are_skipped() -> None:
     _, skipped = log_of([10, 10], [10, 10], [5, 505], skips=True)
     assert skipped > 150
+
+
+@pytest.mark.parametrize("skips", [True, False])
+def test_an_error_of_a_run_is_raised_and_a_cancelled_cycle_runs_no_more(skips: bool) -> None:
+    loop = VirtualLoop(0)
+    clock = VirtualClock(loop)
+    if not skips:
+        clock.run_cycle = None  # type: ignore[assignment, method-assign]
+
+    class Failing(Counting):
+        def run_once(self) -> None:
+            super().run_once()
+            self.news += 1  # so that no run is skipped
+            if self.runs == 3:
+                raise ValueError("third run")
+
+    async def main() -> None:
+        failing = Failing("f", [], 10 * MS, 5 * MS, news=1)
+        with pytest.raises(ValueError, match="third run"):
+            await run_cycle(clock, failing)
+        assert loop.now_ns == 25 * MS
+        cancelled = Failing("c", [], 10 * MS, loop.now_ns, news=1)
+        task = loop.create_task(run_cycle(clock, cancelled))
+        await clock.sleep_until_ns(loop.now_ns + 15 * MS)
+        task.cancel()
+        await clock.sleep_until_ns(loop.now_ns + 50 * MS)
+        assert (cancelled.runs, failing.runs) == (2, 3)
+
+    loop.run_until_complete(main())
 
 
 def report_of(system: str, seed: int, seconds: float, faults: RandomFaults | None) -> tuple[object, ...]:
@@ -131,5 +162,5 @@ def test_a_run_reports_the_same_with_and_without_skipped_runs(
     seconds = 150.0 if faults else 20.0  # random faults end two minutes before the end
     with_skips = report_of("observatory", seed, seconds, faults)
     assert sum(counts) > 100
-    monkeypatch.delattr(VirtualClock, "sleep_cycle_ns")
+    monkeypatch.delattr(VirtualClock, "run_cycle")
     assert report_of("observatory", seed, seconds, faults) == with_skips

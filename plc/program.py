@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from types import CodeType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import msgspec
 
@@ -204,6 +204,12 @@ class InternalVariable:
     value: Scalar | str
 
 
+class Described(Protocol):
+    """Something that can be described as data for JSON."""
+
+    def describe(self) -> dict[str, Any]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class SourceLine:
     """A line of a program's source.
@@ -303,6 +309,10 @@ class Program(ABC):
         """Return the line that assigned output `name` last; None while it has its initial value, or a value set from outside."""
         assigned = self._assigned.get(name)
         return SourceLine(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
+
+    def decided(self, name: str) -> Described | None:
+        """Return the statement that assigned output `name` last, with what decided; None if that is not known."""
+        return None
 
     def put(self, name: str, value: Scalar) -> None:
         """Set a variable from outside the logic, for example for a force."""

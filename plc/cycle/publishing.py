@@ -29,7 +29,7 @@ from fieldtwin.gateway.core.image.image import (
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.cycle.forces import Forces
-from fieldtwin.plc.program import Outbox, ProgramFailed, SourceLine, Variable
+from fieldtwin.plc.program import Described, Outbox, ProgramFailed, SourceLine, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
 """A function that returns a program's inputs, by variable, as the program read them."""
@@ -74,6 +74,8 @@ class TagChange:
     forced: bool = False
     place: SourceLine | None = None
     """The source line that assigned the new value (`after`)."""
+    decided: Described | None = None
+    """The statement of that line, and what decided that it was executed."""
 
     def describe(self, now_ns: int) -> dict[str, Any]:
         """Return the change as data for JSON."""
@@ -87,6 +89,7 @@ class TagChange:
             "inputs": self.inputs,
             "forced": self.forced,
             "place": str(self.place or ""),
+            "decided": self.decided.describe() if self.decided is not None else None,
         }
 
 
@@ -232,9 +235,11 @@ class OutputImage:
                 self._missing.pop(output.index, None)
             if value is not before or broken:
                 kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
-                place = output.program.place(output.name) if force is None else None
+                place, decided = None, None
+                if force is None:
+                    place, decided = output.program.place(output.name), output.program.decided(output.name)
                 change = TagChange(
-                    output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place
+                    output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place, decided
                 )
                 kept.append(change)
                 if self.on_change is not None:

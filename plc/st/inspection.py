@@ -60,6 +60,36 @@ class Inspection:
             return None
         return InternalVariable(path, str(found[0]), shown_value(*found))
 
+    def attribute(self, path: str) -> tuple[str, ty.Type] | None:
+        """Return the Python attributes of a path without indices, such as ``v_delay.ET``, and the type of its value.
+
+        None for other paths, and for a variable with members.
+        """
+        name, rest = _first(path)
+        top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
+        if top is None or "[" in rest:
+            return None
+        attributes, kind = [f"v_{name.lower()}"], top[1]
+        for member in rest.split(".")[1:]:
+            found = self._member_attribute(kind, member)
+            if found is None:
+                return None
+            attributes.append(found[0])
+            kind = found[1]
+        if isinstance(kind, ty.Struct | ty.Block | ty.Array):
+            return None
+        return ".".join(attributes), kind
+
+    def _member_attribute(self, kind: ty.Type, member: str) -> tuple[str, ty.Type] | None:
+        key = member.lower()
+        if isinstance(kind, ty.Struct):
+            return (f"m_{key}", kind.fields[key][1]) if key in kind.fields else None
+        if not isinstance(kind, ty.Block):
+            return None
+        if kind.standard is not None:
+            return {**kind.inputs, **kind.outputs}.get(key)
+        return next(((f"v_{key}", of) for name, of in self._blocks[kind.name.lower()] if name.lower() == key), None)
+
     def _below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
         if isinstance(kind, ty.Struct | ty.Block):
             for member, of, inside in self._members(kind, value):
@@ -132,6 +162,16 @@ def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
     if isinstance(kind, ty.Elementary) and kind.kind in _DATES:
         return _DATES[kind.kind](value)
     return value if isinstance(value, bool | int | float | str) else str(value)
+
+
+def literal(kind: ty.Type, value: Any) -> str:
+    """Return a value as it is written in the source, with 12 digits of a REAL."""
+    if isinstance(value, bool):
+        return str(value).upper()
+    if ty.is_kind(ty.plain(kind), "duration"):
+        return values.duration_text(value, "T")
+    found = shown_value(kind, value)
+    return values.real_text(found, 12) if isinstance(found, float) else str(found)
 
 
 def _elements(kind: ty.Array, value: list[Any]) -> str:

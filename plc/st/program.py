@@ -30,6 +30,7 @@ from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
+from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
@@ -44,6 +45,7 @@ class StProgram(Program):
     st_unit: CompiledUnit
     st_declared: CompiledProgram
     st_inspection: Inspection
+    st_decisions: DecisionReader
 
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
@@ -101,7 +103,7 @@ class StProgram(Program):
             convert = _from_tag(found.kind)
             holder = self.st_holder(found)
             setattr(holder, found.attribute, convert(value) if convert else value)
-            if found.role == "output":
+            if found.role != "input":
                 setattr(holder, line_of(found.attribute), 0)
 
     def place(self, name: str) -> SourceLine | None:
@@ -112,6 +114,12 @@ class StProgram(Program):
         if isinstance(line, tuple):
             return SourceLine(*line)
         return SourceLine(self.source_path, line) if line else None
+
+    def decided(self, name: str) -> Decided | None:
+        found, place = self.st_variables.get(name), self.place(name)
+        if found is None or place is None or found.shared:
+            return None
+        return self.st_decisions.read(self.st_body, (place.path, place.line, name.lower()))
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)
@@ -198,6 +206,11 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         "st_declared": found,
         "st_inspection": Inspection(
             unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None and not v.shared]
+        ),
+        "st_decisions": DecisionReader(
+            Inspection(unit, [(v.name, v.kind) for v in found.variables]),
+            decisions_of(unit.source),
+            frozenset(v.name.lower() for v in found.variables if v.role == "input"),
         ),
         "source_path": found.path,
         "source_files": files,

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.written import reference, text_of
+from fieldtwin.plc.st.syntax.written import case_label, reference, text_of
 from fieldtwin.plc.states import Transition
 
 OTHER = "(other)"
@@ -121,14 +121,10 @@ def _parts(statement: t.Statement) -> Iterator[tuple[str, tuple[t.Statement, ...
     elif isinstance(statement, t.Case):
         selector = text_of(statement.selector)
         for labels, body in statement.branches:
-            yield f"{selector} = {', '.join(map(_label, labels))}", body
+            yield f"{selector} = {', '.join(map(case_label, labels))}", body
         yield "else", statement.otherwise
     elif isinstance(statement, t.For | t.While | t.Repeat):
         yield "", statement.body
-
-
-def _label(label: t.CaseLabel) -> str:
-    return text_of(label.low) if label.high is None else f"{text_of(label.low)}..{text_of(label.high)}"
 
 
 @dataclass
@@ -197,7 +193,7 @@ class _Machine:
         return next(iter(self.states.values()))
 
     def _state_name(self, label: t.CaseLabel) -> str:
-        return _label(label).rpartition("#")[2].rpartition(".")[2] if label.high is None else _label(label)
+        return case_label(label).rpartition("#")[2].rpartition(".")[2] if label.high is None else case_label(label)
 
     def _state(self, value: t.Init) -> str | None:
         """Return the state that an expression names; None if it is computed."""

@@ -265,8 +265,22 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
             f"by {by + ' ' if by else ''}program {change['program']}",
             markup=False,
         )
+        if change["place"]:
+            _print_decision(change["place"], change["decided"] or {})
         for name, value in change["inputs"].items():
             stdout.print(f"    {name} was {value_text(value)}", markup=False)
+
+
+def _print_decision(place: str, decided: Mapping[str, Any]) -> None:
+    """Print the line that made a change; for Structured Text with its statement, the conditions around it, and the values that
+    its variables had after the scan.
+    """
+    stdout.print(f"    in {place}  {decided.get('statement', '')}".rstrip(), markup=False, soft_wrap=True)
+    for one in decided.get("conditions", ()):
+        said = "because" if one["holds"] else "because not"
+        stdout.print(f"        {said} {one['text']}  (line {one['line']})", markup=False, soft_wrap=True)
+    for name, value in decided.get("variables", {}).items():
+        stdout.print(f"        {name} is {value} after the scan", markup=False, soft_wrap=True)
 
 
 def print_proof(name: str, proof: Proof, result: SearchResult, text: str) -> None:

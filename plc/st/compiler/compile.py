@@ -55,6 +55,8 @@ class CompiledUnit:
     """By number of an assertion of a unit test: the types of the values that it shows."""
     probed: Mapping[int, ty.Type] = field(default_factory=dict)
     """By number of a probe for coverage with a value: the type of the value."""
+    source: t.SourceUnit = field(default_factory=t.SourceUnit)
+    """The declarations as they were parsed."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -79,7 +81,7 @@ class _Unit:
         self.env = Environment(dialect)
         for warning in unit.warnings:
             self.env.warnings.add(warning)
-        self.out = CodeWriter()
+        self.out, self.source = CodeWriter(), unit
         self.unit = without_edges(without_charts(without_addresses(unit)))
         if not dialect.vendor:
             self.unit = with_execution_control(self.unit)
@@ -133,6 +135,7 @@ class _Unit:
             missing,
             recorded,
             probed,
+            self.source,
         )
 
     def _kinds(self) -> tuple[str, ...]:

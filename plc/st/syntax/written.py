@@ -48,6 +48,11 @@ def reference(ref: t.Ref) -> str:
     return ref.name + "".join(map(_selector, ref.selectors))
 
 
+def case_label(label: t.CaseLabel) -> str:
+    """Return a label of a CASE: a value or a range."""
+    return text_of(label.low) if label.high is None else f"{text_of(label.low)}..{text_of(label.high)}"
+
+
 def _selector(selector: t.Member | t.Bit | t.Index) -> str:
     if isinstance(selector, t.Member):
         return f".{selector.name}"

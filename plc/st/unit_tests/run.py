@@ -12,10 +12,9 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.plc.program import ScanTooLong
-from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.inspection import shown_value
+from fieldtwin.plc.st.inspection import literal
 from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource
 from fieldtwin.plc.st.unit_tests.translate import AssertionText, TranslatedTest
 
@@ -126,21 +125,11 @@ def _result(number: int, text: AssertionText, context: _TestContext, unit: Compi
     count = context.counts.get(number, _Count())
     if not count.failed:
         return AssertionResult(text, count.executed, False, count.t_ns)
-    shown = [_text(kind, value) for kind, value in zip(unit.recorded[number], count.values, strict=True)]
+    shown = [literal(kind, value) for kind, value in zip(unit.recorded[number], count.values, strict=True)]
     expected = text.expected + (shown[1] if len(shown) > 1 else "")
     if len(shown) > 2:
         expected += f" within {shown[2]}"
     return AssertionResult(text, count.executed, True, count.t_ns, expected, shown[0])
-
-
-def _text(kind: ty.Type, value: Any) -> str:
-    """Return a value as in the source."""
-    if isinstance(value, bool):
-        return str(value).upper()
-    if ty.is_kind(ty.plain(kind), "duration"):
-        return values.duration_text(value, "T")
-    found = shown_value(kind, value)
-    return values.real_text(found, 12) if isinstance(found, float) else str(found)
 
 
 def _reason(error: BaseException) -> str:

@@ -33,7 +33,7 @@ def compiled(body: str, dialect: str) -> CompiledUnit:
 def after(body: str, dialect: str = "codesys") -> dict[str, Any]:
     made = program_class(compiled(body, dialect))()
     scan(made)
-    return {name[2:]: value for name, value in vars(made.st_body).items()}
+    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
 
 
 ACCEPTED = [

@@ -22,7 +22,7 @@ def run(variables: str, body: str, before: str = "", scans: int = 1) -> dict[str
     made = program(f"{before}\nPROGRAM p VAR {variables} END_VAR\n{body}\nEND_PROGRAM")
     for number in range(1, scans + 1):
         scan(made, number)
-    return {name[2:]: value for name, value in vars(made.st_body).items()}
+    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
 
 
 def value(kind: str, expression: str, variables: str = "", before: str = "") -> Any:

@@ -24,6 +24,21 @@ function FromGateway({ store, tag }) {
   </p>`;
 }
 
+/** The statement in Structured Text that made a change, and what decided that it was executed. */
+function Decision({ decided }) {
+  const variables = Object.entries(decided.variables);
+  return html`<pre class="decision">${decided.statement}</pre>
+    ${decided.conditions.length > 0 &&
+    html`<ul class="conditions">
+      ${decided.conditions.map((c) => html`<li key=${c.line + c.text}>line ${c.line}: <code>${c.text}</code> ${c.holds ? "was true" : "was false"}</li>`)}
+    </ul>`}
+    ${variables.length > 0 &&
+    html`<table class="list">
+      <thead><tr><th>Variable after the scan</th><th class="number">Value</th></tr></thead>
+      <tbody>${variables.map(([name, v]) => html`<tr key=${name}><td>${name}</td><td class="number">${v}</td></tr>`)}</tbody>
+    </table>`}`;
+}
+
 function FromProgram({ store, tag, word }) {
   const [found, error] = useFetched(() => get(`${store.path}/plc/why/${tag}`), [tag]);
   if (error) return html`<${Failure} text=${error} />`;
@@ -38,6 +53,7 @@ function FromProgram({ store, tag, word }) {
       ${" "}<strong>${word(last.before)}</strong> to <strong>${word(last.after)}</strong> ${age(last.age_ms / 1000)} ago
       (${time(last)} in the run, scan ${last.scan})${last.place ? html`, in line <code>${last.place}</code>` : ""}.
     </p>
+    ${last.decided && html`<${Decision} decided=${last.decided} />`}
     ${inputs.length > 0 &&
     html`<p>In that scan the program had read:</p>
       <table class="list">

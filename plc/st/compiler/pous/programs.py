@@ -55,7 +55,7 @@ class Programs(Bodies):
         super().__init__(variables)
         self._unit = unit
         self.outputs: dict[str, frozenset[str]] = {}
-        """By class of a PROGRAM: the attributes that hold its outputs."""
+        """By class of a PROGRAM: the attributes that hold its outputs and local variables."""
         self.shared_outputs: set[str] = set()
         """The attributes of global variables that are outputs."""
 
@@ -84,10 +84,10 @@ class Programs(Bodies):
                     variables.append(
                         ProgramVariable(v.name, role or "", kind, retain, attribute, location=address, optional=located)
                     )
-        outputs = frozenset(v.attribute for v in variables if v.role == "output")
+        assigned = frozenset(v.attribute for v in variables if v.role != "input")
         variables += self._offered(pou, {v.name.lower() for v in variables})
-        self.shared_outputs.update(v.attribute for v in variables if v.shared and v.role == "output")
-        self.outputs[f"P_{pou.name.lower()}"] = outputs
+        self.shared_outputs.update(v.attribute for v in variables if v.shared and v.role != "input")
+        self.outputs[f"P_{pou.name.lower()}"] = assigned
         with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
             with self.out.block("def __init__(self):"):
                 self._initialise_program(pou, symbols)

@@ -143,7 +143,7 @@ class DecisionReader:
         self._variables: dict[tuple[str, int, str], list[tuple[str, ty.Type, attrgetter[Any]]]] = {}
 
     def read(self, body: Any, key: tuple[str, int, str]) -> Decided | None:
-        """Return the decision for a file, a line and a variable, with the present values; None if there is none."""
+        """Return the decision for a file, a line and a variable, with the present values; None without such a statement."""
         decision = self._decisions.get(key)
         if decision is None:
             return None

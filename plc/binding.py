@@ -116,16 +116,26 @@ def _found(name: str, folders: Sequence[str]) -> Path:
     return next((p for p in places if p.exists()), places[0])
 
 
-def _text_class(source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str]) -> type[StProgram]:
+def text_source(source: str, folders: Sequence[str]) -> tuple[Path, str] | None:
+    """Return the file or folder of a program in Structured Text, and the name of the program in it ("" for the only one).
+
+    Return None for a source in Python, or for no source at all.
+    """
     name, _, program = source.strip().partition(":")
     found = _found(name, folders)
-    if not (name.lower().endswith(SUFFIXES) or (name and found.is_dir())):
+    is_text = name.lower().endswith(SUFFIXES) or (name and found.is_dir())
+    return (found, program.strip()) if is_text else None
+
+
+def _text_class(source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str]) -> type[StProgram]:
+    found = text_source(source, folders)
+    if found is None:
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
     from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
     places = tuple(_found(library, folders) for library in libraries)
-    return load_source(found, program.strip(), dialect_of(dialect), places)
+    return load_source(*found, dialect_of(dialect), places)
 
 
 def image_for(

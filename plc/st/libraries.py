@@ -84,6 +84,8 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
         (*unit.missing, *(m for one in library.units for m in one.missing if _owner(m) in seen)),
         unit.instances,
         unit.tests,
+        unit.tasks,
+        unit.configured,
     )
 
 

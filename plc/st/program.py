@@ -29,7 +29,8 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
+from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
+from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
@@ -46,13 +47,18 @@ class StProgram(Program):
     st_declared: CompiledProgram
     st_inspection: Inspection
     st_decisions: DecisionReader
+    st_instance: str = ""
+    """The program of a configuration whose connections are used, if it has any."""
 
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
-        self.st_inputs = [_Input(v) for v in self.st_declared.variables if v.role == "input"]
+        inputs = [v for v in self.st_declared.variables if v.role == "input"]
+        self.st_inputs = [_Input(v) for v in inputs if not v.shared]
+        self.st_shared_inputs = [_Input(v) for v in inputs if v.shared]
+        """The inputs that are global variables with an address."""
         self.st_variables = {v.name: v for v in self.st_declared.variables}
         self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         self.st_shared: list[tuple[str, str, Callable[[Any], Any] | None]] = []
@@ -68,12 +74,15 @@ class StProgram(Program):
     def execute(self, scan: ScanInfo) -> None:
         self.st_resource.begin(scan, self.tag)
         body, namespace = self.st_body, self.__dict__
+        for item in self.st_shared_inputs:
+            item.put(self.st_resource.globals, namespace[item.name])
+        if self.st_instance:
+            getattr(body, connection(self.st_instance, into=True))()
         for item in self.st_inputs:
-            value = namespace[item.name]
-            if value is not None:
-                holder = self.st_resource.globals if item.shared else body
-                setattr(holder, item.attribute, item.taken(value) if item.convert else value)
+            item.put(body, namespace[item.name])
         body.execute()
+        if self.st_instance:
+            getattr(body, connection(self.st_instance, into=False))()
         self.st_show()
 
     def whole_state(self, now_ns: int) -> Any:
@@ -168,12 +177,17 @@ class StProgram(Program):
 class _Input:
     """An input: how the value in the image is converted to the program's value."""
 
-    __slots__ = ("attribute", "convert", "name", "shared")
+    __slots__ = ("attribute", "convert", "name")
 
     def __init__(self, variable: ProgramVariable) -> None:
         self.name = variable.name
-        self.attribute, self.shared = variable.attribute, variable.shared
+        self.attribute = variable.attribute
         self.convert = _from_tag(variable.kind)
+
+    def put(self, holder: Any, value: Any) -> None:
+        """Set the variable in `holder`. Without a `value`, it keeps the one that it has."""
+        if value is not None:
+            setattr(holder, self.attribute, self.taken(value) if self.convert else value)
 
     def taken(self, value: Any) -> Any:
         """Return `value` as the program uses it. Raises `LogicError` for a value that the variable cannot hold."""
@@ -185,10 +199,14 @@ class _Input:
 
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
-    """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`."""
+    """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`.
+
+    `name` may also be that of a program of a configuration, which states the PROGRAM.
+    """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
     names = [*(p.name for p in unit.programs), *missing]
-    wanted = name or (names[0] if len(names) == 1 else "")
+    instance = instance_of(unit, name)
+    wanted = instance.program if instance is not None else name or (names[0] if len(names) == 1 else "")
     found = next((p for p in unit.programs if p.name.lower() == wanted.lower()), None)
     if found is None:
         for m in missing.values():
@@ -197,13 +215,20 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         raise FileInvalid(
             f"no PROGRAM {name}" if name else "which PROGRAM is meant",
             path=unit.path,
-            expected=", ".join(names) or "a PROGRAM in the file",
+            expected=", ".join((*names, *(one.name for one in unit.instances))) or "a PROGRAM in the file",
             hint="write SOURCE:NAME, because it has several" if len(names) > 1 else "",
         )
+    connecting = [one.name for one in unit.instances if one.program == found.name and one.connected]
+    if instance is None and connecting:
+        hint = "write SOURCE:NAME with the name of one of them"
+        message = f"which program of the configuration is meant, because they connect the variables of {found.name}"
+        raise FileInvalid(message, path=unit.path, expected=", ".join(connecting), hint=hint)
+    connected = instance.connected if instance is not None else frozenset()
     files = tuple(sorted(unit.files, key=lambda file: (file != found.path, file)))
     body: dict[str, Any] = {
         "st_unit": unit,
         "st_declared": found,
+        "st_instance": instance.name if instance is not None and connected else "",
         "st_inspection": Inspection(
             unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None and not v.shared]
         ),
@@ -236,9 +261,22 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
                 limits=limits,
                 words=words,
                 address=v.location,
-                needs_tag=not v.optional,
+                needs_tag=not (v.optional or v.name.lower() in connected),
             )
     return type(found.name, (StProgram,), body)
+
+
+def instance_of(unit: CompiledUnit, name: str = "") -> CompiledInstance | None:
+    """Return the program of a configuration that `name` means: its name, or the PROGRAM that only this one has.
+
+    An empty `name` stands for the only PROGRAM of the unit. Return None if there is no such program, or if there are several.
+    """
+    programs = [p.name for p in unit.programs]
+    wanted = (name or (programs[0] if len(programs) == 1 else "")).lower()
+    if wanted not in {program.lower() for program in programs}:
+        return next((one for one in unit.instances if one.name.lower() == wanted), None)
+    found = [one for one in unit.instances if one.program.lower() == wanted]
+    return found[0] if len(found) == 1 else None
 
 
 def load_source(

@@ -125,6 +125,8 @@ def _parsed(texts: Texts, dialect: Dialect) -> SourceUnit:
         tuple(missing for unit in units for missing in unit.missing),
         tuple(instance for unit in units for instance in unit.instances),
         tuple(test for unit in units for test in unit.tests),
+        tuple(task for unit in units for task in unit.tasks),
+        tuple(variable for unit in units for variable in unit.configured),
     )
 
 

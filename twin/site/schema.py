@@ -191,7 +191,7 @@ class TaskForm(SiteModel):
     """
 
     interval_ms: Milliseconds | None = None
-    priority: int = Field(default=10, ge=0, le=31)
+    priority: int = Field(default=10, ge=0, le=0xFFFF)
     late_ms: Milliseconds | None = Field(default=None, description="default: the watchdog's")
     single: TagName | None = None
 
@@ -211,7 +211,7 @@ class PlcForm(SiteModel):
     outputs_at: Literal["start", "end"] = Field(
         default="end", description="start: a scan's outputs change at the next cycle"
     )
-    tasks: dict[Name, TaskForm] = Field(default={}, description="default: one, every cycle_ms")
+    tasks: dict[Name, TaskForm] = Field(default={}, description="default: those of the sources, or one, every cycle_ms")
     programs: dict[Name, ProgramForm] = Field(
         default={}, description="none: a different controller commands, or no controller"
     )

@@ -27,6 +27,7 @@ from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.exported_tags import ExportedTag, resolve_exported_tags
 from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
+from fieldtwin.twin.site.programs.configured_tasks import with_configured_tasks
 from fieldtwin.twin.site.read_back_warnings import never_read_back, read_only_once
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
@@ -102,6 +103,7 @@ def _resolve(
         with errors.collect():
             devices[name] = _device(file, name, device, buses, path, profiles, known, errors)
     buses = connect_pauses(buses, form, devices)
+    plc = with_configured_tasks(file, form.plc, path.parent, errors)
     _check_addresses(file, buses, devices, errors)
     system = System(
         name=form.system,
@@ -109,7 +111,7 @@ def _resolve(
         hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
         buses=buses,
         devices=devices,
-        plc=form.plc,
+        plc=plc,
         remote=form.remote,
         file=file,
         commands=form.commands,

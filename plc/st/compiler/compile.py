@@ -15,9 +15,10 @@ from types import CodeType
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
+from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
+from fieldtwin.plc.st.compiler.configurations.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.execution_control import with_execution_control
-from fieldtwin.plc.st.compiler.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.pous.blocks import Blocks
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, Programs
@@ -57,6 +58,8 @@ class CompiledUnit:
     """By number of a probe for coverage with a value: the type of the value."""
     source: t.SourceUnit = field(default_factory=t.SourceUnit)
     """The declarations as they were parsed."""
+    instances: tuple[CompiledInstance, ...] = ()
+    """The programs that configurations run."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -82,19 +85,20 @@ class _Unit:
         for warning in unit.warnings:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
+        unit = with_configured(unit)
         self.unit = without_edges(without_charts(without_addresses(unit)))
         if not dialect.vendor:
             self.unit = with_execution_control(self.unit)
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
         self.env.missing = {m.name.lower(): m for m in unit.missing if m.name.lower() not in declared}
         self._check_names()
-        self._check_configuration()
         self._check_addresses(unit)
         self.declarations = Declarations(self.env, self.unit, self.out)
         self.variables = Variables(self.env, self.unit, self.declarations, self.out)
         self.variables.declare_global_constants()
         self.declarations.resolve()
         self.variables.declare_globals()
+        self.instances = compiled_instances(self.env, self.unit, self.declarations)
         self.functions = Functions(self.variables)
         self.blocks = Blocks(self.variables)
         self.programs = Programs(self.variables, self.unit)
@@ -136,6 +140,7 @@ class _Unit:
             recorded,
             probed,
             self.source,
+            self.instances,
         )
 
     def _kinds(self) -> tuple[str, ...]:
@@ -149,15 +154,6 @@ class _Unit:
             if pou.name.lower() in seen or pou.name.upper() in ty.ELEMENTARY:
                 self.env.collected(self.env.error(pou.pos, f"{pou.name} is declared twice"))
             seen.add(pou.name.lower())
-
-    def _check_configuration(self) -> None:
-        """Check that the programs that a CONFIGURATION runs exist. The system file states which programs and tasks a PLC runs."""
-        programs = {pou.name.lower(): pou.name for pou in self.unit.pous if pou.kind == "PROGRAM"}
-        for instance in self.unit.instances:
-            if instance.program.lower() not in programs.keys() | self.env.missing.keys():
-                message = f"a program {instance.program!r} is not declared"
-                expected = ", ".join(programs.values())
-                self.env.collected(self.env.error(instance.pos, message, expected=expected))
 
     def _check_addresses(self, unit: t.SourceUnit) -> None:
         """Check that addresses are where they are allowed, and that the variables of a POU, and the global ones, have different

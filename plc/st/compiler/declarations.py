@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from fieldtwin.gateway.core.image.layout import MAX_DEPTH, MAX_MESSAGE_BYTES
 from fieldtwin.plc.blocks import BLOCKS
@@ -73,6 +74,15 @@ class Declarations:
         if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
             return None
         return Symbol(v.name, kind, text, writable=False, constant=value.constant)
+
+    def constant_of(self, expr: t.Expr, kind: ty.Type, what: str) -> Any:
+        """Return the value of a constant expression as a value of type `kind`; `what` names it in errors. Raises `FileInvalid`."""
+        compiler = self._expressions()
+        value = compiler.settled(compiler.value(expr, kind), expr.pos)
+        compiler.coerced(value, kind, expr.pos, what)
+        if value.constant is None:
+            self.env.fail(expr.pos, what, expected="a constant")
+        return value.constant
 
     def _expressions(self) -> Calls:
         compiler = Calls(self.env, self.scope, CodeWriter())

@@ -26,7 +26,6 @@ _UNSUPPORTED = {
         "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
-        "VAR_CONFIG and VAR_ACCESS": "VAR_CONFIG VAR_ACCESS",
         "labels and jumps": "JMP",
     }.items()
     for word in words.split()

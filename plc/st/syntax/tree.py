@@ -225,12 +225,38 @@ class Missing:
 
 
 @dataclass(frozen=True, slots=True)
+class Task:
+    """A TASK of the resource `resource` ("" for a configuration without one). `values`: INTERVAL, PRIORITY, SINGLE, in capitals."""
+
+    pos: Pos
+    name: str
+    values: tuple[tuple[str, Expr], ...]
+    resource: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Instance:
-    """A program that a CONFIGURATION or RESOURCE runs: `name` is the instance, `program` its type."""
+    """A program that a CONFIGURATION or RESOURCE runs: `name` is the instance, `program` its type, `task` the name of its task ("" for
+    none). `arguments` connect its variables with global variables.
+    """
 
     pos: Pos
     name: str
     program: str
+    task: str = ""
+    arguments: tuple[Argument, ...] = ()
+    resource: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ConfiguredVariable:
+    """A variable in VAR_CONFIG: the address of a variable that is declared at ``%I*`` or similar, or its initial value."""
+
+    pos: Pos
+    path: tuple[str, ...]
+    location: str
+    type: TypeSpec
+    initial: Init | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +270,8 @@ class SourceUnit:
     missing: tuple[Missing, ...] = ()
     instances: tuple[Instance, ...] = ()
     tests: tuple[Test, ...] = ()
+    tasks: tuple[Task, ...] = ()
+    configured: tuple[ConfiguredVariable, ...] = ()
 
 
 # -- expressions --------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fieldtwin.plc.st.compiler.located import KINDS
+from fieldtwin.plc.st.compiler.configurations.located import KINDS
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import area_of
 from fieldtwin.plc.st.syntax.walk import nodes, with_parts

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.located import offered
+from fieldtwin.plc.st.compiler.configurations.located import offered
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
 from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import Symbol
+from fieldtwin.plc.st.compiler.scope import Symbol, Value
+from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 
@@ -98,7 +99,41 @@ class Programs(Bodies):
                 body.program_inputs = set(inputs)
                 body.body(pou.body)
             self.write_actions(pou, symbols, inputs)
+            for instance in self._unit.instances:
+                if instance.program.lower() == pou.name.lower() and instance.arguments:
+                    self._write_connections(instance, pou, symbols)
         return CompiledProgram(pou.name, pou.pos.path, tuple(variables))
+
+    def _write_connections(self, instance: t.Instance, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
+        """Write the methods that copy global variables to the inputs of a program, and its outputs to global variables."""
+        valid = [argument for argument in instance.arguments if self._is_connection(argument, pou)]
+        body = Statements(self.env, {}, self.out, pou.name.lower())  # the arguments are outside of the program
+        for into in (True, False):
+            with self.out.block(f"def {connection(instance.name, into=into)}(self):", instance.pos):
+                for argument in valid:
+                    symbol = symbols.get(argument.name.lower())
+                    if symbol is None or (argument.value is not None) is not into:
+                        continue
+                    with self.env.errors.collect():
+                        if argument.value is not None:
+                            value = body.value(argument.value, symbol.type)
+                            code = body.coerced(value, symbol.type, argument.pos, f"{argument.name} of {instance.name}")
+                            self.out.line(f"{symbol.code} = {code}", argument.pos)
+                        else:
+                            body.take(argument, Value(symbol.code, symbol.type))
+
+    def _is_connection(self, argument: t.Argument, pou: t.Pou) -> bool:
+        """Return whether an argument of a program names an input with a value, or an output with a target; if not, add an error."""
+        kind, what = ("VAR_INPUT", "input") if argument.value is not None else ("VAR_OUTPUT", "output")
+        known = [v.name for b in pou.blocks if b.kind == kind for v in b.variables if not v.location]
+        if argument.name.lower() in {name.lower() for name in known}:
+            return True
+        message, expected = (
+            f"{pou.name} has no {what} {argument.name!r}",
+            ", ".join(known) or f"a program with an {what}",
+        )
+        self.env.collected(self.env.error(argument.pos, message, expected=expected))
+        return False
 
     def _offered(self, pou: t.Pou, taken: set[str]) -> Iterator[ProgramVariable]:
         """Yield the located global variables that a program uses. `taken` has the names of its variables, in lower case."""
@@ -137,6 +172,11 @@ class Programs(Bodies):
                 expected="BOOL, a number, a time, an enumeration or MESSAGES",
                 got=str(kind),
             )
+
+
+def connection(instance: str, *, into: bool) -> str:
+    """Return the name of the method that sets the inputs of an instance (`into`), or copies its outputs."""
+    return f"{'into' if into else 'from'}_{instance.lower()}"
 
 
 def _is_reserved(name: str) -> bool:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.configurations.located import Offered
 from fieldtwin.plc.st.compiler.declarations import Declarations
-from fieldtwin.plc.st.compiler.located import Offered
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name

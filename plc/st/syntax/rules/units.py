@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lark import Token, v_args
@@ -12,27 +12,28 @@ from lark.tree import Meta
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.rules.base import Bad, Rules
 from fieldtwin.plc.st.syntax.rules.charts import chart_of
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A TASK of a configuration or resource."""
-
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class _InTask:
-    """A program of a configuration or resource, and the name of its task, if it states one."""
-
-    instance: t.Instance
-    task: Token | None
+from fieldtwin.plc.st.syntax.rules.declarations import initial_of, spec_of
 
 
 def _flat(items: Iterable[Any]) -> Iterator[Any]:
     """Yield the items, and in place of a tuple its items."""
     for item in items:
         yield from item if isinstance(item, tuple) else (item,)
+
+
+@dataclass(frozen=True, slots=True)
+class _InTask:
+    """The name of the task in which a program of a configuration runs."""
+
+    name: Token
+
+
+Configured = t.VarBlock | t.Instance | t.Task | t.ConfiguredVariable
+"""A part of a configuration that is used."""
+
+
+def _token(meta: Meta) -> Token:
+    return Token("NAME", "", line=meta.line, column=meta.column)
 
 
 @v_args(meta=True)
@@ -47,32 +48,81 @@ class UnitRules(Rules):
             tuple(i for i in items if isinstance(i, t.Pou)),
             instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
             tests=tuple(i for i in items if isinstance(i, t.Test)),
+            tasks=tuple(each for each in _flat(items) if isinstance(each, t.Task)),
+            configured=tuple(each for each in _flat(items) if isinstance(each, t.ConfiguredVariable)),
         )
 
     def test(self, meta: Meta, items: list[Any]) -> t.Test:
         word, name, *blocks, body = items
         return t.Test(self._pos(word), str(name)[1:-1].replace("$'", "'"), tuple(blocks), body)
 
-    def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock | t.Instance, ...]:
-        """Return the globals and the programs of a configuration, with those of its resources."""
-        tasks = {item.name.lower() for item in items if isinstance(item, _Task)}
+    def configuration(self, meta: Meta, items: list[Any]) -> tuple[Configured, ...]:
+        """Return the globals, tasks and programs of a configuration, with those of its resources."""
+        return self._configured("", items)
+
+    def resource(self, meta: Meta, items: list[Any]) -> tuple[Configured, ...]:
+        return self._configured(str(items[0]), items)
+
+    def _configured(self, resource: str, items: list[Any]) -> tuple[Configured, ...]:
+        found: list[Configured] = []
+        tasks = {item.name.lower() for item in items if isinstance(item, t.Task)}
         for item in items:
-            if isinstance(item, _InTask) and item.task is not None and item.task.lower() not in tasks:
+            if isinstance(item, t.Instance) and isinstance(item.task, Token) and item.task.lower() not in tasks:
                 raise Bad(item.task, f"a task {str(item.task)!r} is not declared in this configuration or resource")
-        parts = [item.instance if isinstance(item, _InTask) else item for item in items]
-        return tuple(each for each in _flat(parts) if isinstance(each, t.VarBlock | t.Instance))
+            if isinstance(item, t.Instance):
+                found.append(replace(item, task=str(item.task), resource=resource))
+            elif isinstance(item, t.Task):
+                found.append(replace(item, resource=resource))
+            elif isinstance(item, t.VarBlock):
+                found.append(item)
+            elif isinstance(item, tuple):
+                found += item
+        return tuple(found)
 
-    resource = configuration
+    def task(self, meta: Meta, items: list[Any]) -> t.Task:
+        name, *values = items
+        return t.Task(self._pos(name), str(name), tuple(values))
 
-    def task(self, meta: Meta, items: list[Any]) -> _Task:
-        return _Task(str(items[0]))
+    def task_value(self, meta: Meta, items: list[Any]) -> tuple[str, t.Expr]:
+        name, value = items
+        if name.upper() not in ("INTERVAL", "PRIORITY", "SINGLE"):
+            raise Bad(name, "not a property of a task, which are INTERVAL, PRIORITY and SINGLE")
+        return name.upper(), value
 
-    def task_value(self, meta: Meta, items: list[Any]) -> None:
+    def instance(self, meta: Meta, items: list[Any]) -> t.Instance:
+        name, *rest = [item for item in items if isinstance(item, Token) or not isinstance(item, str)]
+        task = rest.pop(0).name if isinstance(rest[0], _InTask) else ""
+        program, *arguments = rest
+        return t.Instance(self._pos(program), str(name), str(program), task, tuple(arguments))
+
+    def in_task(self, meta: Meta, items: list[Any]) -> _InTask:
+        return _InTask(items[0])
+
+    def connected(self, meta: Meta, items: list[Any]) -> t.Argument:
+        (argument,) = items
+        if not argument.name:
+            raise Bad(_token(meta), "an argument of a program without the name of a variable")
+        return argument  # type: ignore[no-any-return]
+
+    def block_in_task(self, meta: Meta, items: list[Any]) -> t.Argument:
+        raise Bad(items[0], "a task for a function block is not supported; put it into a program with this task")
+
+    def config_vars(self, meta: Meta, items: list[Any]) -> tuple[t.ConfiguredVariable, ...]:
+        return tuple(items)
+
+    def config_var(self, meta: Meta, items: list[Any]) -> t.ConfiguredVariable:
+        ref = items[0]
+        if not all(isinstance(selector, t.Member) for selector in ref.selectors):
+            raise Bad(_token(meta), "not a path such as Resource.Instance.Variable")
+        path = (ref.name, *(selector.name for selector in ref.selectors))
+        location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
+        return t.ConfiguredVariable(self._pos(meta), path, location, spec_of(items), initial_of(items))
+
+    def access_vars(self, meta: Meta, items: list[Any]) -> None:
         return None
 
-    def instance(self, meta: Meta, items: list[Any]) -> _InTask:
-        name, *task, program = items
-        return _InTask(t.Instance(self._pos(program), str(name), str(program)), task[0] if task else None)
+    def access(self, meta: Meta, items: list[Any]) -> None:
+        return None
 
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items

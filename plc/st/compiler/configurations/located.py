@@ -83,10 +83,23 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
         names = [*_addresses(pou.blocks)] if pou.kind == "PROGRAM" else []
         names += [node.name for node in nodes(pou) if isinstance(node, t.Ref) and node.name.startswith("%")]
         places += [(pou.name.lower(), name) for name in names]
+    places += [
+        ("", ref.name) for ref in nodes(_connections(unit)) if isinstance(ref, t.Ref) and ref.name.startswith("%")
+    ]
     for place, address in places:
         if place not in found.setdefault(address, []):
             found[address].append(place)
     return found
+
+
+def _connections(unit: t.SourceUnit, program: str = "") -> tuple[t.Argument, ...]:
+    """Return what configurations connect with variables of programs, or of the PROGRAM `program`, in lower case."""
+    return tuple(
+        argument
+        for instance in unit.instances
+        if program in ("", instance.program.lower())
+        for argument in instance.arguments
+    )
 
 
 def _addresses(blocks: Iterable[t.VarBlock]) -> Iterator[str]:
@@ -99,7 +112,8 @@ def _located(blocks: Iterable[t.VarBlock]) -> Iterator[t.VarDecl]:
 
 def _undeclared(unit: t.SourceUnit, address: str) -> t.VarDecl:
     """Return the declaration of an address that has none, at its first use."""
-    uses = (node for pou in unit.pous for node in nodes(pou) if isinstance(node, t.Ref) and node.name == address)
+    everything = nodes((unit.pous, _connections(unit)))
+    uses = (node for node in everything if isinstance(node, t.Ref) and node.name == address)
     pos = min((use.pos for use in uses), key=lambda pos: (pos.line, pos.column))
     return t.VarDecl(pos, address, t.NamedType(pos, _TYPES[address[2]]), None, address)
 
@@ -133,16 +147,21 @@ def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
     by_address = {address_of(v.location): key for key, v in reversed(located.items()) if address_of(v.location)}
     found: dict[tuple[str, str], str] = {}
     """The used variables with their names in the program."""
+
+    def add(key: tuple[str, str] | None) -> None:
+        if key is not None:
+            name = located[key].name
+            found.setdefault(key, short_name(name) if name.startswith("%") else name)
+
     for pou in _reached(unit, program):
         own = {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
         for v in (v for b in pou.blocks if b.kind == "VAR_EXTERNAL" for v in _located([b]) if pou is program):
             found[by_address[address_of(v.location)]] = v.name
             own.add(v.name.lower())
         for ref in (node for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Ref)):
-            key = _global(ref, own, located, by_address)
-            if key is not None:
-                name = located[key].name
-                found.setdefault(key, short_name(name) if name.startswith("%") else name)
+            add(_global(ref, own, located, by_address))
+    for ref in (n for n in nodes(_connections(unit, program.name.lower())) if isinstance(n, t.Ref)):
+        add(_global(ref, set(), located, by_address))
     taken = {v.name.lower() for b in program.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
     ordered = [key for key in located if key in found]
     names = {}

@@ -1,0 +1,1 @@
+"""Located variables, and the tasks and programs of configurations."""

@@ -1,0 +1,143 @@
+"""The tasks and programs of configurations (IEC 61131-3:2013, 6.8), and the addresses that VAR_CONFIG gives to variables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NoReturn
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.scope import Environment
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of
+from fieldtwin.plc.st.syntax.written import text_of
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledTask:
+    """A TASK. `interval_ns` is 0 if it has no INTERVAL. `single` is the text of SINGLE, such as ``start`` or ``%IX0.0``; "" for none.
+
+    `priority` is from 0, the highest and the default, to 65535.
+    """
+
+    name: str
+    interval_ns: int
+    priority: int
+    single: str
+    pos: t.Pos
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledInstance:
+    """A program that a configuration runs: its name, the PROGRAM, its task, and the variables of the program that it connects."""
+
+    name: str
+    program: str
+    task: CompiledTask | None
+    connected: frozenset[str]
+
+
+def compiled_instances(
+    env: Environment, unit: t.SourceUnit, declarations: Declarations
+) -> tuple[CompiledInstance, ...]:
+    """Return the programs of the configurations of a unit with their tasks. Errors are collected in `env`."""
+    programs = {pou.name.lower(): pou.name for pou in unit.pous if pou.kind == "PROGRAM"}
+    tasks: dict[tuple[str, str], CompiledTask] = {}
+    for task in unit.tasks:
+        with env.errors.collect():
+            key = task.resource.lower(), task.name.lower()
+            if key in tasks:
+                env.fail(task.pos, f"task {task.name} is declared twice")
+            tasks[key] = _task(env, task, declarations)
+    found: dict[str, CompiledInstance] = {}
+    for one in unit.instances:
+        if one.name.lower() in found:
+            env.collected(env.error(one.pos, f"program {one.name} is declared twice in configurations"))
+        if one.program.lower() in programs:
+            made = CompiledInstance(
+                one.name,
+                programs[one.program.lower()],
+                tasks.get((one.resource.lower(), one.task.lower())),
+                frozenset(argument.name.lower() for argument in one.arguments),
+            )
+            found[one.name.lower()] = made
+        elif one.program.lower() not in env.missing:
+            expected = ", ".join(programs.values())
+            env.collected(env.error(one.pos, f"a program {one.program!r} is not declared", expected=expected))
+    return tuple(found.values())
+
+
+def _task(env: Environment, task: t.Task, declarations: Declarations) -> CompiledTask:
+    values = dict(task.values)
+    interval, priority, single = (values.get(name) for name in ("INTERVAL", "PRIORITY", "SINGLE"))
+    interval_ns = int(declarations.constant_of(interval, ty.TIME, "INTERVAL")) if interval is not None else 0
+    number = int(declarations.constant_of(priority, ty.ELEMENTARY["UINT"], "PRIORITY")) if priority is not None else 0
+    if interval_ns < 0:
+        env.fail(task.pos, f"INTERVAL of task {task.name}", expected="a positive duration")
+    return CompiledTask(task.name, interval_ns, number, text_of(single) if single is not None else "", task.pos)
+
+
+def with_configured(unit: t.SourceUnit) -> t.SourceUnit:
+    """Return `unit` with the addresses and initial values of VAR_CONFIG in the declarations of its programs.
+
+    Raises `FileInvalid` for a variable that does not exist or already has an address, and for programs of one type with
+    different values.
+    """
+    if not unit.configured:
+        return unit
+    changed: dict[tuple[str, str], t.ConfiguredVariable] = {}
+    for one in unit.configured:
+        program, name = _target(unit, one)
+        before = changed.setdefault((program.name.lower(), name), one)
+        if (before.location, before.initial) != (one.location, one.initial):
+            _fail(one, "two programs of one type have different values", expected="a PROGRAM for each of them")
+    return replace(unit, pous=tuple(_with_values(pou, changed) if pou.kind == "PROGRAM" else pou for pou in unit.pous))
+
+
+def _target(unit: t.SourceUnit, one: t.ConfiguredVariable) -> tuple[t.Pou, str]:
+    """Return the program that declares a variable of VAR_CONFIG, and the variable's name in lower case."""
+    instances = {instance.name.lower(): instance for instance in unit.instances}
+    path = [name.lower() for name in one.path]
+    if path[0] not in instances and len(path) > 1:
+        path.pop(0)  # the resource
+    instance = instances.get(path[0])
+    program = next(
+        (
+            pou
+            for pou in unit.pous
+            if instance and pou.kind == "PROGRAM" and pou.name.lower() == instance.program.lower()
+        ),
+        None,
+    )
+    if program is None:
+        _fail(one, "no program of the configuration has this name", expected=", ".join(i.name for i in unit.instances))
+    if len(path) > 2:
+        _fail(one, "a variable in a function block is not supported here", expected="a variable of a program")
+    declared = {v.name.lower(): v for block in program.blocks for v in block.variables}
+    variable = declared.get(path[-1]) if len(path) == 2 else None
+    if variable is None:
+        _fail(one, f"{program.name} has no such variable", expected=", ".join(v.name for v in declared.values()))
+    if one.location and (address_of(variable.location) or area_of(variable.location) != area_of(one.location)):
+        wanted = f"{variable.name} AT %{area_of(one.location)}* in {program.name}"
+        _fail(one, f"{variable.name} cannot get the address {one.location}", expected=wanted)
+    return program, path[-1]
+
+
+def _with_values(pou: t.Pou, changed: dict[tuple[str, str], t.ConfiguredVariable]) -> t.Pou:
+    def configured(v: t.VarDecl) -> t.VarDecl:
+        one = changed.get((pou.name.lower(), v.name.lower()))
+        if one is None:
+            return v
+        return replace(v, location=one.location or v.location, initial=one.initial or v.initial)
+
+    return replace(
+        pou, blocks=tuple(replace(b, variables=tuple(configured(v) for v in b.variables)) for b in pou.blocks)
+    )
+
+
+def _fail(one: t.ConfiguredVariable, message: str, *, expected: str) -> NoReturn:
+    pos, name = one.pos, ".".join(one.path)
+    raise FileInvalid(
+        f"VAR_CONFIG {name}: {message}", path=pos.path, line=pos.line, column=pos.column, expected=expected
+    )

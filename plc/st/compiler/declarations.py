@@ -76,7 +76,7 @@ class Declarations:
         return Symbol(v.name, kind, text, writable=False, constant=value.constant)
 
     def constant_of(self, expr: t.Expr, kind: ty.Type, what: str) -> Any:
-        """Return the value of a constant expression as a value of type `kind`; `what` names it in errors. Raises `FileInvalid`."""
+        """Return the value of a constant expression of type `kind`; `what` names it in errors. Raises `FileInvalid`."""
         compiler = self._expressions()
         value = compiler.settled(compiler.value(expr, kind), expr.pos)
         compiler.coerced(value, kind, expr.pos, what)

@@ -12,7 +12,7 @@ from fieldtwin.plc.st.syntax.walk import nodes
 def written_by_several_tasks(unit: t.SourceUnit, tasks: Mapping[str, str]) -> Iterator[StWarning]:
     """Yield a finding for each global variable that programs of several tasks write, also through function blocks and functions.
 
-    `tasks` has the task of each PROGRAM, or program of a configuration, that the PLC runs; "" stands for the only PROGRAM of the unit.
+    `tasks` has the task of each PROGRAM, or program of a configuration, that the PLC runs; "" stands for the only PROGRAM.
     """
     pous = {pou.name.lower(): pou for pou in unit.pous}
     programs = [pou for pou in unit.pous if pou.kind == "PROGRAM"]

@@ -226,7 +226,7 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A TASK of the resource `resource` ("" for a configuration without one). `values`: INTERVAL, PRIORITY, SINGLE, in capitals."""
+    """A TASK of a resource ("" for a configuration without one). `values` has INTERVAL, PRIORITY and SINGLE, in capitals."""
 
     pos: Pos
     name: str
@@ -236,8 +236,8 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Instance:
-    """A program that a CONFIGURATION or RESOURCE runs: `name` is the instance, `program` its type, `task` the name of its task ("" for
-    none). `arguments` connect its variables with global variables.
+    """A program that a CONFIGURATION or RESOURCE runs: `name` is the instance, `program` its type, `task` that of its task, or
+    "". `arguments` connect its variables with global variables.
     """
 
     pos: Pos

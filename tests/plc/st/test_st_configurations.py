@@ -82,7 +82,7 @@ def test_a_program_without_connections_is_not_connected() -> None:
 
 
 def test_the_program_of_a_configuration_has_to_be_named_if_there_are_several() -> None:
-    with pytest.raises(FileInvalid, match="which program of the configuration is meant.*expected a, b"):
+    with pytest.raises(FileInvalid, match=r"which program of the configuration is meant.*expected a, b"):
         program(TWO, "Main")
 
 

@@ -16,7 +16,7 @@ from fieldtwin.plc.st.syntax.written import text_of
 
 @dataclass(frozen=True, slots=True)
 class CompiledTask:
-    """A TASK. `interval_ns` is 0 if it has no INTERVAL. `single` is the text of SINGLE, such as ``start`` or ``%IX0.0``; "" for none.
+    """A TASK. `interval_ns` is 0 if it has no INTERVAL. `single` is the text of SINGLE, such as ``start``; "" if it has none.
 
     `priority` is from 0, the highest and the default, to 65535.
     """

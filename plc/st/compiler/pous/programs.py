@@ -123,7 +123,7 @@ class Programs(Bodies):
                             body.take(argument, Value(symbol.code, symbol.type))
 
     def _is_connection(self, argument: t.Argument, pou: t.Pou) -> bool:
-        """Return whether an argument of a program names an input with a value, or an output with a target; if not, add an error."""
+        """Return whether an argument of a program is an input with a valueor an output with a target; add an error if not."""
         kind, what = ("VAR_INPUT", "input") if argument.value is not None else ("VAR_OUTPUT", "output")
         known = [v.name for b in pou.blocks if b.kind == kind for v in b.variables if not v.location]
         if argument.name.lower() in {name.lower() for name in known}:

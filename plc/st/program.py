@@ -269,7 +269,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
 def instance_of(unit: CompiledUnit, name: str = "") -> CompiledInstance | None:
     """Return the program of a configuration that `name` means: its name, or the PROGRAM that only this one has.
 
-    An empty `name` stands for the only PROGRAM of the unit. Return None if there is no such program, or if there are several.
+    An empty `name` stands for the only PROGRAM of the unit. Return None if no program or several programs match.
     """
     programs = [p.name for p in unit.programs]
     wanted = (name or (programs[0] if len(programs) == 1 else "")).lower()

@@ -1,1 +1,1 @@
-"""What a system takes from the sources of its programs while its file is loaded."""
+"""Settings that a system takes from the sources of its programs while its file is loaded."""

@@ -102,7 +102,7 @@ def _form(file: YamlFile, plc: PlcForm, folder: Path, task: CompiledTask) -> Tas
 
 
 def _trigger(plc: PlcForm, folder: Path, single: str) -> str | None:
-    """Return the tag of the variable that SINGLE names, of the first program that offers it; None if there is none."""
+    """Return the tag of the variable that SINGLE names, of the first program that offers it; None if no program does."""
     for name, form in plc.programs.items():
         found = _unit(form, folder)
         if found is None:

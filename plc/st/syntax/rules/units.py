@@ -90,7 +90,8 @@ class UnitRules(Rules):
         return name.upper(), value
 
     def instance(self, meta: Meta, items: list[Any]) -> t.Instance:
-        name, *rest = [item for item in items if isinstance(item, Token) or not isinstance(item, str)]
+        parts: list[Any] = [item for item in items if isinstance(item, Token) or not isinstance(item, str)]
+        name, *rest = parts
         task = rest.pop(0).name if isinstance(rest[0], _InTask) else ""
         program, *arguments = rest
         return t.Instance(self._pos(program), str(name), str(program), task, tuple(arguments))

@@ -33,6 +33,7 @@ COMMANDS = {
         "Confirm or refuse a write that a language-model agent has proposed.",
     ),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
+    "alarm": ("fieldtwin.cli.run.alarm_command", "List the alarms of a running instance; acknowledge and shelve them."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
         "fieldtwin.cli.plc.plc_command",
@@ -137,7 +138,7 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("new", "run", "simulate", "studio", "mcp", "approve", "reload", "emulate", "with"),
+        *("new", "run", "simulate", "studio", "mcp", "approve", "reload", "alarm", "emulate", "with"),
         *("plc", "topside", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (

@@ -14,6 +14,7 @@ from starlette.staticfiles import StaticFiles
 
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.studio.access import Access
+from fieldtwin.studio.alarms import api as alarms
 from fieldtwin.studio.api import commissioning, faults, frames, instances, plc, scenarios, tags, traces, twin
 from fieldtwin.studio.api.operation import PREFIX, Operation
 from fieldtwin.studio.api_application import api_application
@@ -36,6 +37,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *frames.OPERATIONS,
     *plc.OPERATIONS,
     *faults.OPERATIONS,
+    *alarms.OPERATIONS,
     *scenarios.OPERATIONS,
     *traces.OPERATIONS,
     *campaigns.OPERATIONS,

@@ -50,6 +50,33 @@ def session() -> RunSession:
     return made
 
 
+ALARM = {
+    "state": "normal", "active": False, "quality": "good", "reason": "none", "priority": "low", "text": "",
+    "condition": "a.b > 1", "acknowledge": True, "by": "", "in_state_s": None, "shelved_for_s": None,
+}  # fmt: skip
+
+
+def test_alarms_that_need_attention_are_shown_the_most_important_first(session: RunSession) -> None:
+    session.gateway_status = gateway_status(
+        alarms={
+            "calm": ALARM,
+            "level": ALARM | {"state": "active_unacknowledged", "text": "Open the drain", "in_state_s": 5.0},
+            "fire": ALARM | {"state": "active_acknowledged", "priority": "critical", "by": "jo", "in_state_s": 180.0},
+            "lost": ALARM | {"quality": "bad", "reason": "never_read"},
+            "test": ALARM | {"state": "shelved"},
+        }
+    )
+    rows = [text.split() for text in shown(session, 100)]
+    listed = rows[rows.index(["alarm", "state", "quality", "priority", "for", "text"]) + 1 :][:4]
+    assert [" ".join(row) for row in listed] == [
+        "fire active acknowledged good critical 3 min (by jo)",
+        "level active unacknowledged good low 5 s Open the drain",
+        "lost normal bad (never read) low -",
+        "test shelved good low -",
+    ]
+    assert "ALARMS=fire,level" in line(session)
+
+
 def shown(session: RunSession, width: int, height: int = 60) -> list[str]:
     out = StringIO()
     console = Console(file=out, width=width, height=height, force_terminal=False)

@@ -50,7 +50,7 @@ class TagWatch:
         `AT_ONCE`, none if `since` is None; ``dropped``, how many of them are no longer kept; ``last``, the newest number;
         ``tags``, with value, quality, reason and source time (ns) of each of `names`; ``refusals``, the writes that did not
         reach their device, from the journal entry after number `refused` on; ``alarms``, the changes of alarms after number
-        `alarms`.
+        `alarms`, none if it is None.
 
         A change is a value, quality or reason that differs from the last one of its tag. With ``"samples": true`` the entries
         are all samples instead, equal ones too, with numbers of their own.
@@ -58,12 +58,12 @@ class TagWatch:
         Raises `UsageError` for an unknown tag.
         """
         since, names, refused = args.get("since"), args.get("names", []), args.get("refused", 0)
-        alarms = args.get("alarms", 0)
-        numbers = all(type(number) is int for number in (refused, alarms, 0 if since is None else since))
+        alarms = args.get("alarms")
+        numbers = all(number is None or type(number) is int for number in (since, alarms)) and type(refused) is int
         if not numbers or not isinstance(names, list):
             raise UsageError(
                 "what to watch",
-                expected='{"since": NUMBER or null, "samples": true or false, "refused": NUMBER, "alarms": NUMBER, '
+                expected='{"since": NUMBER or null, "samples": true or false, "refused": NUMBER, "alarms": NUMBER or null, '
                 '"names": [TAG...]}',
             )
         now_ns = self._clock.monotonic_ns()
@@ -81,7 +81,7 @@ class TagWatch:
             "dropped": 0 if since is None else max(0, ring.oldest - since - 1),
             "tags": {name: _shown(self._tags.current(name, now_ns)) for name in names},
             "refusals": [r.status() for r in self._journal.since(refused)] if self._journal is not None else [],
-            "alarms": self._alarms.events_since(alarms) if self._alarms is not None else [],
+            "alarms": [] if self._alarms is None or alarms is None else self._alarms.events_since(alarms),
         }
 
     def _put(self, name: str, value: TagValue) -> None:

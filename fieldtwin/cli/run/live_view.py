@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtwin.cli.plc.views import value_text
+from fieldtwin.cli.run.alarms_view import MOST_ALARMS, alarm_table, alarms_line, standing
 from fieldtwin.cli.run.troubles import fronts_of, interference, troubles, waiting_once
 from fieldtwin.console import stderr
 from fieldtwin.gateway.runtime.gateway_status import BusStatus
@@ -156,6 +157,8 @@ def line(session: RunSession) -> str:
         parts.append(f"PLC WAITING={','.join(plc.waiting)}")
     if plc is not None and plc.forces:
         parts.append(f"FORCED={','.join(plc.forces)}")
+    if gateway is not None and (alarms := alarms_line(gateway.alarms)):
+        parts.append(f"ALARMS={alarms}")
     if gateway is not None and not gateway.plc.alive:
         parts.append("PLC LOST")
     return " ".join(parts)
@@ -172,6 +175,7 @@ def _p99(plc: PlcStatus) -> str:
 
 def render(session: RunSession) -> RenderableType:
     """Return the live table, fitted to the terminal's width."""
+    gateway = session.gateway_status
     kind = "prototype" if session.options.prototype else "plant"
     left = session.options.duration_s
     clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
@@ -179,6 +183,8 @@ def render(session: RunSession) -> RenderableType:
     parts: list[RenderableType] = [head, _devices(session), _foot(session)]
     parts += [Text(text, style="bold yellow") for text in interference(session)]
     parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
+    if gateway is not None and (alarms := standing(gateway.alarms)):
+        parts.append(alarm_table(dict(islice(alarms.items(), MOST_ALARMS))))
     parts.append(_tags(session))  # this table comes last, so that a low terminal cuts off only the end of the list
     return Group(*parts)
 

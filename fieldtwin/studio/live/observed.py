@@ -35,6 +35,7 @@ def describe_system(system: System) -> dict[str, Any]:
             }
             for name, form in system.plc.programs.items()
         },
+        "alarms": list(system.alarms),
         "cycle_ms": system.plc.cycle_ms,
     }
 

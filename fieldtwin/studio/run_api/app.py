@@ -10,6 +10,7 @@ from starlette.applications import Starlette
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.northbound.http_tokens import tokens_of
 from fieldtwin.studio.access import VIEW, Access, allowed_hosts
+from fieldtwin.studio.alarms import api as alarms
 from fieldtwin.studio.api import faults, frames, instances, plc, tags
 from fieldtwin.studio.api_application import api_application
 from fieldtwin.studio.live.gallery import Gallery
@@ -22,6 +23,7 @@ OPERATIONS = (
     *frames.OPERATIONS,
     *plc.OPERATIONS,
     *faults.OPERATIONS,
+    *alarms.OPERATIONS,
 )
 TITLE = "fieldtwin run"
 

@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
 from fieldtwin.gateway.core.conditions.decimals import as_decimal
+from fieldtwin.gateway.runtime.alarms.state_machine import ACKNOWLEDGEABLE
 from fieldtwin.studio.scenarios.recorder import Action, Recording, Seen, State
 
 BRIEF_NS = 500_000_000
@@ -72,6 +73,8 @@ def _steps(recording: Recording, expected: list[list[_Expected]]) -> Iterator[st
         elif _never_read(recording, n):
             yield "  # Left out: the gateway did not read the set value before it was released."
         else:
+            if "acknowledge" in action.step:
+                yield f"  - wait: {{until: {json.dumps(_to_acknowledge(action.step['acknowledge']))}, within: {KNOWN_WITHIN_S}s}}"
             yield f"  - {_flow(action.step)}"
         for one in expected[n][:MOST_OF_A_PERIOD]:
             within = math.ceil(2 * (one.t_ns - now_ns) / 1e9 + one.slack_s)
@@ -165,6 +168,11 @@ def _never_read(recording: Recording, n: int) -> bool:
 def _told(action: Action) -> dict[str, Any] | None:
     told: dict[str, Any] | None = (action.step or {}).get("set")
     return told
+
+
+def _to_acknowledge(alarm: str) -> str:
+    """Return the expression in which an alarm can be acknowledged."""
+    return " or ".join(f"{alarm} == {state.value!r}" for state in ACKNOWLEDGEABLE)
 
 
 def _delay(ns: int) -> str:

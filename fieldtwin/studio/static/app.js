@@ -14,6 +14,7 @@ import { Bus } from "./views/bus.js";
 import { Plc } from "./views/plc.js";
 import { Trends } from "./views/trends.js";
 import { Faults } from "./views/faults.js";
+import { Alarms, standing } from "./views/alarms.js";
 import { Scenario } from "./views/scenario.js";
 import { FailedChecks, Timeline } from "./views/timeline.js";
 import { Guide } from "./commissioning/guide.js";
@@ -25,6 +26,7 @@ const VIEWS = {
   bus: { title: "Bus", view: Bus, fill: true },
   plc: { title: "PLC", view: Plc },
   trends: { title: "Trends", view: Trends },
+  alarms: { title: "Alarms", view: Alarms, live: true, shown: (store) => store.about?.system.alarms.length > 0 },
   faults: { title: "Faults", view: Faults, prototype: true },
   scenario: { title: "Scenario", view: Scenario, live: true },
   twin: { title: "Twin", view: Twin, live: true },
@@ -88,8 +90,8 @@ function Instance({ place }) {
     <${Banners} store=${store} />
     <nav class="nav" aria-label="Views">
       ${Object.entries(VIEWS).map(
-        ([name, { title, prototype, live }]) =>
-          (!prototype || store.isPrototype) && !(live && store.isTrace) &&
+        ([name, { title, prototype, live, shown }]) =>
+          (!prototype || store.isPrototype) && !(live && store.isTrace) && (!shown || shown(store)) &&
           html`<a href=${address(place.instance, name)} aria-current=${name === place.view ? "page" : null}>
             ${title} <${Count} store=${store} view=${name} />
           </a>`,
@@ -109,8 +111,8 @@ function Instance({ place }) {
 function Count({ store, view }) {
   const forces = Object.keys(store.status?.plc?.forces ?? {}).length;
   const faults = (store.status?.field?.faults?.length ?? 0) + Object.keys(store.status?.field?.set ?? {}).length;
-  const count = view === "plc" ? forces : view === "faults" ? faults : 0;
-  return count ? html`<span class="count" title=${view === "plc" ? "active forces" : "active faults"}>${count}</span>` : null;
+  const [count, title] = { plc: [forces, "active forces"], faults: [faults, "active faults"], alarms: [standing(store), "alarms that are active or not acknowledged"] }[view] ?? [0, ""];
+  return count ? html`<span class="count" title=${title}>${count}</span>` : null;
 }
 
 function Top({ store }) {

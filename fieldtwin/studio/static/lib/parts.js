@@ -66,6 +66,30 @@ export function Dialog({ title, onClose, children }) {
   </dialog>`;
 }
 
+/** Ask for a number and send it. `above` and `below` are drawn around the field; `below` gets null while the text is no number. */
+export function NumberDialog({ title, label, first = "", unit, action, danger, send, above, below, onClose }) {
+  const [text, setText] = useState(first);
+  const [run, error, busy] = useAction();
+  const entered = Number(text.replace(",", "."));
+  const wanted = text.trim() !== "" && Number.isFinite(entered) ? entered : null;
+  const submit = async (e) => {
+    e.preventDefault();
+    if (await run(() => send(wanted))) onClose();
+  };
+  return html`<${Dialog} title=${title} onClose=${onClose}>
+    <form onSubmit=${submit}>
+      ${above}
+      <${Failure} text=${error} />
+      <label>${label} <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${unit}</label>
+      ${below(wanted)}
+      <footer>
+        <button type="button" onClick=${onClose}>Cancel</button>
+        <button class=${danger ? "danger" : "primary"} disabled=${wanted === null || busy}>${action}</button>
+      </footer>
+    </form>
+  <//>`;
+}
+
 /** The values of the last minute as a small line; times without a good value are shaded. */
 export function Sparkline({ points, now, width = 110, height = 22 }) {
   if (!points?.length) return html`<svg class="spark" width=${width} height=${height} aria-hidden="true"></svg>`;

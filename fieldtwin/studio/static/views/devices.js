@@ -3,7 +3,7 @@
 import { html, useState } from "../vendor/preact.js";
 import { post, put, remove } from "../lib/api.js";
 import { age, number, value } from "../lib/format.js";
-import { ChangesLost, Dialog, Failure, Quality, Sparkline, useAction } from "../lib/parts.js";
+import { ChangesLost, Failure, NumberDialog, Quality, Sparkline, useAction } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { address } from "../lib/address.js";
 
@@ -107,28 +107,4 @@ function WriteDialog({ store, full, about, onClose }) {
     below=${(wanted) => html`<p>${number(old)} ${about.unit} → <strong>${wanted === null ? "…" : number(wanted)} ${about.unit}</strong></p>`}
     onClose=${onClose}
   />`;
-}
-
-/** Ask for a number and send it. `above` and `below` are drawn around the field; `below` gets null while the text is no number. */
-function NumberDialog({ title, label, first = "", unit, action, danger, send, above, below, onClose }) {
-  const [text, setText] = useState(first);
-  const [run, error, busy] = useAction();
-  const entered = Number(text.replace(",", "."));
-  const wanted = text.trim() !== "" && Number.isFinite(entered) ? entered : null;
-  const submit = async (e) => {
-    e.preventDefault();
-    if (await run(() => send(wanted))) onClose();
-  };
-  return html`<${Dialog} title=${title} onClose=${onClose}>
-    <form onSubmit=${submit}>
-      ${above}
-      <${Failure} text=${error} />
-      <label>${label} <input autofocus value=${text} onInput=${(e) => setText(e.target.value)} inputmode="decimal" /> ${unit}</label>
-      ${below(wanted)}
-      <footer>
-        <button type="button" onClick=${onClose}>Cancel</button>
-        <button class=${danger ? "danger" : "primary"} disabled=${wanted === null || busy}>${action}</button>
-      </footer>
-    </form>
-  <//>`;
 }

@@ -1,0 +1,1 @@
+"""The alarm list of an instance, for pages and clients."""

@@ -9,7 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 MAX_FILES = 2_000
 """The largest number of files in a folder of a program."""
-SUFFIXES = (".st", ".iecst", ".exp", ".xml", ".tcpou", ".tcdut", ".tcgvl")
+SUFFIXES = (".st", ".iecst", ".exp", ".xml", ".tcpou", ".tcdut", ".tcgvl", ".tcio")
 """The file names' endings in lower case: Structured Text (as written here, and by other tools), PLCopen XML, TwinCAT."""
 
 TEST_SUFFIX = ".test.st"

@@ -34,11 +34,12 @@ def without_edges(unit: t.SourceUnit) -> t.SourceUnit:
 def _without_edges(pou: t.Pou, errors: ErrorCollector) -> t.Pou:
     edges: dict[str, t.VarDecl] = {}
     for block in pou.blocks:
-        place = block.kind if pou.kind != "FUNCTION" else "a FUNCTION, which keeps no values"
+        place = f"a {pou.kind}, which keeps no values" if pou.kind in ("FUNCTION", *t.METHODS) else block.kind
         for variable in block.variables:
             _check(variable, place, errors)
             if variable.edge:
                 edges[variable.name.lower()] = variable
+    methods = tuple(_without_edges(method, errors) for method in pou.methods)
     if not edges:
         return pou
     declared = [t.VarDecl(v.pos, _trigger(v.name), t.NamedType(v.pos, _BLOCKS[v.edge]), None) for v in edges.values()]
@@ -48,6 +49,7 @@ def _without_edges(pou: t.Pou, errors: ErrorCollector) -> t.Pou:
         blocks=(*pou.blocks, t.VarBlock(pou.pos, "VAR", frozenset(), tuple(declared))),
         body=(*calls, *_reading(pou.body, edges)),
         actions=tuple(replace(action, body=_reading(action.body, edges)) for action in pou.actions),
+        methods=tuple(replace(method, body=_reading(method.body, edges)) for method in methods),
     )
 
 

@@ -152,9 +152,14 @@ def _at(kind: ty.Array, value: Any, at: Sequence[int]) -> Any:
 
 
 def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
-    """Return a value for display: an enumerated value by its name, a date as a literal, an array with its first elements."""
+    """Return a value for display: an enumerated value by its name, a date as a literal, an array with its first elements.
+
+    Of a variable of an interface type, the type of the instance is shown.
+    """
     if isinstance(kind, ty.Array):
         return _elements(kind, value)
+    if isinstance(kind, ty.Interface):
+        return "NULL" if value is None else f"an instance of {value.of.name}"
     if isinstance(kind, ty.Enum):
         return next((word for word, number in kind.values.items() if number == value), str(value))
     if isinstance(kind, ty.String):

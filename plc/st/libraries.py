@@ -7,7 +7,7 @@ declarations have precedence over those of libraries, and a library over those t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -96,17 +96,32 @@ def _owner(missing: t.Missing) -> str:
 
 def _names(root: Any) -> Iterator[str]:
     """Yield the names, in lower case, of types, variables and POUs to which a declaration may refer."""
-    pous = (*root.pous, *root.tests) if isinstance(root, t.SourceUnit) else ()
-    parts = [*root.types, *root.globals] if isinstance(root, t.SourceUnit) else [root]
-    for part in (*parts, *pous):
-        local = set()
-        if isinstance(part, t.Pou | t.Test):
-            local = {v.name.lower() for b in part.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
-            yield from (v.name.lower() for b in part.blocks if b.kind == "VAR_EXTERNAL" for v in b.variables)
-        yield from _references(part, local)
+    parts = [*root.types, *root.globals, *root.pous, *root.tests] if isinstance(root, t.SourceUnit) else [root]
+    for part in parts:
+        if isinstance(part, t.Pou):
+            yield from _of_pou(part, frozenset())
+        elif isinstance(part, t.Test):
+            yield from _of_variables(part, frozenset())
+        else:
+            yield from _references(part, frozenset())
 
 
-def _references(root: Any, local: set[str]) -> Iterator[str]:
+def _of_pou(pou: t.Pou, outer: frozenset[str]) -> Iterator[str]:
+    """Yield the names of a POU and its methods. `outer` are the variables of the owner of a method."""
+    yield from _of_variables(replace(pou, methods=()), outer)
+    own = outer | {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+    for method in pou.methods:
+        yield from _of_pou(method, own)
+
+
+def _of_variables(part: t.Pou | t.Test, outer: frozenset[str]) -> Iterator[str]:
+    """Yield the names of a part that declares variables. `outer` are further variables that it can use."""
+    own = outer | {v.name.lower() for b in part.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+    yield from (v.name.lower() for b in part.blocks if b.kind == "VAR_EXTERNAL" for v in b.variables)
+    yield from _references(part, own)
+
+
+def _references(root: Any, local: frozenset[str]) -> Iterator[str]:
     for node in nodes(root):
         if isinstance(node, t.NamedType | t.SubrangeType) or (
             isinstance(node, t.Ref) and node.name.lower() not in local

@@ -80,7 +80,10 @@ class StProgram(Program):
             getattr(body, connection(self.st_instance, into=True))()
         for item in self.st_inputs:
             item.put(body, namespace[item.name])
-        body.execute()
+        try:
+            body.execute()
+        except RecursionError as e:
+            raise _too_deep(e) from None
         if self.st_instance:
             getattr(body, connection(self.st_instance, into=False))()
         self.st_show()
@@ -196,6 +199,12 @@ class _Input:
             return self.convert(value)
         except values.LogicError as e:
             raise values.LogicError(f"input {self.name}: {e.message}", expected=e.expected, got=e.got) from e
+
+
+def _too_deep(error: RecursionError) -> values.LogicError:
+    """Return the error of calls that are nested too deep. The compiler refuses recursion, except through interfaces."""
+    found = values.LogicError("calls nested too deep", hint="a method calls itself through an interface")
+    return found.with_traceback(error.__traceback__)
 
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:

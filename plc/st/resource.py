@@ -16,6 +16,7 @@ from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.runtime.references import Instance
 
 MAX_STEPS = 1_000_000
 """How many loop iterations, and calls of functions and function blocks, a program may make in one scan. The limit is
@@ -27,13 +28,15 @@ Together = dict[Any, Any]
 class Context:
     """The interface through which compiled code uses the running scan."""
 
-    __slots__ = ("first_scan", "left", "lookup", "now_ns")
+    __slots__ = ("first_scan", "instances", "left", "lookup", "now_ns")
 
     def __init__(self) -> None:
         self.left = MAX_STEPS
         """The number of loop iterations and calls that the scan may still make."""
         self.now_ns = 0
         self.first_scan = False
+        self.instances = 0
+        """The number of instances that variables of an interface type can refer to."""
         self.lookup: Callable[[str], TagValue] | None = None
 
     @property
@@ -45,6 +48,11 @@ class Context:
         """Return whether an input is good. A forced value counts as good: the user who forces it wants it to be used."""
         assert self.lookup is not None
         return self.lookup(name).quality in (Quality.GOOD, Quality.SIMULATED)
+
+    def number(self) -> int:
+        """Return the number of a new instance, by which states refer to it."""
+        self.instances += 1
+        return self.instances
 
     @staticmethod
     def too_long() -> NoReturn:
@@ -105,6 +113,8 @@ def state_of(value: Any, now_ns: int) -> Any:
         return tuple([state_of(v, now_ns) for v in value])
     if isinstance(value, FunctionBlock):
         return type(value).__name__, *value.state(now_ns)
+    if isinstance(value, Instance):
+        return value.of.number
     if isinstance(value, Outbox):
         return value.outstanding, tuple(value.pending)
     names = getattr(value, "__slots__", None)

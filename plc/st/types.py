@@ -138,6 +138,8 @@ class Struct:
     fields: Mapping[str, tuple[str, Type]] = field(hash=False)
     elements: int = 1
     nested: int = 1
+    refers: bool = False
+    """Whether it contains a reference to an instance."""
 
     def __str__(self) -> str:
         return self.name
@@ -145,8 +147,8 @@ class Struct:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A function block: a block of the standard, whose class is `standard`, or a block of the user. The mappings give for each
-    name in lower case the name as declared and the type; `actions` are the names of its actions in lower case."""
+    """A function block: a block of the standard, whose class is `standard`, or a block or class of the user. The mappings give
+    for each name in lower case the name as declared and the type. All other names are in lower case."""
 
     name: str
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -156,9 +158,43 @@ class Block:
     elements: int = 8
     nested: int = 1
     actions: frozenset[str] = frozenset()
+    publics: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
+    """The variables in VAR PUBLIC."""
+    bases: frozenset[str] = frozenset()
+    """The blocks and classes that this one extends, directly or through others."""
+    interfaces: frozenset[str] = frozenset()
+    """The interfaces that this one implements, also through its bases."""
+    refers: bool = False
+    """Whether it contains a reference to an instance."""
+    is_class: bool = False
+    """Whether it is a class, which has no body and cannot be called."""
+    abstract: bool = False
 
     def __str__(self) -> str:
         return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """An interface. A variable of this type refers to an instance, or is NULL. `bases` are the interfaces that it extends,
+    directly or through others, in lower case."""
+
+    name: str
+    bases: frozenset[str] = frozenset()
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Null:
+    """The type of NULL, the reference to no instance."""
+
+    def __str__(self) -> str:
+        return "NULL"
+
+
+NULL = Null()
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +229,7 @@ class MessagesOut:
 
 Type = (
     Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | MessagesIn | MessagesOut | Nothing
+    | Interface | Null
 )  # fmt: skip
 
 
@@ -242,7 +279,20 @@ def fits(source: Type, target: Type) -> bool:
         return _widens(source, sink)
     if isinstance(source, String) and isinstance(sink, String):
         return source.wide == sink.wide
+    if isinstance(sink, Interface) and isinstance(source, Block | Interface | Null):
+        return isinstance(source, Null) or source == sink or sink.name.lower() in _implemented(source)
     return source == sink
+
+
+def _implemented(kind: Block | Interface) -> frozenset[str]:
+    return kind.interfaces if isinstance(kind, Block) else kind.bases
+
+
+def holds_interface(kind: Type) -> bool:
+    """Return whether a value of this type is, or contains, a reference to an instance."""
+    if isinstance(kind, Array):
+        return holds_interface(kind.of)
+    return isinstance(kind, Interface) or (isinstance(kind, Struct | Block) and kind.refers)
 
 
 def _widens(source: Elementary, target: Elementary) -> bool:

@@ -28,19 +28,22 @@ from fieldtwin.plc.st.runtime.moments import (
     tod_of,
     tod_text,
 )
-from fieldtwin.plc.st.runtime.references import Cell, Cut, Element, MemberReference
+from fieldtwin.plc.st.runtime.references import Cell, Cut, Element, Instance, MemberReference, instance, same
 
 __all__ = [  # and all names that compiled code calls
     "Cell",
     "Cut",
     "Element",
+    "Instance",
     "LogicError",
     "MemberReference",
     "date_of",
     "date_text",
     "day_of_week",
     "dt_of",
+    "instance",
     "moment_text",
+    "same",
     "split_date",
     "split_dt",
     "split_tod",

@@ -109,7 +109,8 @@ def _summary(found: Checked) -> str:
 
 
 def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    plural = "es" if what.endswith("s") else "s"
+    return f"{count} {what}{'' if count == 1 else plural}"
 
 
 def _as_json(found: Checked) -> dict[str, object]:

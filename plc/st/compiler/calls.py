@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.classes.members import Selected, class_of, note, selected
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
@@ -22,14 +25,18 @@ class Calls(Expressions):
 
     def call(self, call: t.Call) -> Value:
         name = call.ref.name.lower()
-        signature = self.env.functions.get(name)
+        method = selected(self, call.ref, "METHOD")
+        signature = method.method.signature if method is not None else self.env.functions.get(name)
         inner, en, eno = split_control(self.env, call, signature.names() if signature is not None else ())
         if en is not None or eno is not None:
             return self._controlled_call(inner, en, eno)
-        if not call.ref.selectors and name in self.env.functions:
+        if signature is not None and (method is not None or not call.ref.selectors):
             if self.only_constants:
                 self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
-            return self._user_function(call, self.env.functions[name])
+            if method is not None:
+                return self._user_function(call, signature, method)
+            note(self, name, call.pos)
+            return self._user_function(call, signature)
         if not call.ref.selectors:
             self.env.refuse_missing(name, call.pos)
         own = self.symbols.get(name)
@@ -46,7 +53,18 @@ class Calls(Expressions):
                 + [s.name for s in self.symbols.values()]
             )
             self.env.unknown(call.pos, "a function", call.ref.name, known)
-        raise self.env.error(call.pos, "a function block is called in a separate statement", got=call.ref.name)
+        raise self._wrong_call(call)
+
+    def _wrong_call(self, call: t.Call) -> FileInvalid:
+        """Return the error of a call in an expression that calls neither a function nor a method."""
+        ref = call.ref
+        last = ref.selectors[-1] if ref.selectors else None
+        if isinstance(last, t.Member):
+            of = class_of(self, self.type_of(replace(ref, selectors=ref.selectors[:-1])))
+            if of is not None and last.name.lower() not in of.actions:
+                known = [one.signature.name for one in of.methods.values() if one.kind == "METHOD"]
+                self.env.unknown(last.pos, f"in {of.name}, a method", last.name, known)
+        return self.env.error(call.pos, "a function block is called in a separate statement", got=ref.name)
 
     def _controlled_call(self, call: t.Call, en: t.Expr | None, eno: t.Argument | None) -> Value:
         """Write the call of a function with EN or ENO before the expression of which it is a part."""
@@ -87,22 +105,24 @@ class Calls(Expressions):
         with self.out.block("else:", pos):
             branch(otherwise, False)
 
-    def _user_function(self, call: t.Call, signature: Signature) -> Value:
-        self.env.calls.setdefault(self.pou, {}).setdefault(signature.name.lower(), call.pos)
+    def _user_function(self, call: t.Call, signature: Signature, method: Selected | None = None) -> Value:
+        """Compile the call of a function or method."""
         given = bind(self.env, call, [p.name for p in (*signature.inputs, *signature.in_outs)], signature.name)
-        codes = []
+        codes: list[str] = []
         for p in signature.inputs:
-            expr = _value_of(given.get(p.name.lower()))
-            codes.append(
-                p.initial
-                if expr is None
-                else self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
-            )
+            expr, mark = _value_of(given.get(p.name.lower())), len(self.out.lines)
+            if expr is None:
+                codes.append(p.initial)
+                continue
+            code = self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
+            codes = [self.earlier(Value(one, p.type), mark, expr.pos).code for one in codes]
+            codes.append(code)
         cells: dict[str, str] = {}
         for p in signature.in_outs:
             expr = _value_of(given.get(p.name.lower()))
             codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
-        code = f"f_{signature.name.lower()}({', '.join(codes)})"
+        arguments = ", ".join(codes)
+        code = f"f_{signature.name.lower()}({arguments})" if method is None else method.called(arguments)
         outputs = [a for a in call.arguments if a.target is not None]
         more = bool(signature.outputs)
         if not outputs and all(by_reference(p.type) for p in signature.in_outs):
@@ -129,7 +149,9 @@ class Calls(Expressions):
         self.assign(argument.target, value, argument.pos)
 
     def assign(self, ref: t.Ref, value: Value, pos: t.Pos) -> None:
-        """Write an assignment. An assignment to a bit of a variable keeps all other bits."""
+        """Write an assignment, or the call of SET of a property. An assignment to a bit of a variable keeps all other bits."""
+        if self._assign_property(ref, value, pos):
+            return
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
             whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
             bit(self, whole, ref.selectors[-1])
@@ -149,6 +171,21 @@ class Calls(Expressions):
             self.out.line(f"_v.put({target.code}, {code})", pos)
         else:
             self.out.line(f"{target.code} = {code}", pos)
+
+    def _assign_property(self, ref: t.Ref, value: Value, pos: t.Pos) -> bool:
+        """Write the call of SET if `ref` is a property; return False if it is not."""
+        if not ref.selectors and ref.name.lower() in self.symbols:
+            return False
+        setter = selected(self, ref, "SET")
+        if setter is not None:
+            kind = setter.method.signature.inputs[0].type
+            code = self.coerced(value, kind, pos, f"assigned to {ref.name}")
+            self.out.line(setter.called(code), pos)
+            return True
+        getter = selected(self, ref, "GET")
+        if getter is not None:
+            self.env.fail(ref.pos, f"property {getter.method.owner}.{getter.method.signature.name} has no SET")
+        return False
 
     def writable(self, ref: t.Ref) -> Value:
         target = variable(self, ref)
@@ -176,7 +213,10 @@ class Calls(Expressions):
         if not isinstance(expr, t.Ref):
             self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
         target = self.writable(expr)
-        if target.type != kind and not (isinstance(kind, ty.String) and ty.fits(target.type, kind)):
+        extends = (
+            isinstance(target.type, ty.Block) and isinstance(kind, ty.Block) and kind.name.lower() in target.type.bases
+        )
+        if target.type != kind and not extends and not (isinstance(kind, ty.String) and ty.fits(target.type, kind)):
             self.env.fail(expr.pos, f"VAR_IN_OUT {name} of {of}", expected=str(kind), got=str(target.type))
         if by_reference(kind):
             return target.code

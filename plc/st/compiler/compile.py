@@ -15,12 +15,14 @@ from types import CodeType
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
+from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
 from fieldtwin.plc.st.compiler.configurations.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.execution_control import with_execution_control
 from fieldtwin.plc.st.compiler.pous.blocks import Blocks
 from fieldtwin.plc.st.compiler.pous.functions import Functions
+from fieldtwin.plc.st.compiler.pous.hierarchy import KINDS, Hierarchy
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, Programs
 from fieldtwin.plc.st.compiler.pous.recursion import refuse_recursion
 from fieldtwin.plc.st.compiler.pous.source_lines import SourceLines
@@ -46,9 +48,9 @@ class CompiledUnit:
     python: str
     programs: tuple[CompiledProgram, ...]
     blocks: Mapping[str, tuple[tuple[str, ty.Type], ...]]
-    """By the name of a FUNCTION_BLOCK in lower case: its variables that keep their values, with their types."""
+    """By the name of a FUNCTION_BLOCK or CLASS in lower case: its variables that keep their values, with their types."""
     kinds: tuple[str, ...]
-    """The kind of each declaration: program, function, function block, type or global variable."""
+    """The kind of each declaration: program, function, function block, class, interface, type or global variable."""
     warnings: tuple[StWarning, ...] = ()
     missing: tuple[t.Missing, ...] = ()
     """The declarations that were not imported and are not used."""
@@ -86,7 +88,7 @@ class _Unit:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
         unit = with_configured(unit)
-        self.unit = without_edges(without_charts(without_addresses(unit)))
+        self.unit = with_inherited(without_edges(without_charts(without_addresses(unit))))
         if not dialect.vendor:
             self.unit = with_execution_control(self.unit)
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
@@ -100,12 +102,16 @@ class _Unit:
         self.variables.declare_globals()
         self.instances = compiled_instances(self.env, self.unit, self.declarations)
         self.functions = Functions(self.variables)
-        self.blocks = Blocks(self.variables)
-        self.programs = Programs(self.variables, self.unit)
+        self.blocks = Blocks(self.variables, self.functions)
+        self.programs = Programs(self.variables, self.functions, self.unit)
+        hierarchy = Hierarchy(self.env, self.declarations, self.functions)
         for pou in self.unit.pous:
             if pou.kind == "FUNCTION":
                 with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
                     self.env.functions[pou.name.lower()] = self.functions.signature(pou)
+            elif pou.kind in KINDS:
+                with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
+                    hierarchy.add(pou)
 
     def compiled(self) -> CompiledUnit:
         programs = []
@@ -115,9 +121,9 @@ class _Unit:
                 if pou.kind == "FUNCTION":
                     if pou.name.lower() in self.env.functions:  # without an error in its declaration
                         self.functions.write(pou)
-                elif pou.kind == "FUNCTION_BLOCK":
+                elif pou.kind in ("FUNCTION_BLOCK", "CLASS"):
                     self.blocks.write(pou)
-                else:
+                elif pou.kind == "PROGRAM":
                     programs.append(self.programs.write(pou))
         with self.env.errors.collect():
             refuse_recursion(self.env)

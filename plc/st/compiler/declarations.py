@@ -27,11 +27,12 @@ class Declarations:
         self.out = out
         self.scope: dict[str, Symbol] = {}
         """The constants of the POU whose declarations are being read."""
-        self._constants: dict[str, dict[str, Symbol]] = {}
+        self._constants: dict[t.Pos, dict[str, Symbol]] = {}
+        """The constants of each POU and method, by its position."""
         self._deep = 0
         self._unit = unit
         self._types: dict[str, t.TypeDecl] = {}
-        self._blocks = {p.name.lower(): p for p in unit.pous if p.kind == "FUNCTION_BLOCK"}
+        self._blocks = {p.name.lower(): p for p in unit.pous if p.kind in ("FUNCTION_BLOCK", "CLASS", "INTERFACE")}
         self._open: list[str] = []
         for declared in unit.types:
             with env.declaring(declared.name, env.faulty):
@@ -49,11 +50,12 @@ class Declarations:
 
     @contextmanager
     def within(self, pou: t.Pou) -> Iterator[None]:
-        """Make the constants of `pou` available to limits and initial values."""
+        """Make the constants of `pou` available to limits and initial values. A method also has those of its owner."""
         before = self.scope
-        self.scope = self._constants.setdefault(pou.name.lower(), {})
+        known = pou.pos in self._constants
+        self.scope = self._constants.setdefault(pou.pos, dict(before) if pou.kind in t.METHODS else {})
         try:
-            if not self.scope:
+            if not known:
                 for block in pou.blocks:
                     for v in block.variables if "CONSTANT" in block.qualifiers else ():
                         found = self.constant(v, f"v_{v.name.lower()}")
@@ -182,7 +184,8 @@ class Declarations:
         if key in self._types:
             return self._declared(self._types[key])
         if key in self._blocks:
-            return self._block(self._blocks[key])
+            pou = self._blocks[key]
+            return self._interface(pou) if pou.kind == "INTERFACE" else self._block(pou)
         self.env.refuse_missing(key, pos)
         if key in _STANDARD:
             return _STANDARD[key]
@@ -197,7 +200,8 @@ class Declarations:
                     self.env.fail(field.pos, f"{field.name} is declared twice")
                 fields[field.name.lower()] = (field.name, self.type_of(field.type))
             total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
-            struct = ty.Struct(declared.name, fields, total, nested + 1)
+            refers = any(ty.holds_interface(kind) for _, kind in fields.values())
+            struct = ty.Struct(declared.name, fields, total, nested + 1, refers)
             self._write_struct(struct, declared)
             return struct
         assert isinstance(declared, t.AliasDecl)
@@ -255,6 +259,7 @@ class Declarations:
 
     def _block(self, pou: t.Pou) -> ty.Block:
         members: dict[str, dict[str, tuple[str, ty.Type]]] = {"VAR_INPUT": {}, "VAR_OUTPUT": {}, "VAR_IN_OUT": {}}
+        publics: dict[str, tuple[str, ty.Type]] = {}
         held: list[ty.Type] = []
         with self.within(pou):
             for block in pou.blocks:
@@ -264,10 +269,35 @@ class Declarations:
                         held.append(kind)
                     if block.kind in members:
                         members[block.kind][v.name.lower()] = (v.name, kind)
+                    elif block.qualifiers & {"PUBLIC", "INTERNAL"} and "CONSTANT" not in block.qualifiers:
+                        publics[v.name.lower()] = (v.name, kind)
         total, nested = self.bounded(pou.pos, held)
         inputs, outputs, in_outs = members.values()
+        base = self.named(pou.extends[0].name, pou.extends[0].pos) if pou.extends else None
         actions = frozenset(action.name.lower() for action in pou.actions)
-        return ty.Block(pou.name, inputs, outputs, in_outs, elements=total, nested=nested + 1, actions=actions)
+        bases, interfaces = frozenset[str](), self._interfaces(pou.implements)
+        if isinstance(base, ty.Block):
+            bases, interfaces = base.bases | {base.name.lower()}, interfaces | base.interfaces
+            actions |= base.actions
+        return ty.Block(
+            pou.name, inputs,
+            outputs,
+            in_outs, elements=total, nested=nested + 1, actions=actions, publics=publics,
+            bases=bases, interfaces=interfaces, refers=any(map(ty.holds_interface, held)), is_class=pou.kind == "CLASS",
+            abstract="ABSTRACT" in pou.modifiers,
+        )  # fmt: skip
+
+    def _interface(self, pou: t.Pou) -> ty.Interface:
+        return ty.Interface(pou.name, self._interfaces(pou.extends))
+
+    def _interfaces(self, names: tuple[t.NamedType, ...]) -> frozenset[str]:
+        """Return the interfaces with these names, and those that they extend, in lower case."""
+        found: set[str] = set()
+        for name in names:
+            kind = self.named(name.name, name.pos)
+            if isinstance(kind, ty.Interface):
+                found |= {kind.name.lower(), *kind.bases}
+        return frozenset(found)
 
     def _constant(self, expr: t.Expr, what: str) -> int:
         return self._expressions().constant_integer(expr, what)
@@ -276,6 +306,10 @@ class Declarations:
 
     def initial(self, kind: ty.Type, init: t.Init | None, spec: t.TypeSpec | None = None) -> str:
         """Return the Python expression of a new variable's value."""
+        of = _element(kind)
+        if isinstance(of, ty.Block) and of.abstract and (place := init or spec) is not None:
+            hint = "declare a POU that extends it, or pass an instance as VAR_IN_OUT"
+            self.env.fail(place.pos, f"{of} is ABSTRACT and has no instances", hint=hint)
         if init is None:
             named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
             return self.env.type_initials.get(named) or default_value(kind)
@@ -340,3 +374,10 @@ class Declarations:
                         code += ".copy()"
                     out.line(f"new.{name} = {code}")
                 out.line("return new")
+
+
+def _element(kind: ty.Type) -> ty.Type:
+    """Return the type of the elements of an array, and of arrays in it; any other type itself."""
+    while isinstance(kind, ty.Array):
+        kind = kind.of
+    return kind

@@ -19,7 +19,8 @@ from fieldtwin.plc.st.syntax import tree as t
 
 def with_execution_control(unit: t.SourceUnit) -> t.SourceUnit:
     """Return `unit` with the bodies of its functions and function blocks that declare EN or ENO under their control."""
-    return replace(unit, pous=tuple(pou if pou.kind == "PROGRAM" else _controlled(pou) for pou in unit.pous))
+    left_out = ("PROGRAM", "INTERFACE")
+    return replace(unit, pous=tuple(pou if pou.kind in left_out else _controlled(pou) for pou in unit.pous))
 
 
 def _controlled(pou: t.Pou) -> t.Pou:
@@ -30,7 +31,8 @@ def _controlled(pou: t.Pou) -> t.Pou:
     if en is not None:
         otherwise = () if eno is None else (_assigned(pou.pos, eno, "FALSE"),)
         body = (t.If(pou.pos, ((t.Ref(pou.pos, en.name), body),), otherwise),)
-    return replace(pou, body=body)
+    methods = tuple(one if "ABSTRACT" in one.modifiers else _controlled(one) for one in pou.methods)
+    return replace(pou, body=body, methods=methods)
 
 
 def _declared(pou: t.Pou, kind: str, name: str) -> t.VarDecl | None:

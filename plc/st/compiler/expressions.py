@@ -3,14 +3,17 @@ is written to the `CodeWriter` first, in order."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
+from fieldtwin.plc.st.compiler.classes.members import own_property_type, property_type
 from fieldtwin.plc.st.compiler.implicit import converted
 from fieldtwin.plc.st.compiler.literals import Malformed, constant
 from fieldtwin.plc.st.compiler.operators import binary, unary
 from fieldtwin.plc.st.compiler.scope import (
+    Class,
     CodeWriter,
     Environment,
     Symbol,
@@ -44,6 +47,8 @@ class Expressions:
         """The control variables of the FOR loops around the statement."""
         self.program_inputs: set[str] = set()
         """The inputs whose quality can be queried, when a PROGRAM is compiled."""
+        self.own: Class | None = None
+        """The class to which the body belongs."""
 
     # -- assignment compatibility ---------------------------------------------------------------------------------------
 
@@ -75,6 +80,8 @@ class Expressions:
             if not value.place:
                 return value.code
             return f"_v.copied({value.code})" if isinstance(source, ty.Array) else f"{value.code}.copy()"
+        if isinstance(target, ty.Interface):
+            return f"_v.Instance({value.code})" if isinstance(source, ty.Block) else value.code
         if isinstance(source, ty.Block | ty.MessagesIn | ty.MessagesOut):
             self.env.fail(pos, f"a {source} cannot be assigned")
         return value.code
@@ -141,7 +148,10 @@ class Expressions:
     def type_of(self, ref: t.Ref) -> ty.Type | None:
         """Return the type of a variable or of its part without compiling it, or None if it has no such part."""
         symbol, selectors = lookup(self, ref)
-        kind = symbol.type if symbol is not None else None
+        if symbol is not None:
+            kind: ty.Type | None = symbol.type
+        else:
+            kind, selectors = own_property_type(self, ref)
         for selector in selectors:
             if isinstance(selector, t.Bit):
                 kind = ty.BOOL
@@ -151,8 +161,8 @@ class Expressions:
                 name = selector.name.lower()
                 members = kind.fields if isinstance(kind, ty.Struct) else {}
                 if isinstance(kind, ty.Block):
-                    members = {**kind.inputs, **kind.outputs}
-                kind = members[name][1] if name in members else None
+                    members = {**kind.inputs, **kind.outputs, **kind.publics}
+                kind = members[name][1] if name in members else property_type(self, kind, name)
         return kind
 
     def flat(self, value: Value, pos: t.Pos) -> Value:
@@ -162,6 +172,18 @@ class Expressions:
         name = self.out.temporary()
         self.out.line(f"{name} = {value.code}", pos)
         return Value(name, value.type, value.constant)
+
+    def earlier(self, value: Value, mark: int, pos: t.Pos) -> Value:
+        """Return `value`, computed before the lines that were written after the first `mark` lines.
+
+        Operands and arguments are evaluated from left to right, and those lines belong to a later one.
+        """
+        if len(self.out.lines) == mark or value.constant is not None:
+            return value
+        later, name = self.out.since(mark), self.out.temporary()
+        self.out.line(f"{name} = {value.code}", pos)
+        self.out.again(later)
+        return replace(value, code=name)
 
     def known(self, expr: t.Expr, result: float) -> Value:
         """Return `result`, which the compiler computed for the untyped constant `expr`, as a `Value`."""

@@ -19,6 +19,8 @@ _EXACT = {32: 24, 64: 53}
 def converted(x: Compiling, value: Value, target: ty.Type, pos: Pos) -> str | None:
     """Return the Python code of `value` as a `target`, or None if the dialect does not allow the conversion."""
     source, sink = ty.plain(value.type), ty.plain(target)
+    if isinstance(sink, ty.Interface):
+        return "None" if x.env.dialect.vendor and _is_null(source) else None
     if isinstance(sink, ty.Enum):
         return _to_enum(x, value, source, sink, pos)
     if isinstance(source, ty.Enum):
@@ -34,6 +36,11 @@ def converted(x: Compiling, value: Value, target: ty.Type, pos: Pos) -> str | No
             return None
     code = _code(value.code, source, sink)
     return f"_v.inside({code}, {target.low}, {target.high})" if isinstance(target, ty.Subrange) else code
+
+
+def _is_null(kind: ty.Type) -> bool:
+    """Return whether a value of this type is the constant 0, which CODESYS also accepts for NULL."""
+    return isinstance(kind, ty.AnyInt) and kind.value == 0
 
 
 def _to_enum(x: Compiling, value: Value, source: ty.Type, enum: ty.Enum, pos: Pos) -> str | None:
@@ -88,6 +95,9 @@ def meeting(x: Compiling, left: ty.Type, right: ty.Type, pos: Pos) -> ty.Type | 
     found = ty.common(left, right)
     if found is not None or not x.env.dialect.vendor:
         return found
+    for one, other in ((left, right), (right, left)):
+        if isinstance(one, ty.Interface) and _is_null(other):
+            return one
     a, b = _numeric(left), _numeric(right)
     if a is None or b is None:
         return None

@@ -65,6 +65,8 @@ def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
     right = x.value(expr.right, wanted)
     if expr.op in ("AND_THEN", "OR_ELSE") and len(x.out.lines) > mark:
         left, right = _only_if_needed(x, expr, left, right, x.out.since(mark))
+    else:
+        left = x.earlier(left, mark, expr.pos)
     if expr.op in _LOGIC:
         return _logic(x, expr, left, right)
     if expr.op in COMPARISONS:
@@ -133,6 +135,9 @@ def _logic(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
 
 def _comparison(x: Compiling, expr: t.Binary, left: Value, right: Value) -> Value:
     kind = meeting(x, left.type, right.type, expr.pos)
+    if isinstance(kind, ty.Interface) and expr.op in ("=", "<>"):
+        code = f"_v.same({x.coerced(left, kind, expr.pos)}, {x.coerced(right, kind, expr.pos)})"
+        return Value(code if expr.op == "=" else f"(not {code})", ty.BOOL)
     if kind is None or not isinstance(kind, ty.Elementary | ty.AnyInt | ty.AnyReal | ty.String | ty.Enum):
         _mismatch(x, expr, left, right, "two values of compatible types")
     if isinstance(kind, ty.AnyInt | ty.AnyReal | ty.String):

@@ -33,6 +33,8 @@ class Symbol:
     constant: Any = None
     reference: str = ""
     is_input: bool = False
+    refused: str = ""
+    """Why the variable is not visible in the scope; empty for one that is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,67 @@ class Signature:
         return {p.name.lower() for p in (*self.inputs, *self.in_outs, *self.outputs)}
 
 
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A method, or the GET or SET of a property: `kind` is METHOD, GET or SET.
+
+    `owner` is the name, as declared, of the class or interface that declares it. `access` is PUBLIC, PROTECTED, PRIVATE or
+    INTERNAL. `abstract` is true for one without a body.
+    """
+
+    signature: Signature
+    kind: str
+    owner: str
+    access: str
+    abstract: bool
+    final: bool
+    pos: Pos
+
+    @property
+    def attribute(self) -> str:
+        """Return the name of the method in the Python class."""
+        return attribute_of(self.kind, self.signature.name)
+
+    @property
+    def key(self) -> str:
+        """Return the name by which calls of the method are noted."""
+        of = "" if self.kind == "METHOD" else f".{self.kind.lower()}"
+        return f"{self.owner.lower()}.{self.signature.name.lower()}{of}"
+
+    def __str__(self) -> str:
+        of = "" if self.kind == "METHOD" else f"{self.kind} of "
+        return f"{of}{self.owner}.{self.signature.name}"
+
+
+def attribute_of(kind: str, name: str) -> str:
+    """Return the Python name of a method (``m_``), or of the GET (``g_``) or SET (``s_``) of a property."""
+    return f"{kind[0].lower()}_{name.lower()}"
+
+
+@dataclass(slots=True)
+class Class:
+    """A function block, class, program or interface with all its methods and actions, also those that it inherits.
+
+    `key` is its name in lower case. `methods` are by their Python names; `actions` map names to the POUs that declare them,
+    all in lower case. `ancestors` are the classes that it extends, directly or through others, the nearest first.
+    """
+
+    name: str
+    key: str
+    kind: str
+    ancestors: tuple[Class, ...] = ()
+    methods: dict[str, Method] = field(default_factory=dict)
+    actions: dict[str, str] = field(default_factory=dict)
+    descendants: list[Class] = field(default_factory=list)
+    variables: dict[str, Symbol] = field(default_factory=dict)
+    """The variables of an instance, as code inside the class sees them."""
+    type: ty.Type | None = None
+
+    def of(self, kind: str, name: str) -> Method | None:
+        """Return the method, GET or SET with this name."""
+        return self.methods.get(attribute_of(kind, name))
+
+
 def simple_default(kind: ty.Type) -> str | None:
     """Return the initial value of a type without parts as Python code; None for other types."""
     if isinstance(kind, ty.Subrange):
@@ -83,6 +146,8 @@ def simple_default(kind: ty.Type) -> str | None:
         return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
     if isinstance(kind, ty.String):
         return "''"
+    if isinstance(kind, ty.Interface):
+        return "None"
     return str(kind.initial) if isinstance(kind, ty.Enum) else None
 
 
@@ -123,6 +188,8 @@ class Environment:
     types: dict[str, ty.Type] = field(default_factory=dict)
     type_initials: dict[str, str] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
+    classes: dict[str, Class] = field(default_factory=dict)
+    """The function blocks, classes, programs and interfaces with methods, or that extend or implement others."""
     globals: dict[str, Symbol] = field(default_factory=dict)
     lists: dict[str, dict[str, Symbol]] = field(default_factory=dict)
     """The variables of each global list."""
@@ -203,6 +270,8 @@ class Compiling(Protocol):
     out: CodeWriter
     only_constants: bool
     program_inputs: set[str]
+    own: Class | None
+    pou: str
     wanted: ty.Type | None
 
     def value(self, expr: Expr, wanted: ty.Type | None = None) -> Value: ...
@@ -210,6 +279,8 @@ class Compiling(Protocol):
     def declared(self, *exprs: Expr) -> ty.Type | None: ...
 
     def flat(self, value: Value, pos: Pos) -> Value: ...
+
+    def earlier(self, value: Value, mark: int, pos: Pos) -> Value: ...
 
     def known(self, expr: Expr, result: float) -> Value: ...
 

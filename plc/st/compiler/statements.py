@@ -9,6 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.calls import Calls
+from fieldtwin.plc.st.compiler.classes.members import SUPER, is_own, note, selected
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.implicit import meeting
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, default_value, wrapped
@@ -105,6 +106,12 @@ class Statements(Calls):
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call
         name = call.ref.name.lower()
+        if selected(self, call.ref, "METHOD") is not None:
+            self.out.line(self.value(call).code, s.pos)
+            return
+        if name in SUPER and not call.ref.selectors and is_own(self, call.ref):
+            self._base_call(call)
+            return
         known = name in self.symbols or name in self.env.globals
         if not call.ref.selectors and not known and self._is_action(self.owner, self.actions, name):
             self._own_action(call, name)
@@ -119,15 +126,33 @@ class Statements(Calls):
         else:
             self.out.line(self.value(call).code, s.pos)
 
+    def _base_call(self, call: t.Call) -> None:
+        """Write ``SUPER()``, the call of the body of the base (6.6.6.4)."""
+        assert self.own is not None
+        base = self.own.ancestors[0]
+        if call.arguments:
+            self.env.fail(call.arguments[0].pos, f"{call.ref.name} takes no arguments: the base has the same variables")
+        if base.kind == "CLASS" or self.pou != self.owner:
+            expected = f"{call.ref.name} in the body of a FUNCTION_BLOCK that extends a FUNCTION_BLOCK"
+            self.env.fail(call.pos, f"{call.ref.name}()", expected=expected)
+        note(self, base.key, call.pos)
+        self.out.line(f"B_{base.key}.execute(self, now_ns)", call.pos)
+
     def _is_action(self, pou: str, actions: frozenset[str], name: str) -> bool:
         return name in actions or f"{pou}.{name}" in self.env.missing
 
     def _own_action(self, call: t.Call, name: str) -> None:
         """Write the call of an action of the same POU."""
-        self._note_action(self.owner, name, call)
+        declaring = self.own.actions.get(name, self.owner) if self.own is not None else self.owner
+        self._note_action(declaring, name, call)
         if call.arguments:
             self.env.fail(call.arguments[0].pos, f"action {call.ref.name} takes no arguments")
         self.out.line(f"self.a_{name}()", call.pos)
+
+    def _declaring(self, block: ty.Block, action: str) -> str:
+        """Return the name of the POU that declares the action: the block or one of its bases, in lower case."""
+        of = self.env.classes.get(block.name.lower())
+        return of.actions.get(action, of.key) if of is not None else block.name.lower()
 
     def _note_action(self, pou: str, name: str, call: t.Call) -> None:
         key = f"{pou}.{name}"
@@ -150,8 +175,10 @@ class Statements(Calls):
         if en is not None or eno is not None:
             self.controlled(call.pos, en, eno, lambda: self._block_call(call, code, block, action))
             return
+        if block.is_class and not action:
+            self.env.fail(call.pos, f"{call.ref.name} is an instance of the class {block} and cannot be called")
         if action:
-            self._note_action(block.name.lower(), action, call)
+            self._note_action(self._declaring(block, action), action, call)
         if "[" in code:  # compute the place once
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.classes.members import is_own, own_property, own_variable, property_value
 from fieldtwin.plc.st.compiler.implicit import as_number
 from fieldtwin.plc.st.compiler.scope import Compiling, Symbol, Value
 from fieldtwin.plc.st.syntax import tree as t
 
 
-def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Member | t.Bit | t.Index, ...]]:
+def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Selector, ...]]:
     """Return the variable to which `ref` refers, and the selectors after its name, which may be qualified by a global list."""
+    if is_own(x, ref):
+        return own_variable(x, ref)
     name = ref.name.lower()
     symbol = x.symbols.get(name) or x.env.globals.get(name)
     first = ref.selectors[0] if ref.selectors else None
@@ -19,10 +22,27 @@ def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Member | t.
 
 
 def variable(x: Compiling, ref: t.Ref) -> Value:
-    """Compile a reference to a variable or to a part of it, or a value of an enumeration."""
+    """Compile a reference to a variable, a property or a part of one, or a value of an enumeration."""
+    found = None if ref.name.lower() in x.symbols else own_property(x, ref)
+    value, selectors = found if found is not None else _variable(x, ref)
+    for selector in selectors:
+        if isinstance(selector, t.Member):
+            value = _member(x, value, ref, selector)
+        elif isinstance(selector, t.Index):
+            value = _index(x, value, selector)
+        else:
+            value = bit(x, value, selector)
+    return value
+
+
+def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
     symbol, selectors = lookup(x, ref)
+    if symbol is None and ref.name.lower() == "null" and not selectors:
+        return Value("None", ty.NULL), ()
     if symbol is None or (x.env.dialect.vendor and isinstance(symbol.type, ty.Enum) and selectors):
-        return _enum_value(x, ref)
+        return _enum_value(x, ref), ()
+    if symbol.refused:
+        x.env.fail(ref.pos, symbol.refused)
     if ref.name.lower() in x.env.ambiguous and ref.name.lower() not in x.symbols:
         expected = ", ".join(x.env.ambiguous[ref.name.lower()])
         x.env.fail(ref.pos, f"{ref.name} is a variable of several global lists", expected=expected)
@@ -31,14 +51,7 @@ def variable(x: Compiling, ref: t.Ref) -> Value:
     owner, _, own = symbol.code.rpartition(".")
     reference = symbol.reference or (f"_v.MemberReference({owner}, {own!r})" if owner else "")
     value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference, symbol.is_input)
-    for selector in selectors:
-        if isinstance(selector, t.Member):
-            value = _member(x, value, selector)
-        elif isinstance(selector, t.Index):
-            value = _index(x, value, selector)
-        else:
-            value = bit(x, value, selector)
-    return value
+    return value, selectors
 
 
 def _enum_value(x: Compiling, ref: t.Ref) -> Value:
@@ -71,23 +84,26 @@ def _qualified_value(x: Compiling, enum: ty.Enum, member: t.Member) -> Value:
     return Value(repr(number), enum, number)
 
 
-def _member(x: Compiling, value: Value, member: t.Member) -> Value:
+def _member(x: Compiling, value: Value, ref: t.Ref, member: t.Member) -> Value:
     kind, name = value.type, member.name.lower()
     if isinstance(kind, ty.Struct) and name in kind.fields:
         reference = f"_v.MemberReference({value.code}, {f'm_{name}'!r})"
         code = f"{value.code}.m_{name}"
         return Value(code, kind.fields[name][1], None, True, value.writable, reference, value.is_input)
     if isinstance(kind, ty.Block):
-        for members, writable in ((kind.inputs, True), (kind.outputs, False)):
+        for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.publics, True)):
             if name in members:
                 attribute = members[name][0] if kind.standard else f"v_{name}"
                 reference = f"_v.MemberReference({value.code}, {attribute!r})"
                 return Value(f"{value.code}.{attribute}", members[name][1], None, True, writable, reference)
+    found = property_value(x, value, ref, member)
+    if found is not None:
+        return found
     known: list[str] = []
     if isinstance(kind, ty.Struct):
         known = [f for f, _ in kind.fields.values()]
     elif isinstance(kind, ty.Block):
-        known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values())]
+        known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values(), *kind.publics.values())]
     raise x.env.unknown(member.pos, f"in {kind}, a member", member.name, known)
 
 

@@ -6,7 +6,7 @@ types are valid here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from fieldtwin.plc.st.dialects import StWarning
@@ -26,24 +26,50 @@ Finding = tuple[str, t.Pos, str]
 def findings(unit: t.SourceUnit) -> Iterator[StWarning]:
     """Yield the findings about a unit that compiles, POU by POU."""
     enums = {one.name.lower(): one for one in unit.types if isinstance(one, t.EnumDecl)}
-    for pou in unit.pous:
-        about = _About(pou, enums, unit.globals)
-        for rule in _RULES:
-            for id, pos, message in rule(about):
-                yield StWarning(id, message, pos.path, pos.line, pos.column)
+    pous = {pou.name.lower(): pou for pou in unit.pous}
+    for pou in (one for one in unit.pous if one.kind != "INTERFACE"):
+        family = tuple(one for one in unit.pous if pou in _lineage(one, pous))
+        inherited = tuple(block for base in _lineage(pou, pous)[1:] for block in base.blocks)
+        shared = (*unit.globals, *inherited)
+        abouts = [_About(pou, enums, shared, family)]
+        for method in pou.methods:
+            if "ABSTRACT" not in method.modifiers:
+                abouts.append(_About(method, enums, (*shared, *pou.blocks), (method,)))
+        for about in abouts:
+            for rule in _RULES:
+                for id, pos, message in rule(about):
+                    yield StWarning(id, message, pos.path, pos.line, pos.column)
+
+
+def _lineage(pou: t.Pou, pous: Mapping[str, t.Pou]) -> list[t.Pou]:
+    """Return a POU and the POUs that it extends, the nearest first."""
+    found = [pou]
+    while found[-1].extends:
+        base = pous.get(found[-1].extends[0].name.lower())
+        if base is None or base in found:
+            break
+        found.append(base)
+    return found
 
 
 class _About:
-    """A POU with what the rules need to know about its names. All names are in lower case."""
+    """A POU or method with what the rules need to know about its names. All names are in lower case.
 
-    def __init__(self, pou: t.Pou, enums: dict[str, t.EnumDecl], shared: tuple[t.VarBlock, ...]) -> None:
+    `shared` are the variables that it uses and does not declare. `family` is the POU with those that extend it, because they and
+    their methods use its variables.
+    """
+
+    def __init__(
+        self, pou: t.Pou, enums: dict[str, t.EnumDecl], shared: tuple[t.VarBlock, ...], family: tuple[t.Pou, ...]
+    ) -> None:
         self.pou, self.enums = pou, enums
+        self.users = [one for each in family for one in nodes((each.body, each.actions, each.chart, each.methods))]
         declared = [(v, block) for block in (*shared, *pou.blocks) for v in block.variables]
         self.variables = {v.name.lower(): v for v, _ in declared}
         self.constants = {v.name.lower() for v, block in declared if "CONSTANT" in block.qualifiers}
         self.bodies = [pou.body, *(action.body for action in pou.actions)]
         self.nodes = list(nodes((pou.body, pou.actions, pou.chart)))
-        self.chart_actions = {one.action.lower() for one in self.nodes if isinstance(one, t.Association)}
+        self.chart_actions = {one.action.lower() for one in self.users if isinstance(one, t.Association)}
         self.conditions = [condition for one in self.nodes for condition in _conditions(one)]
 
     def named_type(self, name: str) -> str:
@@ -64,13 +90,20 @@ def _conditions(node: object) -> Iterator[t.Expr]:
 
 def _unused(about: _About) -> Iterator[Finding]:
     in_declarations = nodes(tuple((v.type, v.initial) for block in about.pou.blocks for v in block.variables))
-    used = {
-        one.name.lower() for one in (*about.nodes, *in_declarations) if isinstance(one, t.Ref)
-    } | about.chart_actions
+    refs = (one for one in (*about.users, *in_declarations) if isinstance(one, t.Ref))
+    used = {_variable_of(ref) for ref in refs} | about.chart_actions
     for block in about.pou.blocks:
         for variable in block.variables if block.kind in _LOCAL else ():
             if variable.name.lower() not in used and not variable.location:
                 yield "ST101", variable.pos, f"{variable.name} is not used"
+
+
+def _variable_of(ref: t.Ref) -> str:
+    """Return the name of the variable to which a reference refers, also after THIS and SUPER."""
+    first = ref.selectors[0] if ref.selectors else None
+    if ref.name.lower().rstrip("^") in ("this", "super") and isinstance(first, t.Member):
+        return first.name.lower()
+    return ref.name.lower()
 
 
 def _equal_reals(about: _About) -> Iterator[Finding]:
@@ -112,15 +145,15 @@ def _cases_without_else(about: _About) -> Iterator[Finding]:
 
 def _unwritten_outputs(about: _About) -> Iterator[Finding]:
     written = set(about.chart_actions)
-    for one in about.nodes:
+    for one in about.users:
         if isinstance(one, t.Assign):
-            written.add(one.target.name.lower())
+            written.add(_variable_of(one.target))
         elif isinstance(one, t.For):
-            written.add(one.variable.name.lower())
+            written.add(_variable_of(one.variable))
         elif isinstance(one, t.Call):
-            written.add(one.ref.name.lower())
-            written.update(a.target.name.lower() for a in one.arguments if a.target is not None)
-            written.update(a.value.name.lower() for a in one.arguments if isinstance(a.value, t.Ref))
+            written.add(_variable_of(one.ref))
+            written.update(_variable_of(a.target) for a in one.arguments if a.target is not None)
+            written.update(_variable_of(a.value) for a in one.arguments if isinstance(a.value, t.Ref))
     for block in about.pou.blocks:
         for variable in block.variables if block.kind == "VAR_OUTPUT" else ():
             if variable.name.lower() not in {*written, "eno"} and variable.initial is None:

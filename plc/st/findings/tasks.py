@@ -38,19 +38,29 @@ def written_by_several_tasks(unit: t.SourceUnit, tasks: Mapping[str, str]) -> It
 def _written(program: t.Pou, pous: Mapping[str, t.Pou], shared: frozenset[str]) -> dict[str, t.Pos]:
     """Return the global variables that a program writes, each with a place."""
     found: dict[str, t.Pos] = {}
-    waiting, seen = [program], {program.name.lower()}
+    waiting, seen = [(program, frozenset[str]())], {program.name.lower()}
     while waiting:
-        pou = waiting.pop()
-        own = {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
-        for node in nodes((pou.blocks, pou.body, pou.actions, pou.chart)):
+        pou, outer = waiting.pop()
+        own = outer | {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
+        waiting += [(method, own) for method in pou.methods]
+        if pou.kind == "INTERFACE":
+            waiting += [(one, frozenset()) for one in _implementing(pou, pous) if one.name.lower() not in seen]
+        for node in nodes((pou.blocks, pou.body, pou.actions, pou.chart, pou.extends)):
             for ref in _targets(node):
                 if ref.name.lower() in shared - own:
                     found.setdefault(ref.name.lower(), ref.pos)
             used = node.name if isinstance(node, t.NamedType) else node.ref.name if isinstance(node, t.Call) else ""
             if used.lower() in pous and used.lower() not in seen:
                 seen.add(used.lower())
-                waiting.append(pous[used.lower()])
+                waiting.append((pous[used.lower()], frozenset()))
     return found
+
+
+def _implementing(interface: t.Pou, pous: Mapping[str, t.Pou]) -> Iterator[t.Pou]:
+    """Yield the POUs that implement or extend an interface; a call through it can execute their methods."""
+    for pou in pous.values():
+        if interface.name.lower() in (name.name.lower() for name in (*pou.implements, *pou.extends)):
+            yield pou
 
 
 def _targets(node: object) -> Iterator[t.Ref]:

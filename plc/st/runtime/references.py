@@ -1,4 +1,5 @@
-"""References for VAR_IN_OUTs of elementary types at run time: each object refers to a variable of the caller.
+"""References at run time: those for VAR_IN_OUTs of elementary types refer to a variable of the caller, and those in variables of
+an interface type to an instance.
 
 Reading and writing `v` reads and writes that variable immediately. So two VAR_IN_OUTs that refer to one variable always have
 the same value, and so does the variable itself (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are passed directly.
@@ -7,6 +8,8 @@ the same value, and so does the variable itself (IEC 61131-3, 6.5.3.1). Arrays, 
 from __future__ import annotations
 
 from typing import Any
+
+from fieldtwin.plc.st.runtime.logic_error import LogicError
 
 
 class Cell:
@@ -67,3 +70,24 @@ class Cut:
     @v.setter
     def v(self, value: str) -> None:
         self._of.v = value[: self._length]
+
+
+class Instance:
+    """The value of a variable of an interface type: a reference to an instance. The value NULL is None."""
+
+    __slots__ = ("of",)
+
+    def __init__(self, of: Any) -> None:
+        self.of = of
+
+
+def instance(reference: Instance | None, name: str) -> Any:
+    """Return the instance to which the variable `name` refers. Raises `LogicError` if it is NULL."""
+    if reference is None:
+        raise LogicError(f"{name} is NULL", expected="an instance, which an assignment stores in it before it is used")
+    return reference.of
+
+
+def same(a: Instance | None, b: Instance | None) -> bool:
+    """Return whether two variables refer to the same instance, or are both NULL."""
+    return a is b or (a is not None and b is not None and a.of is b.of)

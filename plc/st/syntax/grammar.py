@@ -19,11 +19,7 @@ MAX_EXPECTED = 8
 _UNSUPPORTED = {
     word: construct
     for construct, words in {
-        "classes and methods": (
-            "METHOD END_METHOD CLASS END_CLASS EXTENDS THIS SUPER ABSTRACT FINAL PUBLIC PRIVATE PROTECTED INTERNAL VAR_INST"
-        ),
-        "interfaces": "INTERFACE END_INTERFACE IMPLEMENTS",
-        "properties": "PROPERTY END_PROPERTY GET END_GET SET END_SET",
+        "variables of an instance in a method": "VAR_INST",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
         "labels and jumps": "JMP",
@@ -39,6 +35,7 @@ _READABLE = {
     "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
+    "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
 }  # fmt: skip
 
 

@@ -22,12 +22,16 @@ from fieldtwin.plc.st.syntax.rules.units import UnitRules
 from fieldtwin.plc.st.syntax.source import blanked, shortened
 
 _ENDS = re.compile(
-    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"|\b(?P<end>END_(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|TYPE|CONFIGURATION|TEST))\b|\S\s*\Z""",
+    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"|\S\s*\Z
+    |\b(?P<end>END_(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE|CONFIGURATION|TEST))\b(?!\s*(?:METHOD|PROPERTY)\b)""",
+    re.IGNORECASE | re.VERBOSE,
+)
+"""The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped. Methods after a POU belong to it."""
+
+_DECLARED = re.compile(
+    r"\b(?:FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE)\s+(?:(?:PUBLIC|INTERNAL|ABSTRACT|FINAL)\s+)*([A-Za-z_]\w*)",
     re.IGNORECASE,
 )
-"""The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped."""
-
-_DECLARED = re.compile(r"\b(?:FUNCTION_BLOCK|FUNCTION|TYPE)\s+([A-Za-z_]\w*)", re.IGNORECASE)
 
 
 class _Build(UnitRules, DeclarationRules, ChartRules, StatementRules, ExpressionRules):

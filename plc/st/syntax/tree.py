@@ -119,7 +119,7 @@ TypeDecl = StructDecl | EnumDecl | AliasDecl
 
 @dataclass(frozen=True, slots=True)
 class VarBlock:
-    """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` are in capitals.
+    """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` (RETAIN, PUBLIC, ...) are in capitals.
 
     `list` is the name of the global list to which a VAR_GLOBAL belongs, if the dialect has such lists. If
     `only_qualified` is true, its variables are known only as ``list.variable``.
@@ -187,8 +187,11 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Pou:
-    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is the type of a
-    function's result; None for a function without a result."""
+    """A program organization unit, a class or an interface: `kind` is PROGRAM, FUNCTION, FUNCTION_BLOCK, CLASS or INTERFACE.
+
+    A METHOD, and the GET or SET of a property, is the same node in the `methods` of its owner. `returns` is the type of the
+    result; None without a result. `modifiers` are in capitals: the access (PUBLIC, ...), FINAL, ABSTRACT and OVERRIDE.
+    """
 
     pos: Pos
     kind: str
@@ -198,6 +201,14 @@ class Pou:
     body: tuple[Statement, ...]
     actions: tuple[Action, ...] = ()
     chart: Chart | None = None
+    methods: tuple[Pou, ...] = ()
+    extends: tuple[NamedType, ...] = ()
+    implements: tuple[NamedType, ...] = ()
+    modifiers: frozenset[str] = frozenset()
+
+
+METHODS = ("METHOD", "GET", "SET")
+"""The kinds of a `Pou` that belongs to another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,11 +315,16 @@ class Index:
     indices: tuple[Expr, ...]
 
 
+Selector = Member | Bit | Index
+
+
 @dataclass(frozen=True, slots=True)
 class Ref:
+    """A reference to a variable or to a part of it. In the dialects of CODESYS, `name` may be ``THIS^`` or ``SUPER^``."""
+
     pos: Pos
     name: str
-    selectors: tuple[Member | Bit | Index, ...] = ()
+    selectors: tuple[Selector, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

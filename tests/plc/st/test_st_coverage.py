@@ -105,3 +105,23 @@ def test_coverages_of_two_files_add_up(tmp_path: Path) -> None:
 
 def test_ranges_of_lines() -> None:
     assert line_ranges([7, 3, 9, 8, 8]) == "3, 7-9"
+
+
+def test_statements_of_methods_are_counted(tmp_path: Path) -> None:
+    source = """CLASS Counter
+VAR n : INT; END_VAR
+METHOD PUBLIC Up : INT
+  n := n + 1;
+  IF n > 1 THEN
+    n := 0;
+  END_IF
+  Up := n;
+END_METHOD
+METHOD PUBLIC Unused
+  n := 3;
+END_METHOD
+END_CLASS
+"""
+    found = covered(tmp_path, "TEST 'x' VAR c : Counter; END_VAR ASSERT_EQ(c.Up(), 1); END_TEST", source)
+    assert [place.line for place in found.missed(Kind.STATEMENT)] == [6, 11]
+    assert found.count(Kind.STATEMENT) == (3, 5)

@@ -99,6 +99,42 @@ FUNCTION_BLOCK Block VAR_OUTPUT x : BOOL; END_VAR VAR_IN_OUT y : BOOL; END_VAR x
     assert found[4].message == "the output b is never written"
 
 
+CLASSES = """INTERFACE Level METHOD Read : INT VAR_OUTPUT valid : BOOL; END_VAR END_METHOD END_INTERFACE
+FUNCTION_BLOCK Base
+VAR_OUTPUT a, b, c : INT; END_VAR
+VAR own, derived, through_this, unused : INT; END_VAR
+METHOD PUBLIC Go : INT
+VAR_INPUT by : INT; END_VAR
+VAR_OUTPUT never : BOOL; END_VAR
+VAR left_over : INT; after : TON; END_VAR
+a := own + THIS.through_this;
+IF by > 3 THEN after(); END_IF
+Go := 10 / by;
+RETURN;
+Go := 1;
+END_METHOD
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Top EXTENDS Base
+THIS.b := derived;
+END_FUNCTION_BLOCK
+"""
+
+
+def test_methods_have_findings_and_use_the_variables_of_their_block() -> None:
+    found = list(findings(parse_all(CLASSES, "p.st")))
+    assert [(one.id, one.line, one.message.split()[0]) for one in found if one.id in ("ST101", "ST104")] == [
+        ("ST101", 4, "unused"),
+        ("ST104", 3, "the"),
+        ("ST101", 8, "left_over"),
+        ("ST104", 7, "the"),
+    ]
+    assert [one.message for one in found if one.id == "ST104"] == [
+        "the output c is never written",
+        "the output never is never written",
+    ]
+    assert [(one.id, one.line) for one in found if one.id in ("ST105", "ST107")] == [("ST105", 10), ("ST107", 13)]
+
+
 def test_every_finding_is_explained() -> None:
     assert {one.id for one in everything()} >= set(FINDINGS)
 
@@ -205,6 +241,26 @@ def test_a_variable_that_two_tasks_write_is_found_through_function_blocks(
     found = list(written_by_several_tasks(parse_all(SHARED, "p.st"), tasks))
     assert [one.line for one in found] == lines
     assert all(one.message == "total is written by Slow (task slow) and Third (task quick)" for one in found)
+
+
+def test_a_variable_that_two_tasks_write_is_found_through_interfaces_and_bases() -> None:
+    text = """VAR_GLOBAL total, local : INT; END_VAR
+INTERFACE Adding METHOD Add END_METHOD END_INTERFACE
+FUNCTION_BLOCK Adder IMPLEMENTS Adding
+METHOD PUBLIC Add VAR local : INT; END_VAR total := total + 1; local := 1; END_METHOD
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Derived EXTENDS Adder END_FUNCTION_BLOCK
+PROGRAM Fast VAR adding : Adding; END_VAR
+adding.Add();
+END_PROGRAM
+PROGRAM Slow VAR adder : Derived; END_VAR
+local := 2;
+adder.Add();
+END_PROGRAM"""
+    found = list(written_by_several_tasks(parse_all(text, "p.st"), {"fast": "quick", "slow": "slow"}))
+    assert [(one.line, one.message) for one in found] == [
+        (4, "total is written by Fast (task quick) and Slow (task slow)")
+    ]
 
 
 def test_the_tasks_of_a_system_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

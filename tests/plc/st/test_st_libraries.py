@@ -99,3 +99,21 @@ def test_the_command_takes_libraries(folder: Path, monkeypatch: pytest.MonkeyPat
         "2 files, no errors, 1 warning: 2 functions, 1 global variable, 1 program, 1 type",
     ]
     assert CliRunner().invoke(check, ["main.st"], standalone_mode=False).return_value == 1
+
+
+def test_bases_interfaces_and_what_methods_use_are_taken(tmp_path: Path) -> None:
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "blocks.st").write_text("""INTERFACE Value METHOD Read : INT END_METHOD END_INTERFACE
+        CLASS Base IMPLEMENTS Value
+          VAR limit : INT; END_VAR
+          METHOD PUBLIC Read : INT VAR wrong : INT; END_VAR Read := scaled(3) + wrong; END_METHOD
+        END_CLASS
+        CLASS Unused METHOD m : INT m := TRUE; END_METHOD END_CLASS""")
+    (tmp_path / "lib2").mkdir()
+    (tmp_path / "lib2" / "good.st").write_text(GOOD)
+    (tmp_path / "main.st").write_text("""
+        CLASS Own EXTENDS Base METHOD PUBLIC OVERRIDE Read : INT Read := 1 + SUPER.Read(); END_METHOD END_CLASS
+        PROGRAM p VAR o : Own; n : INT; END_VAR n := o.Read(); END_PROGRAM""")
+    made = loaded(tmp_path)
+    scan(made)
+    assert made.n == 22

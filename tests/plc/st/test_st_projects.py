@@ -150,7 +150,7 @@ def test_a_function_whose_declaration_has_an_error_hides_no_other_error(tmp_path
 
 def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert errors_of(tmp_path) == [
-        ": a folder without a program; expected files .st, .iecst, .exp, .xml, .tcpou, .tcdut, .tcgvl"
+        ": a folder without a program; expected files .st, .iecst, .exp, .xml, .tcpou, .tcdut, .tcgvl, .tcio"
     ]
     monkeypatch.setattr(source_files, "MAX_FILES", 2)
     for n in range(3):
@@ -161,9 +161,7 @@ def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("text", "construct"),
     [
-        ("FUNCTION_BLOCK a EXTENDS b END_FUNCTION_BLOCK", "classes and methods"),
-        ("FUNCTION_BLOCK a METHOD PUBLIC b : INT END_METHOD END_FUNCTION_BLOCK", "classes and methods"),
-        ("INTERFACE i END_INTERFACE", "interfaces"),
+        ("CLASS a METHOD b VAR_INST c : INT; END_VAR END_METHOD END_CLASS", "variables of an instance in a method"),
         ("TYPE p : POINTER TO INT; END_TYPE", "pointers and references"),
         ("TYPE p : REF_TO INT; END_TYPE", "pointers and references"),
         ("PROGRAM p VAR a : INT; END_VAR a^ := 1; END_PROGRAM", "pointers and references"),

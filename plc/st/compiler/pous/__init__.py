@@ -1,1 +1,1 @@
-"""The Python code of variables, functions, function blocks and programs."""
+"""The methods of classes, and the Python code of variables, functions, function blocks, classes and programs."""

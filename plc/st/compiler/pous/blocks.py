@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, by_reference
 from fieldtwin.plc.st.compiler.statements import Statements
@@ -10,17 +13,18 @@ from fieldtwin.plc.st.syntax import tree as t
 
 
 class Bodies:
-    """The compiler of what function blocks and programs have in common: bodies and actions."""
+    """The compiler of what function blocks, classes and programs have in common: bodies, actions and methods."""
 
-    def __init__(self, variables: Variables) -> None:
+    def __init__(self, variables: Variables, functions: Functions) -> None:
         self.env, self.declarations, self.out = variables.env, variables.declarations, variables.out
-        self.variables = variables
+        self.variables, self.functions = variables, functions
 
     def body_of(self, pou: t.Pou, symbols: dict[str, Symbol], name: str) -> Statements:
         """Return the compiler of a body of a POU. `name` is that of the POU, or of an action with the POU before it."""
         body = Statements(self.env, symbols, self.out, name)
         body.owner = pou.name.lower()
-        body.actions = frozenset(action.name.lower() for action in pou.actions)
+        body.own = self.env.classes.get(body.owner)
+        body.actions = frozenset(body.own.actions) if body.own is not None else frozenset()
         return body
 
     def write_actions(self, pou: t.Pou, symbols: dict[str, Symbol], inputs: frozenset[str] = frozenset()) -> None:
@@ -37,6 +41,40 @@ class Bodies:
                 body.program_inputs = set(inputs)
                 body.body(action.body)
 
+    def write_methods(self, pou: t.Pou, symbols: dict[str, Symbol], inputs: frozenset[str] = frozenset()) -> None:
+        """Write the methods of a POU and its properties, and those that it inherits. `symbols` are the variables of the POU."""
+        own = self.env.classes.get(pou.name.lower())
+        if own is None:
+            return
+        own.variables = symbols
+        visible = {**symbols, **self._without_call(pou, symbols)}
+        for declared in pou.methods:
+            method = own.of(declared.kind, declared.name)
+            if method is None or method.abstract:
+                continue
+            with self.env.declaring(declared.name, self.env.faulty_here), self.declarations.within(declared):
+                body = self.body_of(pou, {**visible, **self.variables.symbols_of(declared, "")}, method.key)
+                body.program_inputs = set(inputs)
+                self.functions.write_body(declared, method.signature, body, method.attribute, "self")
+        for method in own.methods.values():
+            if method.owner != pou.name and not method.abstract:
+                self.out.line(f"{method.attribute} = B_{method.owner.lower()}.{method.attribute}", pou.pos)
+        for action, declaring in own.actions.items():
+            if declaring != own.key:
+                self.out.line(f"a_{action} = B_{declaring}.a_{action}", pou.pos)
+
+    @staticmethod
+    def _without_call(pou: t.Pou, symbols: dict[str, Symbol]) -> dict[str, Symbol]:
+        """Return the variables that exist only while the body of the POU is executed, as methods see them."""
+        found = {}
+        for block in pou.blocks:
+            for v in block.variables if block.kind in ("VAR_IN_OUT", "VAR_TEMP") else ():
+                symbol = symbols.get(v.name.lower())
+                if symbol is not None:
+                    reason = f"{v.name} is a {block.kind} of {pou.name} and does not exist while a method is executed"
+                    found[v.name.lower()] = replace(symbol, refused=reason)
+        return found
+
     def note_parts(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
         """Add the function blocks that a POU contains to those that it may call."""
         for kind, v in (
@@ -47,36 +85,43 @@ class Bodies:
 
 
 class Blocks(Bodies):
-    """The compiler of the function blocks of a unit."""
+    """The compiler of the function blocks and classes of a unit."""
 
-    def __init__(self, variables: Variables) -> None:
-        super().__init__(variables)
+    def __init__(self, variables: Variables, functions: Functions) -> None:
+        super().__init__(variables, functions)
         self.kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
         """By function block: its variables that keep their values."""
 
     def write(self, pou: t.Pou) -> None:
-        """Write the class of a FUNCTION_BLOCK."""
+        """Write the Python class of a FUNCTION_BLOCK or CLASS."""
         symbols = self.variables.symbols_of(pou, "self.")
         self.note_parts(pou, symbols)
         held = [s for s in symbols.values() if s.code.startswith("self.")]
         kept = [s.code.split(".")[1] for s in held]
         in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
+        kind = self.declarations.named(pou.name, pou.pos)
+        number = ("number",) if isinstance(kind, ty.Block) and kind.interfaces else ()
         self.kept[pou.name.lower()] = tuple(
             (s.name, s.type) for s, attribute in zip(held, kept, strict=True) if attribute not in in_outs
         )
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
-            self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
-            self.out.line(f"in_outs = {tuple(in_outs)}")
+            self.out.line(f"__slots__ = {(*kept, *number)}")
+            self.out.line(f"in_outs = {(*in_outs, *number)}")
+            self.out.line(f"name = {pou.name!r}")
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(
                     pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou))
                 )
                 for attribute in in_outs:
                     self.out.line(f"self.{attribute} = None")
-            with self.out.block("def execute(self, now_ns):"):
-                self.out.step(pou.pos)
-                self.variables.initialise(pou, symbols, ("VAR_TEMP",))
-                self.body_of(pou, symbols, pou.name.lower()).body(pou.body)
+                for attribute in number:
+                    self.out.line(f"self.{attribute} = _c.number()")
+            self.write_methods(pou, symbols)
+            if pou.kind == "FUNCTION_BLOCK":
+                with self.out.block("def execute(self, now_ns):"):
+                    self.out.step(pou.pos)
+                    self.variables.initialise(pou, symbols, ("VAR_TEMP",))
+                    self.body_of(pou, symbols, pou.name.lower()).body(pou.body)
             self.write_actions(pou, symbols)
 
     def _kept_temporaries(self, pou: t.Pou) -> tuple[str, ...]:

@@ -23,6 +23,9 @@ class Functions:
             for v in block.variables:
                 if block.kind in found:
                     kind = self.declarations.type_of(v.type)
+                    if block.kind == "VAR_IN_OUT":
+                        found[block.kind].append(Parameter(v.name, kind, ""))
+                        continue
                     initial = self.declarations.shared(self.declarations.initial(kind, v.initial, v.type))
                     found[block.kind].append(Parameter(v.name, kind, initial))
         return Signature(
@@ -37,17 +40,26 @@ class Functions:
         """Write the Python function of a FUNCTION."""
         signature = self.env.functions[pou.name.lower()]
         key = pou.name.lower()
-        symbols = self.variables.symbols_of(pou, "")
-        if key in symbols:
-            self.env.fail(pou.pos, f"{pou.name} is the name of the function's result, and is declared again")
+        body = Statements(self.env, self.variables.symbols_of(pou, ""), self.out, key)
+        self.write_body(pou, signature, body, f"f_{key}", "")
+
+    def write_body(self, pou: t.Pou, signature: Signature, body: Statements, name: str, instance: str) -> None:
+        """Write the Python function `name` of a FUNCTION or method. `instance` is the name of its first argument, if it has one.
+
+        `body` compiles its statements; its symbols are the variables of the POU, and those of its owner.
+        """
+        key, symbols = pou.name.lower(), body.symbols
+        own = {v.name.lower() for block in pou.blocks for v in block.variables}
         result = "None" if pou.returns is None else f"v_{key}"
+        if pou.returns is not None and key in own:
+            word = "function" if pou.kind == "FUNCTION" else "method"
+            self.env.fail(pou.pos, f"{pou.name} is the name of the {word}'s result, and is declared again")
         if pou.returns is not None:
-            symbols.setdefault(key, Symbol(pou.name, signature.returns, result))
-        arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
-        body = Statements(self.env, symbols, self.out, pou.name.lower())
+            symbols[key] = Symbol(pou.name, signature.returns, result)
+        arguments = [f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs]
         results = [result, *(f"v_{p.name.lower()}" for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
-        with self.out.block(f"def f_{key}({arguments}):", pou.pos):
+        with self.out.block(f"def {name}({', '.join([instance] * bool(instance) + arguments)}):", pou.pos):
             self.out.step(pou.pos)
             if pou.returns is not None:
                 self.out.line(f"{result} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)

@@ -9,6 +9,7 @@ from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.configurations.located import offered
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
+from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, Value
 from fieldtwin.plc.st.compiler.statements import Statements
@@ -52,8 +53,8 @@ class CompiledProgram:
 class Programs(Bodies):
     """The compiler of the programs of a unit."""
 
-    def __init__(self, variables: Variables, unit: t.SourceUnit) -> None:
-        super().__init__(variables)
+    def __init__(self, variables: Variables, functions: Functions, unit: t.SourceUnit) -> None:
+        super().__init__(variables, functions)
         self._unit = unit
         self.outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs and local variables."""
@@ -78,6 +79,9 @@ class Programs(Bodies):
                     self._check_interface(v, kind, role or "")
                     if _is_reserved(v.name):
                         self.env.fail(v.pos, f"a PROGRAM's variable needs another name than {v.name}")
+                    if retain and ty.holds_interface(kind):
+                        hint = "a restart creates new instances, so assign the reference again"
+                        self.env.fail(v.pos, f"{v.name} is RETAIN and refers to an instance", hint=hint)
                     if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
                         self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
                     attribute = f"v_{v.name.lower()}"
@@ -99,6 +103,7 @@ class Programs(Bodies):
                 body.program_inputs = set(inputs)
                 body.body(pou.body)
             self.write_actions(pou, symbols, inputs)
+            self.write_methods(pou, symbols, inputs)
             for instance in self._unit.instances:
                 if instance.program.lower() == pou.name.lower() and instance.arguments:
                     self._write_connections(instance, pou, symbols)
@@ -165,7 +170,7 @@ class Programs(Bodies):
                     self.variables.write_initial(v, symbol)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
-        if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block):
+        if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Interface):
             self.env.fail(
                 v.pos,
                 f"{v.name} cannot be bound to a tag",

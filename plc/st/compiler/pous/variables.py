@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.classes.inheritance import INHERITED
 from fieldtwin.plc.st.compiler.configurations.located import Offered
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
@@ -139,6 +140,8 @@ class Variables:
             return self._external(v)
         code = f"{prefix}v_{v.name.lower()}"
         symbol = self._symbol(v, block, code)
+        if {INHERITED, "PRIVATE"} <= block.qualifiers:
+            return replace(symbol, refused=f"{v.name} is PRIVATE in the POU that declares it")
         if block.kind == "VAR_IN_OUT" and not by_reference(symbol.type):
             return replace(symbol, code=f"{code}.v", reference=code)
         return symbol

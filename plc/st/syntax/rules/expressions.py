@@ -40,7 +40,7 @@ class ExpressionRules(Rules):
     def reference(self, meta: Meta, items: list[Any]) -> t.Ref:
         name, *selectors = items
         if name.type != "DIRECT":
-            return t.Ref(self._pos(meta), str(name), tuple(selectors))
+            return t.Ref(self._pos(meta), "".join(name.split()), tuple(selectors))  # THIS ^ is THIS^
         address = address_of(name)
         if not address:
             raise Bad(name, "an address without a number is allowed in a declaration only")

@@ -15,6 +15,14 @@ from fieldtwin.plc.st.syntax.rules.charts import chart_of
 from fieldtwin.plc.st.syntax.rules.declarations import initial_of, spec_of
 
 
+@dataclass(frozen=True, slots=True)
+class _Members:
+    """A method or a property: its methods, and the token of its name."""
+
+    token: Token
+    methods: tuple[t.Pou, ...]
+
+
 def _flat(items: Iterable[Any]) -> Iterator[Any]:
     """Yield the items, and in place of a tuple its items."""
     for item in items:
@@ -45,7 +53,7 @@ class UnitRules(Rules):
         return t.SourceUnit(
             types,
             tuple(each for each in _flat(items) if isinstance(each, t.VarBlock)),
-            tuple(i for i in items if isinstance(i, t.Pou)),
+            tuple(_with_members(items)),
             instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
             tests=tuple(i for i in items if isinstance(i, t.Test)),
             tasks=tuple(each for each in _flat(items) if isinstance(each, t.Task)),
@@ -125,18 +133,108 @@ class UnitRules(Rules):
     def access(self, meta: Meta, items: list[Any]) -> None:
         return None
 
-    def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
+    # -- POUs and classes -------------------------------------------------------------------------------------------------
+
+    def _pou(self, kind: str, items: list[Any]) -> t.Pou:
+        modifiers = frozenset(_take(items, "MODIFIER"))
         name, *rest = items
-        returns = rest.pop(0) if isinstance(rest[0], t.TypeSpec) else None
-        body = tuple(i for i in rest[-1] if not isinstance(i, t.Action | t.Step | t.Transition))
-        actions = tuple(i for i in rest[-1] if isinstance(i, t.Action))
-        return t.Pou(self._pos(name), kind, str(name), returns, tuple(rest[:-1]), body, actions, chart_of(rest[-1]))
+        returns = next((i for i in rest if isinstance(i, t.TypeSpec)), None)
+        blocks = tuple(i for i in rest if isinstance(i, t.VarBlock))
+        parts = rest[-1] if rest and isinstance(rest[-1], tuple) else rest
+        body = tuple(i for i in parts if isinstance(i, t.Statement))
+        actions = tuple(i for i in parts if isinstance(i, t.Action))
+        methods = _methods(parts)
+        bases = {i.word: i.names for i in rest if isinstance(i, _Bases)}
+        return t.Pou(
+            self._pos(name), kind, str(name), returns, blocks, body, actions, chart_of(parts), methods,
+            bases.get("EXTENDS", ()), bases.get("IMPLEMENTS", ()), modifiers,
+        )  # fmt: skip
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
-        return self._pou("PROGRAM", meta, items)
+        return self._pou("PROGRAM", items)
 
     def function(self, meta: Meta, items: list[Any]) -> t.Pou:
-        return self._pou("FUNCTION", meta, items)
+        return self._pou("FUNCTION", items)
 
     def function_block(self, meta: Meta, items: list[Any]) -> t.Pou:
-        return self._pou("FUNCTION_BLOCK", meta, items)
+        return self._pou("FUNCTION_BLOCK", items)
+
+    def class_(self, meta: Meta, items: list[Any]) -> t.Pou:
+        return self._pou("CLASS", items)
+
+    def interface(self, meta: Meta, items: list[Any]) -> t.Pou:
+        return self._pou("INTERFACE", items)
+
+    def pou_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
+        return t.NamedType(self._pos(meta), str(items[0]))
+
+    def extends(self, meta: Meta, items: list[Any]) -> _Bases:
+        return _Bases("EXTENDS", tuple(items))
+
+    def implements(self, meta: Meta, items: list[Any]) -> _Bases:
+        return _Bases("IMPLEMENTS", tuple(items))
+
+    def method(self, meta: Meta, items: list[Any]) -> _Members:
+        pou = self._pou("METHOD", items[1:])
+        return _Members(next(i for i in items[1:] if i.type == "NAME"), (pou,))
+
+    def property(self, meta: Meta, items: list[Any]) -> _Members:
+        """Return GET and SET of a property as methods: GET returns the value, and SET has it as its input."""
+        _, *items = items
+        modifiers = frozenset(_take(items, "MODIFIER"))
+        name, kind, *accessors = items
+        methods = []
+        for accessor in accessors:
+            word, own, blocks, body = accessor
+            if word == "SET":
+                value = t.VarDecl(self._pos(name), str(name), kind, None)
+                blocks = (t.VarBlock(self._pos(name), "VAR_INPUT", frozenset(), (value,)), *blocks)
+            returns = kind if word == "GET" else None
+            method = t.Pou(self._pos(name), word, str(name), returns, blocks, body, modifiers=modifiers | own)
+            methods.append(method)
+        if not methods:
+            raise Bad(name, f"property {name} has neither GET nor SET")
+        return _Members(name, tuple(methods))
+
+    def accessor(self, meta: Meta, items: list[Any]) -> _Accessor:
+        word, *items = items
+        own = frozenset(_take(items, "MODIFIER"))
+        return str(word).upper(), own, tuple(items[:-1]), items[-1]
+
+
+_Accessor = tuple[str, frozenset[str], tuple[t.VarBlock, ...], tuple[t.Statement, ...]]
+"""GET or SET, the modifiers, the variables, and the statements of one."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Bases:
+    """The names after EXTENDS or IMPLEMENTS."""
+
+    word: str
+    names: tuple[t.NamedType, ...]
+
+
+def _take(items: list[Any], kind: str) -> list[str]:
+    """Remove the tokens of this kind from `items`, and return them in capitals."""
+    found = [i for i in items if isinstance(i, Token) and i.type == kind]
+    items[:] = [i for i in items if not (isinstance(i, Token) and i.type == kind)]
+    return [i.upper() for i in found]
+
+
+def _methods(parts: Iterable[Any]) -> tuple[t.Pou, ...]:
+    return tuple(method for i in parts if isinstance(i, _Members) for method in i.methods)
+
+
+def _with_members(items: Iterable[Any]) -> list[t.Pou]:
+    """Return the POUs of a file. A method after the end of a POU belongs to it."""
+    pous: list[t.Pou] = []
+    for item in items:
+        if isinstance(item, t.Pou):
+            pous.append(item)
+        elif isinstance(item, _Members):
+            if not pous or pous[-1].kind == "FUNCTION":
+                raise Bad(
+                    item.token, f"{item.token} is a method or property that belongs to no FUNCTION_BLOCK or CLASS"
+                )
+            pous[-1] = replace(pous[-1], methods=(*pous[-1].methods, *item.methods))
+    return pous

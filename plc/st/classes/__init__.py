@@ -1,0 +1,1 @@
+"""Inheritance of function blocks, classes and interfaces, as far as the tree shows it."""

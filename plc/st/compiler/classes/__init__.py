@@ -1,0 +1,1 @@
+"""The methods and properties to which references refer."""

@@ -1,7 +1,7 @@
-"""Convert the files of a TwinCAT project (.TcPOU, .TcDUT, .TcGVL) to Structured Text, line for line and column for column.
+"""Convert the files of a TwinCAT project (.TcPOU, .TcIO, .TcDUT, .TcGVL) to Structured Text, line for line and column for column.
 
 Such a file is XML with the declaration and the ST body of one object as text in CDATA sections; outside of these, an entity
-moves the columns after it. Actions become those of Structured Text. Methods, properties, transitions and bodies in graphical
+moves the columns after it. Actions, methods and properties become those of Structured Text. Transitions and bodies in graphical
 languages are refused by name.
 """
 
@@ -17,13 +17,13 @@ from fieldtwin.plc.st.syntax.xml_text import parse_xml
 
 _ROOT = re.compile(r"\s*(<\?xml[^>]*\?>)?\s*<TcPlcObject\b")
 _KIND = re.compile(
-    r"(?:\s|\(\*.*?\*\)|//[^\n]*|\{[^}]*\})*(FUNCTION_BLOCK|FUNCTION|PROGRAM)\b", re.DOTALL | re.IGNORECASE
+    r"(?:\s|\(\*.*?\*\)|//[^\n]*|\{[^}]*\})*(FUNCTION_BLOCK|FUNCTION|PROGRAM|INTERFACE)\b", re.DOTALL | re.IGNORECASE
 )
 """The first word of a declaration; comments and pragmas are skipped."""
-_UNSUPPORTED = {
-    "Method": "methods", "Property": "properties", "Transition": "transitions", "Itf": "interfaces",
-}  # fmt: skip
-_PARTS = ("POU", "DUT", "GVL")
+_OBJECTS = ("POU", "Itf", "DUT", "GVL")
+_PARTS = {"Action": "ACTION", "Method": "METHOD", "Property": "PROPERTY"}
+"""The elements of a POU or interface that become a part of Structured Text, with its word."""
+_ACCESSORS = {"Get": "GET", "Set": "SET"}
 
 
 def is_twincat(text: str) -> bool:
@@ -42,23 +42,18 @@ Piece = tuple[int, int, str]
 
 
 @dataclass(slots=True)
-class _Action:
-    """An action of a POU: its name, where its element begins and ends, and the pieces of its body."""
+class _Part:
+    """An object, or an action, method, property or accessor of one: where its element begins and ends, and its texts.
+
+    `word` is its word in Structured Text; "" for an object, whose declaration has the word.
+    """
 
     name: str
+    word: str
     begin: tuple[int, int]
-    body: list[Piece] = field(default_factory=list)
-    end: tuple[int, int] = (1, 0)
-
-
-@dataclass(slots=True)
-class _Object:
-    """A POU, type or list: the pieces of its texts, its actions, and where it ends."""
-
-    name: str
     declaration: list[Piece] = field(default_factory=list)
     body: list[Piece] = field(default_factory=list)
-    actions: list[_Action] = field(default_factory=list)
+    parts: list[_Part] = field(default_factory=list)
     end: tuple[int, int] = (1, 0)
 
 
@@ -67,7 +62,9 @@ class _Reader:
         self._path = path
         self._errors = ErrorCollector()
         self._open: list[str] = []
-        self._objects: list[_Object] = []
+        self._objects: list[_Part] = []
+        self._inside: list[_Part] = []
+        """The object, the part and the accessor whose elements are open."""
         self._parser: expat.XMLParserType
 
     def read(self, text: str) -> None:
@@ -83,15 +80,7 @@ class _Reader:
     def text(self) -> str:
         lines: list[str] = []
         for found in self._objects:
-            _put_pieces(lines, found.declaration)
-            _put_pieces(lines, found.body)
-            for action in found.actions:
-                _put(lines, *action.begin, f"ACTION {action.name}:")
-                _put_pieces(lines, action.body)
-                _put(lines, *action.end, "END_ACTION ")
-            kind = _KIND.match("".join(piece for _, _, piece in found.declaration))
-            if kind is not None:
-                _put(lines, *found.end, f"END_{kind[1].upper()}")
+            _put_part(lines, found)
         return "\n".join(lines)
 
     def _fail(self, message: str, *, expected: str = "", got: str = "") -> None:
@@ -101,42 +90,58 @@ class _Reader:
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._open.append(tag)
         name = attributes.get("Name", "")
-        if self._open[1:] == [tag] and tag in _PARTS:
-            self._objects.append(_Object(name))
-        elif tag in _UNSUPPORTED and len(self._open) <= 3:
-            of = f" of {self._objects[-1].name}" if self._objects else ""
-            self._fail(f"{name}{of}: {_UNSUPPORTED[tag]} are not supported")
-        elif self._open[1:] == ["POU", "Action"]:
-            self._objects[-1].actions.append(_Action(name, self._place()))
-        elif self._objects and tag != "ST" and self._open[2:-1] in (["Implementation"], ["Action", "Implementation"]):
+        deep = len(self._inside)
+        if deep == 0 and len(self._open) == 2 and tag in _OBJECTS:
+            self._enter(_Part(name, "", self._place()), self._objects)
+        elif deep == 1 and len(self._open) == 3 and tag in _PARTS:
+            self._enter(_Part(name, _PARTS[tag], self._place()), self._inside[0].parts)
+        elif deep == 2 and len(self._open) == 4 and tag in _ACCESSORS and self._inside[1].word == "PROPERTY":
+            self._enter(_Part(tag, _ACCESSORS[tag], self._place()), self._inside[1].parts)
+        elif deep == 1 and len(self._open) == 3 and tag == "Transition":
+            self._fail(f"{name} of {self._owner()}: transitions are not supported")
+        elif deep and tag != "ST" and self._open[deep + 1 : -1] == ["Implementation"]:
             self._fail(f"the body of {self._owner()} is not Structured Text", expected="ST", got=tag)
 
+    def _enter(self, part: _Part, among: list[_Part]) -> None:
+        among.append(part)
+        self._inside.append(part)
+
     def _end(self, tag: str) -> None:
-        if self._open[1:] == [tag] and self._objects:
-            self._objects[-1].end = self._place()
-        elif self._open[1:] == ["POU", "Action"]:
-            self._objects[-1].actions[-1].end = self._place()
+        if self._inside and len(self._open) == len(self._inside) + 1:
+            self._inside.pop().end = self._place()
         self._open.pop()
 
     def _owner(self) -> str:
-        """Return the name of the POU or the action that is being read."""
-        found = self._objects[-1]
-        return f"{found.name}.{found.actions[-1].name}" if "Action" in self._open else found.name
+        """Return the name of the object, or of its part, that is being read."""
+        return ".".join(part.name for part in self._inside)
 
     def _place(self) -> tuple[int, int]:
         return self._parser.CurrentLineNumber, self._parser.CurrentColumnNumber
 
     def _characters(self, data: str) -> None:
-        piece = (*self._place(), data)
-        if not self._objects:
+        if not self._inside:
             return
-        found = self._objects[-1]
-        places = {"Declaration": found.declaration, "Implementation/ST": found.body}
-        if found.actions:
-            places["Action/Implementation/ST"] = found.actions[-1].body
-        pieces = places.get("/".join(self._open[2:]))
+        part = self._inside[-1]
+        inner = "/".join(self._open[len(self._inside) + 1 :])
+        pieces = {"Declaration": part.declaration, "Implementation/ST": part.body}.get(inner)
         if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is no part of the text
-            pieces.append(piece)
+            pieces.append((*self._place(), data))
+
+
+def _put_part(lines: list[str], part: _Part) -> None:
+    """Write an object or a part of one, with the words at its beginning and end that its texts do not have."""
+    if part.word == "ACTION":
+        _put(lines, *part.begin, f"ACTION {part.name}:")
+    elif part.word in _ACCESSORS.values():
+        _put(lines, *part.begin, f"{part.word} ")
+    _put_pieces(lines, part.declaration)
+    _put_pieces(lines, part.body)
+    for inner in part.parts:
+        _put_part(lines, inner)
+    kind = _KIND.match("".join(piece for _, _, piece in part.declaration))
+    word = part.word or (kind[1].upper() if kind is not None else "")
+    if word:
+        _put(lines, *part.end, f"END_{word} ")
 
 
 def _put_pieces(lines: list[str], pieces: list[Piece]) -> None:

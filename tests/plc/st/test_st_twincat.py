@@ -110,25 +110,115 @@ VAR n : INT := 5; calls : INT; END_VAR]]></Declaration>
         load_program(str(path), dialect="twincat")
 
 
+DRIVE = f"""{HEAD}<Itf Name="I_Drive" Id="{{6}}"><Declaration><![CDATA[{{attribute 'x'}}
+// PROGRAM in a comment
+INTERFACE I_Drive
+]]></Declaration>
+  <Method Name="Start" Id="{{7}}"><Declaration><![CDATA[METHOD Start : BOOL
+VAR_INPUT
+  rpm : INT;
+END_VAR
+]]></Declaration></Method>
+  <Property Name="Speed" Id="{{8}}"><Declaration><![CDATA[PROPERTY Speed : INT]]></Declaration>
+    <Get Name="Get" Id="{{9}}"><Declaration><![CDATA[]]></Declaration></Get>
+  </Property>
+</Itf></TcPlcObject>"""
+MOTOR = f"""{HEAD}<POU Name="FB_Motor" Id="{{10}}">
+  <Declaration><![CDATA[FUNCTION_BLOCK FB_Motor IMPLEMENTS I_Drive
+VAR
+  _speed : INT;
+  calls : INT;
+END_VAR
+]]></Declaration>
+  <Implementation><ST><![CDATA[calls := calls + 1;]]></ST></Implementation>
+  <Folder Name="Methods" Id="{{11}}" />
+  <Method Name="Start" Id="{{12}}" FolderPath="Methods\\">
+    <Declaration><![CDATA[METHOD PUBLIC Start : BOOL
+VAR_INPUT
+  rpm : INT;
+END_VAR
+]]></Declaration>
+    <Implementation><ST><![CDATA[Speed := rpm;
+Start := THIS^.Speed > 0;
+Reset();]]></ST></Implementation>
+  </Method>
+  <Property Name="Speed" Id="{{13}}"><Declaration><![CDATA[PROPERTY PUBLIC Speed : INT]]></Declaration>
+    <Get Name="Get" Id="{{14}}"><Declaration><![CDATA[VAR
+END_VAR
+]]></Declaration>
+      <Implementation><ST><![CDATA[Speed := _speed;]]></ST></Implementation></Get>
+    <Set Name="Set" Id="{{15}}"><Declaration><![CDATA[VAR half : INT; END_VAR
+]]></Declaration><Implementation><ST><![CDATA[half := Speed / 2;
+_speed := half * 2;]]></ST></Implementation></Set>
+  </Property><Action Name="Reset" Id="{{16}}"><Implementation><ST><![CDATA[calls := 0;]]></ST></Implementation></Action>
+</POU></TcPlcObject>"""
+USER = f"""{HEAD}<POU Name="MAIN" Id="{{17}}"><Declaration><![CDATA[PROGRAM MAIN
+VAR motor : FB_Motor; drive : I_Drive; n : INT; ok : BOOL; END_VAR]]></Declaration>
+<Implementation><ST><![CDATA[motor();
+drive := motor;
+ok := drive.Start(rpm := n + 3);
+n := drive.Speed;]]></ST></Implementation></POU></TcPlcObject>"""
+
+
+@pytest.fixture
+def classes(tmp_path: Path) -> Path:
+    """A TwinCAT project with an interface, a function block with a method and a property, and a program that uses both."""
+    for name, text in (("I_Drive.TcIO", DRIVE), ("FB_Motor.TcPOU", MOTOR), ("MAIN.TcPOU", USER)):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_methods_properties_and_interfaces_of_a_project_run(classes: Path) -> None:
+    made: Any = load_program(str(classes), dialect="twincat")
+    scan(made)
+    assert (made.n, made.ok, made.st_body.v_motor.v_calls) == (2, True, 0)
+    scan(made, 2)
+    assert made.n == 4
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "token"),
+    [
+        ("FB_Motor.TcPOU", "Reset();", "Rest();", "Rest"),
+        ("FB_Motor.TcPOU", "rpm : INT", "rpm : INTT", "INTT"),
+        ("FB_Motor.TcPOU", "Speed := _speed;", "Speed := _spee;", "_spee"),
+        ("FB_Motor.TcPOU", "_speed := half", "_speed := hal ", "hal "),
+        ("FB_Motor.TcPOU", "calls := 0", "calls := 0.5", "0.5"),
+        ("I_Drive.TcIO", "rpm : INT", "rpm : INTT", "INTT"),
+        ("I_Drive.TcIO", "PROPERTY Speed : INT", "PROPERTY Speed : INTT", "INTT"),
+    ],
+)
+def test_errors_in_methods_have_line_and_column_of_the_file(
+    classes: Path, file: str, before: str, after: str, token: str
+) -> None:
+    path = classes / file
+    text = path.read_text().replace(before, after)
+    path.write_text(text)
+    at = text.index(token, text.index(after))
+    with pytest.raises(FileInvalid) as caught:
+        load_program(str(classes), dialect="twincat")
+    places = [f"{Path(error.path).name}:{error.line}:{error.column}" for error in (caught.value, *caught.value.others)]
+    assert f"{file}:{text.count(chr(10), 0, at) + 1}:{at - text.rfind(chr(10), 0, at)}" in places
+
+
 def test_parts_that_are_not_supported_are_named() -> None:
+    drawn = "<Implementation><NWL/></Implementation>"
     parts = (
-        '<Method Name="Start" Id="{5}"><Declaration>METHOD Start</Declaration></Method>\n'
-        '<Property Name="Level" Id="{6}"><Get Name="Get"/></Property><Transition Name="Full"/>\n</POU>'
+        f'<Method Name="Start" Id="{{5}}"><Declaration>METHOD Start</Declaration>{drawn}</Method>\n'
+        f'<Property Name="Level" Id="{{6}}"><Get Name="Get">{drawn}</Get></Property><Transition Name="Full"/>\n</POU>'
     )
     with pytest.raises(FileInvalid) as caught:
         to_st(MAIN.replace("</POU>", parts), "MAIN.TcPOU")
     assert [str(error) for error in (caught.value, *caught.value.others)] == [
-        "MAIN.TcPOU:17:3: Start of MAIN: methods are not supported",
-        "MAIN.TcPOU:18:1: Level of MAIN: properties are not supported",
-        "MAIN.TcPOU:18:61: Full of MAIN: transitions are not supported",
+        "MAIN.TcPOU:17:88: the body of MAIN.Start is not Structured Text; expected ST; got NWL",
+        "MAIN.TcPOU:18:65: the body of MAIN.Level.Get is not Structured Text; expected ST; got NWL",
+        "MAIN.TcPOU:18:105: Full of MAIN: transitions are not supported",
     ]
     with pytest.raises(FileInvalid, match="the body of MAIN is not Structured Text; expected ST; got NWL"):
         to_st(MAIN.replace("<ST>", "<NWL>").replace("</ST>", "</NWL>"))
-    drawn = '<Action Name="Stop"><Implementation><NWL/></Implementation></Action></POU>'
+    action = f'<Action Name="Stop">{drawn}</Action></POU>'
     with pytest.raises(FileInvalid, match=r"the body of MAIN\.Stop is not Structured Text"):
-        to_st(MAIN.replace("</POU>", drawn))
-    with pytest.raises(FileInvalid, match="I_Motor: interfaces are not supported"):
-        to_st(f'{HEAD}<Itf Name="I_Motor"/></TcPlcObject>')
+        to_st(MAIN.replace("</POU>", action))
 
 
 @pytest.mark.parametrize(
@@ -151,9 +241,9 @@ def test_a_damaged_file_is_refused(text: str, message: str) -> None:
         assert not to_st(text).strip()
 
 
-@given(st.integers(0, len(MAIN)), st.integers(0, 40), st.text(max_size=8))
-def test_a_file_with_random_damage_is_read_or_refused(at: int, removed: int, inserted: str) -> None:
-    text = MAIN[:at] + inserted + MAIN[at + removed :]
+@given(st.sampled_from([MAIN, MOTOR]), st.integers(0, len(MOTOR)), st.integers(0, 40), st.text(max_size=8))
+def test_a_file_with_random_damage_is_read_or_refused(whole: str, at: int, removed: int, inserted: str) -> None:
+    text = whole[:at] + inserted + whole[at + removed :]
     try:
         found = to_st(text)
     except FileInvalid:

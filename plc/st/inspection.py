@@ -162,6 +162,8 @@ def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
         return "NULL" if value is None else f"an instance of {value.of.name}"
     if isinstance(kind, ty.Enum):
         return next((word for word, number in kind.values.items() if number == value), str(value))
+    if isinstance(kind, ty.Pointer):
+        return "NULL" if value is None else "a reference"
     if isinstance(kind, ty.String):
         return f"'{value}'"
     if isinstance(kind, ty.Elementary) and kind.kind in _DATES:

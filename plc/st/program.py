@@ -36,6 +36,7 @@ from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
+from fieldtwin.plc.st.runtime.references import REFERENCES
 
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
@@ -92,7 +93,10 @@ class StProgram(Program):
         """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global variables."""
         resource = self.st_resource
         held = [vars(self.st_body), vars(resource.globals)]
-        own = tuple([tuple([state_of(v, now_ns) for name, v in of.items() if not is_line(name)]) for of in held])
+        numbers = resource.numbers(self.st_body)
+        own = tuple(
+            [tuple([state_of(v, now_ns, numbers) for name, v in of.items() if not is_line(name)]) for of in held]
+        )
         return (own, now_ns) if resource.absolute else own
 
     def st_show(self) -> None:
@@ -354,7 +358,9 @@ def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
 
 
 def _dump(value: Any) -> Any:
-    """Return the plain data of a value: objects by their slots (`_own`)."""
+    """Return the plain data of a value: objects by their slots (`_own`), references as None."""
+    if isinstance(value, REFERENCES):
+        return None
     if isinstance(value, list):
         return [_dump(v) for v in value]
     slots = getattr(value, "__slots__", None)
@@ -372,7 +378,9 @@ def _own(value: Any) -> list[str]:
 
 
 def _load(into: Any, kept: Any) -> Any:
-    """Return `kept` in the form of `into`; raises `FileInvalid` if the forms differ."""
+    """Return `kept` in the form of `into`; raises `FileInvalid` if the forms differ. References stay as they are."""
+    if isinstance(into, REFERENCES):
+        return into
     if isinstance(into, list) and isinstance(kept, list) and len(into) == len(kept):
         return [_load(a, b) for a, b in zip(into, kept, strict=True)]
     slots = getattr(into, "__slots__", None)

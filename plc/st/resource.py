@@ -16,7 +16,7 @@ from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.runtime.references import Instance
+from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
 MAX_STEPS = 1_000_000
 """How many loop iterations, and calls of functions and function blocks, a program may make in one scan. The limit is
@@ -76,6 +76,7 @@ class Resource:
         self.globals: Any = self.space["_G"]
         self.absolute = ".scan_ns" in unit.python
         """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""
+        self._has_references = "_v.pointed(" in unit.python
 
     @classmethod
     def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:
@@ -98,19 +99,48 @@ class Resource:
         context.left = MAX_STEPS
         context.now_ns, context.first_scan, context.lookup = scan.now_ns, scan.first_scan, lookup
 
+    def numbers(self, body: Any) -> dict[int, int]:
+        """Return the numbers of the objects of a program by their ids, if its variables may be references."""
+        return _numbered((body, self.globals)) if self._has_references else {}
+
     def __deepcopy__(self, memo: dict[int, Any]) -> Resource:
         new = Resource.__new__(Resource)
         memo[id(self)] = new
         new.context, new.space, new.absolute = self.context, self.space, self.absolute
+        new._has_references = self._has_references
         new.globals = copy.deepcopy(self.globals, memo)
         return new
 
 
-def state_of(value: Any, now_ns: int) -> Any:
+def _numbered(roots: tuple[Any, ...]) -> dict[int, int]:
+    """Return a number for each object below `roots` by its id. Copies of the roots have the same numbers."""
+    numbers: dict[int, int] = {}
+    waiting = list(roots)
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, REFERENCES) or id(value) in numbers:
+            continue
+        if isinstance(value, list):
+            waiting += value
+        elif hasattr(value, "__dict__"):
+            waiting += vars(value).values()
+        elif hasattr(value, "__slots__"):
+            waiting += [getattr(value, name, None) for name in value.__slots__]
+        else:
+            continue
+        numbers[id(value)] = len(numbers)
+    return numbers
+
+
+def state_of(value: Any, now_ns: int, numbers: dict[int, int]) -> Any:
     """Return the part of a variable that affects later scans, as a hashable value. Equal states behave the same from
-    now on."""
+    now on. `numbers`: those of all objects (`Resource.numbers`), by which a reference names its variable.
+    """
     if isinstance(value, list):
-        return tuple([state_of(v, now_ns) for v in value])
+        return tuple([state_of(v, now_ns, numbers) for v in value])
+    if isinstance(value, REFERENCES):
+        owner, *where = value.key()
+        return "reference", numbers.get(owner, owner), *where
     if isinstance(value, FunctionBlock):
         return type(value).__name__, *value.state(now_ns)
     if isinstance(value, Instance):
@@ -121,4 +151,4 @@ def state_of(value: Any, now_ns: int) -> Any:
     if names is None or isinstance(value, bool | int | float | str | Message):
         return repr(value) if isinstance(value, float) else value  # so that 0.0, -0.0 and NaN stay distinct
     references = getattr(value, "in_outs", ())
-    return tuple([state_of(getattr(value, name), now_ns) for name in names if name not in references])
+    return tuple([state_of(getattr(value, name), now_ns, numbers) for name in names if name not in references])

@@ -111,9 +111,12 @@ class String:
 
 @dataclass(frozen=True, slots=True)
 class Enum:
+    """An enumeration. `bits` is the size of the type of its values, for SIZEOF."""
+
     name: str
     values: Mapping[str, int] = field(hash=False)
     initial: int = 0
+    bits: int = 16
 
     def __str__(self) -> str:
         return self.name
@@ -187,8 +190,30 @@ class Interface:
 
 
 @dataclass(frozen=True, slots=True)
+class Named:
+    """A structure or block to which a reference refers, by its name in lower case, because it may contain that reference."""
+
+    key: str
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Pointer:
+    """A reference to a variable of type `of`. `word` is REF_TO, POINTER TO or REFERENCE TO (without ``^`` at each use)."""
+
+    word: str
+    of: Type | Named
+
+    def __str__(self) -> str:
+        return f"{self.word} {self.of}"
+
+
+@dataclass(frozen=True, slots=True)
 class Null:
-    """The type of NULL, the reference to no instance."""
+    """The type of NULL, the reference to no variable."""
 
     def __str__(self) -> str:
         return "NULL"
@@ -228,8 +253,8 @@ class MessagesOut:
 
 
 Type = (
-    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | MessagesIn | MessagesOut | Nothing
-    | Interface | Null
+    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | Pointer | Null | MessagesIn | MessagesOut
+    | Nothing | Interface
 )  # fmt: skip
 
 
@@ -277,6 +302,8 @@ def fits(source: Type, target: Type) -> bool:
         return is_kind(sink, "real")
     if isinstance(source, Elementary) and isinstance(sink, Elementary):
         return _widens(source, sink)
+    if isinstance(source, Null) and isinstance(sink, Pointer):
+        return True
     if isinstance(source, String) and isinstance(sink, String):
         return source.wide == sink.wide
     if isinstance(sink, Interface) and isinstance(source, Block | Interface | Null):

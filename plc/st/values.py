@@ -28,7 +28,24 @@ from fieldtwin.plc.st.runtime.moments import (
     tod_of,
     tod_text,
 )
-from fieldtwin.plc.st.runtime.references import Cell, Cut, Element, Instance, MemberReference, instance, same
+from fieldtwin.plc.st.runtime.references import (
+    Cell,
+    Cut,
+    Element,
+    Instance,
+    MemberReference,
+    Whole,
+    attempted,
+    characters,
+    cut,
+    first,
+    instance,
+    moved,
+    pointed,
+    same,
+    view,
+    whole,
+)
 
 __all__ = [  # and all names that compiled code calls
     "Cell",
@@ -37,18 +54,27 @@ __all__ = [  # and all names that compiled code calls
     "Instance",
     "LogicError",
     "MemberReference",
+    "Whole",
+    "attempted",
+    "characters",
+    "cut",
     "date_of",
     "date_text",
     "day_of_week",
     "dt_of",
+    "first",
     "instance",
     "moment_text",
+    "moved",
+    "pointed",
     "same",
     "split_date",
     "split_dt",
     "split_tod",
     "tod_of",
     "tod_text",
+    "view",
+    "whole",
 ]
 
 _FLOAT = struct.Struct("<f")

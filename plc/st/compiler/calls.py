@@ -12,11 +12,12 @@ from fieldtwin.plc.st.compiler.classes.members import Selected, class_of, note, 
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
+from fieldtwin.plc.st.compiler.pointers import references
 from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Value, by_reference, default_value, wrapped
-from fieldtwin.plc.st.compiler.variables import bit, variable
+from fieldtwin.plc.st.compiler.variables import bit, place, variable
 from fieldtwin.plc.st.syntax import tree as t
 
-_OF_ADDRESSES = frozenset({"ADR", "BITADR", "INDEXOF", "REF", "SIZEOF", "XSIZEOF", "__NEW", "__DELETE"})
+_OF_ADDRESSES = frozenset({"BITADR", "INDEXOF", "__NEW", "__DELETE"})
 """Functions of other tools that need the memory of a controller."""
 
 
@@ -45,7 +46,7 @@ class Calls(Expressions):
             if standard is not None:
                 return standard(self, call)
             if name.upper() in _OF_ADDRESSES:
-                message = "addresses and sizes of variables are not supported"
+                message = "addresses as numbers and memory of a controller are not supported"
                 self.env.fail(call.pos, message, got=call.ref.name)
             known = (
                 [s.name for s in self.env.functions.values()]
@@ -114,7 +115,7 @@ class Calls(Expressions):
             if expr is None:
                 codes.append(p.initial)
                 continue
-            code = self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
+            code = self.given(expr, p.type, expr.pos, _into(p, signature))
             codes = [self.earlier(Value(one, p.type), mark, expr.pos).code for one in codes]
             codes.append(code)
         cells: dict[str, str] = {}
@@ -140,6 +141,12 @@ class Calls(Expressions):
                 )
             self.take(argument, Value(f"{result}[{places[key]}]", types[key]))
         return Value(f"{result}[0]" if more else result, signature.returns)
+
+    def given(self, expr: t.Expr, kind: ty.Type, pos: t.Pos, what: str) -> str:
+        """Return the Python expression of the argument for an input of type `kind`."""
+        if isinstance(kind, ty.Pointer) and kind.word == references.REFERENCE:
+            return references.referring(self, expr, kind, pos)
+        return self.coerced(self.value(expr, kind), kind, pos, what)
 
     def take(self, argument: t.Argument, value: Value) -> None:
         """Compile the output argument ``name => target``: write the assignment of `value` to the target."""
@@ -186,6 +193,33 @@ class Calls(Expressions):
         if getter is not None:
             self.env.fail(ref.pos, f"property {getter.method.owner}.{getter.method.signature.name} has no SET")
         return False
+
+    def refer(self, s: t.Refer) -> None:
+        """Write ``reference REF= variable``."""
+        target = place(self, s.target)
+        if not (isinstance(target.type, ty.Pointer) and target.type.word == references.REFERENCE):
+            self.env.fail(s.pos, "the left side of REF=", expected="a REFERENCE TO", got=str(target.type))
+        allowed = target.writable or (
+            target.is_input and self.env.accepts("ST001", s.pos, f"{s.target.name} is an input and is assigned to")
+        )
+        if not allowed:
+            self.env.fail(s.pos, f"{s.target.name} cannot be assigned to")
+        code = references.referring(self, s.value, target.type, s.value.pos)
+        self.out.line(f"{target.code} = {code}", s.pos)
+
+    def attempt(self, s: t.Attempt) -> None:
+        """Write ``?=`` (IEC 61131-3:2013, table 52): NULL if the reference does not refer to a block of the target's type."""
+        target, value = self.writable(s.target), self.value(s.value)
+        kinds = [v.type for v in (target, value)]
+        if not all(isinstance(kind, ty.Pointer) and kind.word == references.REF_TO for kind in kinds):
+            self.env.fail(s.pos, "operands of ?=", expected="two references (REF_TO)", got=f"{kinds[0]} and {kinds[1]}")
+        to, of = (self.env.target(kind, s.pos) for kind in kinds if isinstance(kind, ty.Pointer))
+        code = value.code
+        if to != of:
+            if not (isinstance(to, ty.Block) and isinstance(of, ty.Block)) or to.standard or of.standard:
+                self.env.fail(s.pos, "types differ", expected=str(kinds[0]), got=str(kinds[1]))
+            code = f"_v.attempted({code}, B_{to.name.lower()})"
+        self.out.line(f"{target.code} = {code}", s.pos)
 
     def writable(self, ref: t.Ref) -> Value:
         target = variable(self, ref)

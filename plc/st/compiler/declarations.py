@@ -34,6 +34,8 @@ class Declarations:
         self._types: dict[str, t.TypeDecl] = {}
         self._blocks = {p.name.lower(): p for p in unit.pous if p.kind in ("FUNCTION_BLOCK", "CLASS", "INTERFACE")}
         self._open: list[str] = []
+        self._pointed: list[t.NamedType] = []
+        """Structures and blocks to which references refer, and which have to be resolved when no other type is open."""
         for declared in unit.types:
             with env.declaring(declared.name, env.faulty):
                 if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
@@ -108,6 +110,8 @@ class Declarations:
             return self.named(spec.name, spec.pos)
         if isinstance(spec, t.ArrayType):
             return self._array(spec)
+        if isinstance(spec, t.PointerType):
+            return self._pointer(spec)
         if isinstance(spec, t.SubrangeType):
             return self._subrange(spec)
         if isinstance(spec, t.StringType):
@@ -133,6 +137,26 @@ class Declarations:
         made = ty.Array(ranges, of)
         self.bounded(spec.pos, [made])
         return made
+
+    def _pointer(self, spec: t.PointerType) -> ty.Pointer:
+        word = spec.word if spec.word == "REF_TO" else f"{spec.word} TO"
+        if spec.word != "REF_TO" and not self.env.dialect.vendor:
+            hint = "the dialects codesys and twincat accept it; the standard has REF_TO"
+            self.env.fail(spec.pos, f"{word} is not in the standard", hint=hint)
+        key = spec.of.name.lower() if isinstance(spec.of, t.NamedType) else ""
+        if isinstance(spec.of, t.NamedType) and (key in self._blocks or isinstance(self._types.get(key), t.StructDecl)):
+            declared = self._blocks.get(key) or self._types[key]
+            self._pointed.append(spec.of)  # it may contain this reference
+            made = ty.Pointer(word, ty.Named(key, declared.name))
+        else:
+            made = ty.Pointer(word, self.type_of(spec.of))
+        self._resolve_pointed()
+        return made
+
+    def _resolve_pointed(self) -> None:
+        while self._pointed and not self._open:
+            later = self._pointed.pop()
+            self.named(later.name, later.pos)
 
     def bounded(self, pos: t.Pos, kinds: Iterable[ty.Type]) -> tuple[int, int]:
         """Return the size and the nesting depth of variables of these types. Raises `FileInvalid` beyond the limits."""
@@ -178,6 +202,7 @@ class Declarations:
         finally:
             self._open.pop()
         self.env.types[key] = found
+        self._resolve_pointed()
         return found
 
     def _resolved(self, key: str, name: str, pos: t.Pos) -> ty.Type:
@@ -222,12 +247,13 @@ class Declarations:
             number += 1
         self._check_base(declared, values)
         first = next(iter(values.values()))
-        enum = ty.Enum(declared.name, values, first)
+        base = ty.ELEMENTARY[declared.base.name.upper()].bits if declared.base is not None else ty.INT.bits
+        enum = ty.Enum(declared.name, values, first, base)
         if isinstance(declared.initial, t.Ref):
             lower = {k.lower(): v for k, v in values.items()}
             if declared.initial.name.lower() not in lower:
                 self.env.unknown(declared.pos, f"in {declared.name}, a value", declared.initial.name, list(values))
-            enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()])
+            enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()], base)
         self.env.types[declared.name.lower()] = enum
         for name, value in values.items():
             self.env.enum_values.setdefault(name.lower(), []).append((enum, value))

@@ -12,6 +12,7 @@ from fieldtwin.plc.st.compiler.classes.members import own_property_type, propert
 from fieldtwin.plc.st.compiler.implicit import converted
 from fieldtwin.plc.st.compiler.literals import Malformed, constant
 from fieldtwin.plc.st.compiler.operators import binary, unary
+from fieldtwin.plc.st.compiler.pointers import references
 from fieldtwin.plc.st.compiler.scope import (
     Class,
     CodeWriter,
@@ -56,6 +57,8 @@ class Expressions:
         """Return the Python expression of `value` as a `target`. Raises `FileInvalid` if this needs an explicit conversion
         function such as REAL_TO_INT.
         """
+        if isinstance(value.type, ty.Pointer) or isinstance(target, ty.Pointer):
+            return references.coerced(self, value, target, pos, what)
         source = ty.plain(value.type)
         accepted = None if ty.fits(value.type, target) else converted(self, value, target, pos)
         if accepted is not None:
@@ -153,16 +156,28 @@ class Expressions:
         else:
             kind, selectors = own_property_type(self, ref)
         for selector in selectors:
-            if isinstance(selector, t.Bit):
+            kind = self._followed(kind, selector.pos)
+            if isinstance(selector, t.Deref):
+                kind = self.env.target(kind, selector.pos) if isinstance(kind, ty.Pointer) else None
+            elif isinstance(selector, t.Bit):
                 kind = ty.BOOL
             elif isinstance(selector, t.Index):
-                kind = kind.of if isinstance(kind, ty.Array) else None
+                if isinstance(kind, ty.Pointer):
+                    kind = self.env.target(kind, selector.pos)
+                else:
+                    kind = kind.of if isinstance(kind, ty.Array) else None
             else:
                 name = selector.name.lower()
                 members = kind.fields if isinstance(kind, ty.Struct) else {}
                 if isinstance(kind, ty.Block):
                     members = {**kind.inputs, **kind.outputs, **kind.publics}
                 kind = members[name][1] if name in members else property_type(self, kind, name)
+        return self._followed(kind, ref.pos)
+
+    def _followed(self, kind: ty.Type | None, pos: t.Pos) -> ty.Type | None:
+        """Return the type of the variable for which a REFERENCE TO stands; other types as they are."""
+        if isinstance(kind, ty.Pointer) and kind.word == references.REFERENCE:
+            return self.env.target(kind, pos)
         return kind
 
     def flat(self, value: Value, pos: t.Pos) -> Value:
@@ -197,6 +212,8 @@ class Expressions:
     def _literal(self, literal: t.Literal) -> Value:
         if literal.kind == "ENUM_REF":
             return self._enum(literal)
+        if literal.kind == "NULL":
+            return Value("None", ty.NULL)
         try:
             known = constant(literal)
         except Malformed as e:

@@ -10,6 +10,7 @@ from typing import NoReturn, TypeGuard
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.implicit import as_number, logical_type, meeting
+from fieldtwin.plc.st.compiler.pointers.references import joined
 from fieldtwin.plc.st.compiler.scope import COMPARISONS, Compiling, Value, wrapped
 from fieldtwin.plc.st.compiler.time_arithmetic import with_time
 from fieldtwin.plc.st.syntax import tree as t
@@ -67,6 +68,9 @@ def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
         left, right = _only_if_needed(x, expr, left, right, x.out.since(mark))
     else:
         left = x.earlier(left, mark, expr.pos)
+    of_references = joined(x, expr, left, right)
+    if of_references is not None:
+        return of_references
     if expr.op in _LOGIC:
         return _logic(x, expr, left, right)
     if expr.op in COMPARISONS:

@@ -42,7 +42,8 @@ class Value:
     """A compiled expression. `place` is true if it is a variable or a part of one, `is_input` if that is an input of the POU.
     `constant` is its value if it is known.
 
-    `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
+    `reference`: Python expression of an object that refers to the variable; empty for a function's own variable. `view`: for an
+    array to which a POINTER TO points, its Python expression; that array may have another size than the pointer states.
     """
 
     code: str
@@ -52,6 +53,7 @@ class Value:
     writable: bool = False
     reference: str = ""
     is_input: bool = False
+    view: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +148,7 @@ def simple_default(kind: ty.Type) -> str | None:
         return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
     if isinstance(kind, ty.String):
         return "''"
-    if isinstance(kind, ty.Interface):
+    if isinstance(kind, ty.Interface | ty.Pointer):
         return "None"
     return str(kind.initial) if isinstance(kind, ty.Enum) else None
 
@@ -249,6 +251,13 @@ class Environment:
 
     def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
         raise self.error(pos, message, expected=expected, got=got, hint=hint)
+
+    def target(self, kind: ty.Pointer, pos: Pos) -> ty.Type:
+        """Return the type of the variables to which references of a type refer."""
+        if not isinstance(kind.of, ty.Named):
+            return kind.of
+        found = self.types.get(kind.of.key)
+        return found if found is not None else self.unknown(pos, "a type", kind.of.name, list(self.types))
 
     def refuse_missing(self, key: str, pos: Pos) -> None:
         """Raise `FileInvalid` if the declaration `key`, a name in lower case, was not imported, with the reason."""

@@ -59,6 +59,12 @@ class Statements(Calls):
     def _assign(self, s: t.Assign) -> None:
         self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
+    def _refer(self, s: t.Refer) -> None:
+        self.refer(s)
+
+    def _attempt(self, s: t.Attempt) -> None:
+        self.attempt(s)
+
     # -- unit tests and coverage --------------------------------------------------------------------------------------
 
     def _assertion(self, s: t.Assertion) -> None:
@@ -179,7 +185,7 @@ class Statements(Calls):
             self.env.fail(call.pos, f"{call.ref.name} is an instance of the class {block} and cannot be called")
         if action:
             self._note_action(self._declaring(block, action), action, call)
-        if "[" in code:  # compute the place once
+        if "[" in code or "(" in code:  # compute the place once
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)
             code = place
@@ -190,7 +196,7 @@ class Statements(Calls):
             assert argument.value is not None
             if name in block.inputs:
                 member, kind = block.inputs[name]
-                value = self.coerced(self.value(argument.value, kind), kind, argument.pos, f"{member} of {block}")
+                value = self.given(argument.value, kind, argument.pos, f"{member} of {block}")
                 self.out.line(f"{code}.{_attribute(block, name, member)} = {value}", call.pos)
             else:
                 member, kind = block.in_outs[name]

@@ -22,11 +22,21 @@ def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Selector, .
 
 
 def variable(x: Compiling, ref: t.Ref) -> Value:
-    """Compile a reference to a variable, a property or a part of one, or a value of an enumeration."""
+    """Compile the name of a variable, a property or a part of one, or a value of an enumeration. A REFERENCE TO stands for its
+    variable.
+    """
+    return _followed(x, place(x, ref), ref.pos)
+
+
+def place(x: Compiling, ref: t.Ref) -> Value:
+    """Compile a name as `variable` does, except that a REFERENCE TO stands for itself."""
     found = None if ref.name.lower() in x.symbols else own_property(x, ref)
     value, selectors = found if found is not None else _variable(x, ref)
     for selector in selectors:
-        if isinstance(selector, t.Member):
+        value = _followed(x, value, selector.pos)
+        if isinstance(selector, t.Deref):
+            value = _dereferenced(x, value, selector.pos)
+        elif isinstance(selector, t.Member):
             value = _member(x, value, ref, selector)
         elif isinstance(selector, t.Index):
             value = _index(x, value, selector)
@@ -37,8 +47,6 @@ def variable(x: Compiling, ref: t.Ref) -> Value:
 
 def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
     symbol, selectors = lookup(x, ref)
-    if symbol is None and ref.name.lower() == "null" and not selectors:
-        return Value("None", ty.NULL), ()
     if symbol is None or (x.env.dialect.vendor and isinstance(symbol.type, ty.Enum) and selectors):
         return _enum_value(x, ref), ()
     if symbol.refused:
@@ -52,6 +60,29 @@ def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
     reference = symbol.reference or (f"_v.MemberReference({owner}, {own!r})" if owner else "")
     value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference, symbol.is_input)
     return value, selectors
+
+
+def _followed(x: Compiling, value: Value, pos: t.Pos) -> Value:
+    """Return the variable to which a REFERENCE TO refers; other values as they are."""
+    is_reference = isinstance(value.type, ty.Pointer) and value.type.word == "REFERENCE TO"
+    return _dereferenced(x, value, pos) if is_reference else value
+
+
+def _dereferenced(x: Compiling, value: Value, pos: t.Pos) -> Value:
+    """Return the variable to which a reference refers. NULL is an error at run time."""
+    kind = value.type
+    if not isinstance(kind, ty.Pointer):
+        x.env.fail(pos, "a ^ after a value that is not a reference", got=str(kind))
+    reference = f"_v.pointed({value.code})"
+    return pointed(reference, x.env.target(kind, pos))
+
+
+def pointed(reference: str, of: ty.Type) -> Value:
+    """Return the variable to which the Python expression `reference` refers."""
+    code, view = f"{reference}.v", ""
+    if isinstance(of, ty.Array) and len(of.ranges) == 1:
+        view, code = code, f"_v.whole({code}, {ty.elements(ty.Array(of.ranges, ty.INT))})"
+    return Value(code, of, None, True, True, reference, view=view)
 
 
 def _enum_value(x: Compiling, ref: t.Ref) -> Value:
@@ -109,18 +140,18 @@ def _member(x: Compiling, value: Value, ref: t.Ref, member: t.Member) -> Value:
 
 def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
     kind = value.type
+    if isinstance(kind, ty.Pointer) and kind.word == "POINTER TO":
+        return _moved(x, value, kind, selector)
     if not isinstance(kind, ty.Array):
         x.env.fail(selector.pos, "an index into a value that is not an array", got=str(kind))
     if len(selector.indices) != len(kind.ranges):
         x.env.fail(selector.pos, "indices", expected=f"{len(kind.ranges)} for {kind}", got=str(len(selector.indices)))
-    code, owner, at = value.code, "", ""
+    code, owner, at = value.view or value.code, "", ""
     for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
-        index = x.flat(x.value(expr), expr.pos)
-        if isinstance(index.type, ty.Enum):
-            index = as_number(x, index, expr.pos)
-        if not ty.is_kind(index.type, "int", "bits"):
-            x.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
-        if isinstance(index.constant, int):
+        index = _whole_number(x, expr)
+        if value.view:
+            at = f"_v.view({code}, {index.code}, {low}, {high})"
+        elif isinstance(index.constant, int):
             if not low <= index.constant <= high:
                 x.env.fail(expr.pos, "an index outside its array", expected=f"{low} to {high}", got=index.code)
             at = str(index.constant - low)
@@ -128,6 +159,23 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
             at = f"_v.index({index.code}, {low}, {high})"
         owner, code = code, f"{code}[{at}]"
     return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})", value.is_input)
+
+
+def _whole_number(x: Compiling, expr: t.Expr) -> Value:
+    index = x.flat(x.value(expr), expr.pos)
+    if isinstance(index.type, ty.Enum):
+        index = as_number(x, index, expr.pos)
+    if not ty.is_kind(index.type, "int", "bits"):
+        x.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
+    return index
+
+
+def _moved(x: Compiling, value: Value, kind: ty.Pointer, selector: t.Index) -> Value:
+    """Compile ``pointer[i]``, which is the variable `i` elements after the one to which the pointer points."""
+    of = x.env.target(kind, selector.pos)
+    if len(selector.indices) != 1 or isinstance(of, ty.Array | ty.String):
+        x.env.fail(selector.pos, f"an index into a {kind}", hint="write ^ before the index")
+    return pointed(f"_v.moved({value.code}, {_whole_number(x, selector.indices[0]).code}, 1)", of)
 
 
 def bit(x: Compiling, value: Value, selector: t.Bit) -> Value:

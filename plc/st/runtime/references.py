@@ -1,24 +1,50 @@
-"""References at run time: those for VAR_IN_OUTs of elementary types refer to a variable of the caller, and those in variables of
-an interface type to an instance.
+"""References at run time: for VAR_IN_OUTs of elementary types, for REF_TO, POINTER TO and REFERENCE TO, and for variables of an
+interface type.
 
-Reading and writing `v` reads and writes that variable immediately. So two VAR_IN_OUTs that refer to one variable always have
-the same value, and so does the variable itself (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are passed directly.
+Reading and writing `v` reads and writes the variable immediately. So two references to one variable always have the same value,
+and so does the variable itself (IEC 61131-3, 6.5.3.1). As VAR_IN_OUTs, arrays, structures and blocks are passed directly.
+
+A reference never leads outside its variable: a pointer that was moved past the end of its array, and NULL, raise `LogicError`
+where the program uses them. `key` identifies the variable: references with equal keys refer to one variable.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 
+Key = tuple[Any, ...]
+"""The identity of a variable: the id of the Python object that holds it, and where it is in that object."""
+
+
+class Reference(Protocol):
+    """A reference to a variable, whose value is `v`."""
+
+    v: Any
+
+    def key(self) -> Key: ...
+
 
 class Cell:
-    """A reference to a function's own variable, for the duration of a call."""
+    """A function's own variable to which references exist."""
 
     __slots__ = ("v",)
 
     def __init__(self, value: Any) -> None:
         self.v = value
+
+    def key(self) -> Key:
+        return (id(self),)
+
+
+class Whole(Cell):
+    """A reference to an array, a structure or a block, which always stays the same Python object."""
+
+    __slots__ = ()
+
+    def key(self) -> Key:
+        return self.v.key() if isinstance(self.v, Characters) else (id(self.v),)
 
 
 class MemberReference:
@@ -28,6 +54,9 @@ class MemberReference:
 
     def __init__(self, owner: Any, name: str) -> None:
         self._owner, self._name = owner, name
+
+    def key(self) -> Key:
+        return id(self._owner), self._name
 
     @property
     def v(self) -> Any:
@@ -39,33 +68,52 @@ class MemberReference:
 
 
 class Element:
-    """A reference to an element of an array: the element that the index selected when the call began."""
+    """A reference to an element of an array: the element that the index selected when the call began.
 
-    __slots__ = ("_at", "_owner")
+    A pointer may be moved to any place `at`. It raises `LogicError` when it is used outside the array.
+    """
 
-    def __init__(self, owner: list[Any], at: int) -> None:
-        self._owner, self._at = owner, at
+    __slots__ = ("at", "owner")
+
+    def __init__(self, owner: Any, at: int) -> None:
+        self.owner, self.at = owner, at
+
+    def key(self) -> Key:
+        owner = self.owner.key() if isinstance(self.owner, Single | Characters) else (id(self.owner),)
+        return *owner, self.at
 
     @property
     def v(self) -> Any:
-        return self._owner[self._at]
+        if not 0 <= self.at < len(self.owner):
+            self._fail()
+        return self.owner[self.at]
 
     @v.setter
     def v(self, value: Any) -> None:
-        self._owner[self._at] = value
+        if not 0 <= self.at < len(self.owner):
+            self._fail()
+        self.owner[self.at] = value
+
+    def _fail(self) -> None:
+        expected = f"element 1 to {len(self.owner)}"
+        raise LogicError("a pointer outside the variable to which it pointed", expected=expected, got=str(self.at + 1))
 
 
 class Cut:
-    """A reference to a string that is shorter than the VAR_IN_OUT: an assigned value is cut to `length` characters."""
+    """A reference to a string with another length than the variable: its value is cut to `length` characters."""
 
     __slots__ = ("_length", "_of")
 
     def __init__(self, of: Any, length: int) -> None:
         self._of, self._length = of, length
 
+    def key(self) -> Key:
+        return self._of.key()  # type: ignore[no-any-return]
+
     @property
-    def v(self) -> Any:
-        return self._of.v
+    def v(self) -> str:
+        text: str = self._of.v
+        return text[: self._length]
 
     @v.setter
     def v(self, value: str) -> None:
@@ -80,6 +128,9 @@ class Instance:
     def __init__(self, of: Any) -> None:
         self.of = of
 
+    def key(self) -> Key:
+        return (id(self.of),)
+
 
 def instance(reference: Instance | None, name: str) -> Any:
     """Return the instance to which the variable `name` refers. Raises `LogicError` if it is NULL."""
@@ -88,6 +139,130 @@ def instance(reference: Instance | None, name: str) -> Any:
     return reference.of
 
 
-def same(a: Instance | None, b: Instance | None) -> bool:
-    """Return whether two variables refer to the same instance, or are both NULL."""
-    return a is b or (a is not None and b is not None and a.of is b.of)
+class Single:
+    """A variable as an array with one element, because a pointer to it was moved."""
+
+    __slots__ = ("_of",)
+
+    def __init__(self, of: Reference) -> None:
+        self._of = of
+
+    def key(self) -> Key:
+        return self._of.key()
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, at: int) -> Any:
+        return self._of.v
+
+    def __setitem__(self, at: int, value: Any) -> None:
+        self._of.v = value
+
+
+class Characters:
+    """A string as an array of its bytes. The byte after its last character, and those after that one, are 0.
+
+    An assigned 0 ends the string. A character can be assigned up to the end of the string; one that would be after the end raises
+    `LogicError`, because a string has no bytes there.
+    """
+
+    __slots__ = ("_length", "_of")
+
+    def __init__(self, of: Reference, length: int) -> None:
+        self._of, self._length = of, length
+
+    def key(self) -> Key:
+        return self._of.key()
+
+    def __len__(self) -> int:
+        return self._length + 1
+
+    def __getitem__(self, at: int) -> int:
+        text: str = self._of.v
+        return ord(text[at]) if at < len(text) else 0
+
+    def __setitem__(self, at: int, value: int) -> None:
+        text: str = self._of.v
+        if value == 0:
+            self._of.v = text[:at]
+        elif at > len(text) or at == self._length:
+            raise LogicError(
+                "a character after the end of its string", expected=f"position 1 to {len(text) + 1}", got=str(at + 1)
+            )
+        else:
+            self._of.v = text[:at] + chr(value) + text[at + 1 :]
+
+
+REFERENCES = (Cell, MemberReference, Element, Cut)
+"""The classes of references that variables may hold; `Whole` is a `Cell`."""
+
+
+def pointed(reference: Reference | None) -> Reference:
+    """Return a reference that is used. Raises `LogicError` for NULL."""
+    if reference is None:
+        raise LogicError("a reference that is NULL is used", expected="a test such as IF r <> NULL before it")
+    return reference
+
+
+def same(a: Reference | None, b: Reference | None) -> bool:
+    """Return whether two references refer to one variable, or are both NULL."""
+    if a is None or b is None:
+        return a is b
+    return a.key() == b.key()
+
+
+def first(reference: Reference | None) -> Reference | None:
+    """Return a pointer to the first element of the array to which `reference` refers."""
+    return None if reference is None else Element(reference.v, 0)
+
+
+def cut(reference: Reference | None, length: int) -> Reference | None:
+    """Return a reference to a string that reads and writes at most `length` characters."""
+    return None if reference is None else Cut(reference, length)
+
+
+def characters(reference: Reference | None, length: int) -> Reference | None:
+    """Return a reference to the bytes of the string to which `reference` refers."""
+    return None if reference is None else Whole(Characters(reference, length))
+
+
+def moved(reference: Reference | None, amount: int, size: int) -> Reference:
+    """Return a pointer that was moved by `amount` bytes, where an element has `size` bytes.
+
+    Raises `LogicError` for NULL, and for an amount that leads into the middle of an element.
+    """
+    at, rest = divmod(amount, size)
+    if rest:
+        raise LogicError(
+            "a pointer into the middle of a value", expected=f"a multiple of {size} bytes", got=str(amount)
+        )
+    held = pointed(reference)
+    if isinstance(held, Element):
+        return Element(held.owner, held.at + at)
+    return Element(Single(held), at)
+
+
+def view(array: Any, i: int, low: int, high: int) -> int:
+    """Return where the element `i` of a pointer's array ``low..high`` is in the array to which it points.
+
+    Raises `LogicError` outside of either array.
+    """
+    most = min(high, low + len(array) - 1)
+    if low <= i <= most:
+        return i - low
+    raise LogicError("an index outside the array to which a pointer points", expected=f"{low} to {most}", got=str(i))
+
+
+def whole(array: Any, size: int) -> Any:
+    """Return the array to which a pointer points. Raises `LogicError` if it has another number of elements."""
+    if len(array) != size or isinstance(array, Characters):
+        raise LogicError(
+            "a pointer to an array of another size is used as a whole", expected=f"{size} elements", got=str(len(array))
+        )
+    return array
+
+
+def attempted(reference: Reference | None, block: type) -> Reference | None:
+    """Return `reference` if it refers to a `block`, otherwise NULL (the assignment attempt ``?=``)."""
+    return reference if reference is not None and isinstance(reference.v, block) else None

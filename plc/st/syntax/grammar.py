@@ -21,7 +21,6 @@ _UNSUPPORTED = {
     for construct, words in {
         "variables of an instance in a method": "VAR_INST",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
-        "pointers and references": "POINTER REF_TO REFERENCE ^ REF=",
         "labels and jumps": "JMP",
     }.items()
     for word in words.split()
@@ -36,6 +35,7 @@ _READABLE = {
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
+    "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
 }  # fmt: skip
 
 

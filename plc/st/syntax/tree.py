@@ -59,7 +59,16 @@ class ArrayType:
     of: TypeSpec
 
 
-TypeSpec = NamedType | SubrangeType | StringType | MessagesType | ArrayType
+@dataclass(frozen=True, slots=True)
+class PointerType:
+    """A type of references to variables: `word` is REF_TO, POINTER or REFERENCE."""
+
+    pos: Pos
+    word: str
+    of: TypeSpec
+
+
+TypeSpec = NamedType | SubrangeType | StringType | MessagesType | ArrayType | PointerType
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +324,14 @@ class Index:
     indices: tuple[Expr, ...]
 
 
-Selector = Member | Bit | Index
+@dataclass(frozen=True, slots=True)
+class Deref:
+    """The variable to which a reference refers: ``^``."""
+
+    pos: Pos
+
+
+Selector = Member | Bit | Index | Deref
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +385,24 @@ Init = Literal | Ref | Call | Binary | Unary | InitArray | InitStruct
 
 @dataclass(frozen=True, slots=True)
 class Assign:
+    pos: Pos
+    target: Ref
+    value: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Refer:
+    """``target REF= value``: from now on the reference `target` refers to the variable `value`."""
+
+    pos: Pos
+    target: Ref
+    value: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """``target ?= value``: an assignment of a reference that gives NULL if the types do not match."""
+
     pos: Pos
     target: Ref
     value: Expr
@@ -481,4 +515,6 @@ class Probe:
     value: Expr | None = None
 
 
-Statement = Assertion | Advance | Probe | Hold | Assign | CallStatement | If | Case | For | While | Repeat | Jump
+Statement = (
+    Assertion | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement | If | Case | For | While | Repeat | Jump
+)  # fmt: skip

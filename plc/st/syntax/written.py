@@ -53,7 +53,9 @@ def case_label(label: t.CaseLabel) -> str:
     return text_of(label.low) if label.high is None else f"{text_of(label.low)}..{text_of(label.high)}"
 
 
-def _selector(selector: t.Member | t.Bit | t.Index) -> str:
+def _selector(selector: t.Selector) -> str:
+    if isinstance(selector, t.Deref):
+        return "^"
     if isinstance(selector, t.Member):
         return f".{selector.name}"
     if isinstance(selector, t.Bit):

@@ -162,12 +162,11 @@ def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, mo
     ("text", "construct"),
     [
         ("CLASS a METHOD b VAR_INST c : INT; END_VAR END_METHOD END_CLASS", "variables of an instance in a method"),
-        ("TYPE p : POINTER TO INT; END_TYPE", "pointers and references"),
-        ("TYPE p : REF_TO INT; END_TYPE", "pointers and references"),
-        ("PROGRAM p VAR a : INT; END_VAR a^ := 1; END_PROGRAM", "pointers and references"),
         ("NAMESPACE n END_NAMESPACE", "namespaces"),
-        ("PROGRAM p VAR a : DINT; END_VAR a := ADR(a); END_PROGRAM", "addresses and sizes of variables"),
-        ("PROGRAM p VAR a : DINT; END_VAR a := SizeOf(a); END_PROGRAM", "addresses and sizes of variables"),
+        (
+            "PROGRAM p VAR a : DINT; END_VAR a := BITADR(a); END_PROGRAM",
+            "addresses as numbers and memory of a controller",
+        ),
     ],
 )
 def test_an_error_names_a_construct_that_is_not_supported(text: str, construct: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fieldtwin.plc.st.compiler.functions.conversions import conversion
 from fieldtwin.plc.st.compiler.functions.library import ONE, Library, Standard
 from fieldtwin.plc.st.compiler.functions.numbers import NUMBERS
+from fieldtwin.plc.st.compiler.functions.references import REFERENCES
 from fieldtwin.plc.st.compiler.functions.scan import SCAN
 from fieldtwin.plc.st.compiler.functions.strings import STRINGS
 from fieldtwin.plc.st.compiler.functions.times import TIMES
@@ -19,4 +20,4 @@ class _Functions(Library):
         return found
 
 
-FUNCTIONS = _Functions(NUMBERS, TIMES, STRINGS, SCAN)
+FUNCTIONS = _Functions(NUMBERS, TIMES, STRINGS, SCAN, REFERENCES)

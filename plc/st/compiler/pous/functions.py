@@ -57,12 +57,15 @@ class Functions:
         if pou.returns is not None:
             symbols[key] = Symbol(pou.name, signature.returns, result)
         arguments = [f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs]
-        results = [result, *(f"v_{p.name.lower()}" for p in signature.outputs)]
+        results = [result, *(symbols[p.name.lower()].code for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
         with self.out.block(f"def {name}({', '.join([instance] * bool(instance) + arguments)}):", pou.pos):
             self.out.step(pou.pos)
             if pou.returns is not None:
                 self.out.line(f"{result} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
+            for p in signature.inputs:
+                if reference := symbols[p.name.lower()].reference:
+                    self.out.line(f"{reference} = _v.Cell({reference})", pou.pos)
             self.variables.initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
             body.body(pou.body)
             self.out.line(body.leave, pou.pos)

@@ -84,6 +84,10 @@ class Programs(Bodies):
                         self.env.fail(v.pos, f"{v.name} is RETAIN and refers to an instance", hint=hint)
                     if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
                         self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
+                    if retain and isinstance(kind, ty.Pointer):
+                        self.env.fail(
+                            v.pos, f"{v.name}, a {kind}, cannot be RETAIN", hint="assign it in the first scan"
+                        )
                     attribute = f"v_{v.name.lower()}"
                     address, located = address_of(v.location), bool(v.location)
                     variables.append(
@@ -95,7 +99,7 @@ class Programs(Bodies):
         self.outputs[f"P_{pou.name.lower()}"] = assigned
         with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
             with self.out.block("def __init__(self):"):
-                self._initialise_program(pou, symbols)
+                self.variables.initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
             with self.out.block("def execute(self):"):
                 self.variables.initialise(pou, symbols, ("VAR_TEMP",))
                 inputs = frozenset(v.name for v in variables if v.role == "input")
@@ -157,20 +161,10 @@ class Programs(Bodies):
             attribute = symbol.code.rpartition(".")[2]
             yield ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
 
-    def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
-        """Initialise all variables with their initial values; messages are passed in from outside."""
-        for block in pou.blocks:
-            for v in block.variables if block.kind in ("VAR", "VAR_INPUT", "VAR_OUTPUT") else ():
-                symbol = symbols.get(v.name.lower())
-                if symbol is None:
-                    continue
-                if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
-                    self.out.line(f"{symbol.code} = ()", v.pos)
-                else:
-                    self.variables.write_initial(v, symbol)
-
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
-        if role != "local" and isinstance(kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Interface):
+        if role != "local" and isinstance(
+            kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface
+        ):
             self.env.fail(
                 v.pos,
                 f"{v.name} cannot be bound to a tag",

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.classes.inheritance import INHERITED
+from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.configurations.located import Offered
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
+from fieldtwin.plc.st.syntax.walk import nodes
 
 
 class Variables:
@@ -101,11 +104,12 @@ class Variables:
         """Write the code of the global variables, after all code that they may need and before any program is created."""
         self.out.line("class _Globals: pass")
         self.out.line("_G = _Globals()")
-        for block in self.unit.globals:
-            for v in block.variables:
-                symbol = self._globals.get((block.list.lower(), v.name.lower()))
-                if symbol is not None:
-                    self.write_initial(v, symbol)
+        found = [
+            (v, self._globals.get((block.list.lower(), v.name.lower())))
+            for block in self.unit.globals
+            for v in block.variables
+        ]
+        self.write_initials([(v, symbol) for v, symbol in found if symbol is not None], {})
 
     # -- variables of POUs ------------------------------------------------------------------------------------------------
 
@@ -114,6 +118,7 @@ class Variables:
         because it is local to a call, unless the POU has actions, which use it too.
         """
         symbols: dict[str, Symbol] = {}
+        addressed = _addressed(pou)
         for block in pou.blocks:
             if pou.kind != "PROGRAM":
                 self._no_retain(block, f"a variable of a {pou.kind}")
@@ -122,7 +127,10 @@ class Variables:
                     if v.name.lower() in symbols:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
-                    symbol = symbols[v.name.lower()] = self._variable(v, block, before)
+                    symbol = self._variable(v, block, before)
+                    if "." not in symbol.code and v.name.lower() in addressed and not by_reference(symbol.type):
+                        symbol = replace(symbol, code=f"{symbol.code}.v", reference=symbol.code)
+                    symbols[v.name.lower()] = symbol
                     if v.location:
                         symbols.setdefault(address_of(v.location).lower(), symbol)
         own = (
@@ -163,20 +171,45 @@ class Variables:
 
     def initialise(self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...]) -> None:
         """Write the initial values of the variables in the blocks of these kinds, such as VAR and VAR_OUTPUT."""
-        for block in pou.blocks:
-            for v in block.variables if block.kind in kinds else ():
-                symbol = symbols.get(v.name.lower())
-                if symbol is not None:
-                    self.write_initial(v, symbol)
+        variables = [v for block in pou.blocks if block.kind in kinds for v in block.variables]
+        self.write_initials([(v, symbols[v.name.lower()]) for v in variables if v.name.lower() in symbols], symbols)
 
-    def write_initial(self, v: t.VarDecl, symbol: Symbol) -> None:
-        """Write the assignment of a variable's initial value. A constant needs none, because its value is written at each use."""
-        if symbol.constant is None:
+    def write_initials(self, variables: Sequence[tuple[t.VarDecl, Symbol]], symbols: dict[str, Symbol]) -> None:
+        """Write the initial values of variables: those of references last, because they may refer to the others."""
+        for v, symbol in sorted(variables, key=lambda each: isinstance(each[1].type, ty.Pointer)):
             with self.env.errors.collect():
-                value = self.declarations.initial(symbol.type, v.initial, v.type)
-                self.out.line(f"{symbol.code} = {value}", v.pos)
+                self._write_initial(v, symbol, symbols)
+
+    def _write_initial(self, v: t.VarDecl, symbol: Symbol, symbols: dict[str, Symbol]) -> None:
+        """Write the assignment of a variable's initial value. A constant needs none, because its value is written at each use."""
+        if symbol.constant is not None:
+            return
+        if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
+            value = "()"  # messages are passed in from outside
+        elif isinstance(symbol.type, ty.Pointer) and isinstance(v.initial, t.Call | t.Ref):
+            compiler = Calls(self.env, symbols, CodeWriter())
+            value = compiler.given(v.initial, symbol.type, v.initial.pos, "an initial value")
+        else:
+            value = self.declarations.initial(symbol.type, v.initial, v.type)
+        if symbol.reference:
+            self.out.line(f"{symbol.reference} = _v.Cell({value})", v.pos)
+        else:
+            self.out.line(f"{symbol.code} = {value}", v.pos)
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
             hint = "a PROGRAM's VAR RETAIN can, also a block in it, and global variables with addresses"
             self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
+
+
+def _addressed(pou: t.Pou) -> set[str]:
+    """Return the names, in lower case, of the variables to which ADR or REF= makes a reference."""
+
+    def found() -> Iterator[t.Expr | None]:
+        for node in nodes((pou.body, pou.actions)):
+            if isinstance(node, t.Refer):
+                yield node.value
+            elif isinstance(node, t.Call) and node.ref.name.upper() == "ADR":
+                yield from (argument.value for argument in node.arguments)
+
+    return {expr.name.lower() for expr in found() if isinstance(expr, t.Ref)}

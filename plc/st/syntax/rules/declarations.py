@@ -87,6 +87,9 @@ class DeclarationRules(Rules):
     def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
         return t.ArrayType(self._pos(meta), tuple(items[:-1]), items[-1])
 
+    def pointer_type(self, meta: Meta, items: list[Any]) -> t.PointerType:
+        return t.PointerType(self._pos(meta), items[0].upper(), items[1])
+
     def range(self, meta: Meta, items: list[Any]) -> tuple[t.Expr, t.Expr]:
         return items[0], items[1]
 

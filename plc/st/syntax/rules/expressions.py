@@ -55,5 +55,8 @@ class ExpressionRules(Rules):
     def index(self, meta: Meta, items: list[Any]) -> t.Index:
         return t.Index(self._pos(meta), tuple(items))
 
+    def deref(self, meta: Meta, items: list[Any]) -> t.Deref:
+        return t.Deref(self._pos(meta))
+
     def literal(self, meta: Meta, items: list[Any]) -> t.Literal:
         return t.Literal(self._pos(meta), items[0].type, str(items[0]))

@@ -30,6 +30,12 @@ class StatementRules(Rules):
     def assign(self, meta: Meta, items: list[Any]) -> t.Assign:
         return t.Assign(self._pos(meta), items[0], items[1])
 
+    def refer(self, meta: Meta, items: list[Any]) -> t.Refer:
+        return t.Refer(self._pos(meta), items[0], items[1])
+
+    def attempt(self, meta: Meta, items: list[Any]) -> t.Attempt:
+        return t.Attempt(self._pos(meta), items[0], items[1])
+
     def call_statement(self, meta: Meta, items: list[Any]) -> t.CallStatement:
         return t.CallStatement(self._pos(meta), items[0])
 

@@ -1,0 +1,1 @@
+"""References to variables, the arithmetic of pointers, and the sizes of variables."""

@@ -1,0 +1,45 @@
+"""The sizes of variables in bytes, as SIZEOF and the arithmetic of pointers count them in the dialects of CODESYS.
+
+A member of a structure begins at a multiple of the size of its type, and a structure ends at a multiple of its largest member, as
+in CODESYS 3 and TwinCAT 3. TIME and the dates have 4 bytes there, although they have 8 in this PLC.
+"""
+
+from __future__ import annotations
+
+from math import prod
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.scope import Environment
+from fieldtwin.plc.st.syntax.tree import Pos
+
+_SHORT = ("TIME", "DATE", "TIME_OF_DAY", "DATE_AND_TIME")
+_BYTES_SHORT = 4
+
+
+def size_of(env: Environment, kind: ty.Type, pos: Pos) -> int:
+    """Return the size of a variable of a type in bytes. Raises `FileInvalid` for a type whose size depends on the controller."""
+    return _layout(env, kind, pos)[0]
+
+
+def _layout(env: Environment, kind: ty.Type, pos: Pos) -> tuple[int, int]:
+    """Return the size of a type and the multiple of bytes at which its variables begin."""
+    kind = ty.plain(kind)
+    if isinstance(kind, ty.Elementary):
+        size = _BYTES_SHORT if kind.name in _SHORT else max(1, kind.bits // 8)
+        return size, size
+    if isinstance(kind, ty.Enum):
+        return kind.bits // 8, kind.bits // 8
+    if isinstance(kind, ty.String):
+        width = 2 if kind.wide else 1
+        return (kind.length + 1) * width, width
+    if isinstance(kind, ty.Array):
+        size, step = _layout(env, kind.of, pos)
+        return size * prod(high - low + 1 for low, high in kind.ranges), step
+    if isinstance(kind, ty.Struct):
+        end, widest = 0, 1
+        for _, of in kind.fields.values():
+            size, step = _layout(env, of, pos)
+            end = -(-end // step) * step + size
+            widest = max(widest, step)
+        return -(-end // widest) * widest, widest
+    raise env.error(pos, f"the size of a {kind} depends on the controller and is not supported")

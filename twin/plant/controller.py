@@ -55,6 +55,8 @@ MOST_COMMAND_BYTES = 64
 WRITE_WITHIN_S = 5.0
 MOST_NAME = 128
 """The largest number of characters of the name of a client in the audit log."""
+MOST_COMMENT = 200
+"""The largest number of characters of a user's comment in the audit log."""
 MOST_REPORTED_CHANGES = 20
 PUBLISHED_AT_ONCE = 20_000
 """The largest number of journal entries (published values) that fits into one line of the control channel."""
@@ -283,12 +285,12 @@ class GatewayProcess:
         return self._gateway.client_tags()
 
     async def _acknowledge(self, args: dict[str, Any]) -> AlarmStatus:
-        """Acknowledge the `alarm` for a user (``by``), and return its new status.
+        """Acknowledge the `alarm` for a user (``by``, ``comment``), and return its new status.
 
         Raises `UsageError` if there is nothing to acknowledge, as the next two commands do if they cannot be carried out.
         """
         alarm, by, now_ns = self._alarm_request(args)
-        self._gateway.alarms.acknowledge(alarm, by, now_ns)
+        self._gateway.alarms.acknowledge(alarm, by, now_ns, str(args.get("comment", ""))[:MOST_COMMENT])
         return self._gateway.alarms.statuses(now_ns)[alarm]
 
     async def _shelve(self, args: dict[str, Any]) -> AlarmStatus:

@@ -10,12 +10,13 @@ import asyncio
 import sys
 from pathlib import Path
 
-from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable
 from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.alarm_changes import follow_alarms
 from fieldtwin.northbound.following import Changes, ImageFollower, follow_texts
 from fieldtwin.northbound.opcua.server import OpcuaServer
 from fieldtwin.northbound.opcua.write_channels import WriteChannels
@@ -53,6 +54,7 @@ class OpcuaProcess:
         self._server = OpcuaServer(self._config, system, self._clock, self._writes.call, rejected)
         self._gateway = Channel(run_dir / "gateway.sock", "gateway")
         self._permissions = Channel(run_dir / "gateway.sock", "gateway")
+        self._alarms = Channel(run_dir / "gateway.sock", "gateway")
 
     async def run(self) -> int:
         stop = stop_signal()
@@ -74,6 +76,7 @@ class OpcuaProcess:
                 pass  # a client that does not read must not delay the end of the run
         await self._gateway.aclose()
         await self._permissions.aclose()
+        await self._alarms.aclose()
         await self._writes.aclose()
         return 0
 
@@ -84,6 +87,7 @@ class OpcuaProcess:
         async with Nursery() as nursery:
             nursery.start(follower.run(image, self._clock, self._publish), "process image")
             nursery.start(self._follow_texts(), "texts")
+            nursery.start(self._follow_alarms(), "alarms")
             if self._config.security is not None:
                 nursery.start(self._follow_permissions(), "tags that clients may write")
             nursery.start(self._listen(), "listener")
@@ -106,6 +110,10 @@ class OpcuaProcess:
         binary = [name for name in names if server.variables.data_types[name] == "ByteString"]
         texts = TextSamples(names, binary)
         await follow_texts(self._gateway, texts, self._clock, lambda changes, now_ns: server.publish(names, changes))
+
+    async def _follow_alarms(self) -> None:
+        every_ns = self._config.every_ms * NS_PER_MS
+        await follow_alarms(self._alarms, self._system.alarms, self._clock, every_ns, self._server.publish_alarms)
 
     async def _follow_permissions(self) -> None:
         """Ask the gateway once a second which tags clients may write, because a reload may change that."""

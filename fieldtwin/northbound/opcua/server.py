@@ -21,12 +21,13 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, os_reason
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.gateway.runtime.gateway_status import AlarmEvent, ServerStatus
 from fieldtwin.northbound.data_types import fitted
 from fieldtwin.northbound.opcua.access.channels import checked_server
 from fieldtwin.northbound.opcua.access.trust import load_identity
 from fieldtwin.northbound.opcua.access.users import Account
 from fieldtwin.northbound.opcua.address_space import Variables, build
+from fieldtwin.northbound.opcua.alarms.conditions import Conditions
 from fieldtwin.northbound.opcua.node_writer import NodeWriter
 from fieldtwin.northbound.opcua.status_codes import BAD_CODES, StatusCode, status_code
 from fieldtwin.northbound.opcua.tag_nodes import VALUE_AS_TEXT
@@ -65,6 +66,7 @@ class OpcuaServer:
         self._clock = clock
         self._server = checked_server(config.security, clock, rejected)
         self._nodes: NodeWriter | None = None
+        self._conditions: Conditions | None = None
         self._call = call
         self._writable: set[str] = set()
         self.writes = TagWrites(config.name, call, {}, ())
@@ -81,6 +83,7 @@ class OpcuaServer:
     async def build(self) -> None:
         """Create the address space. Until its first sample, each variable waits for initial data."""
         server = self._server
+        server.iserver.bind_condition_methods = bool(self._system.alarms)
         await server.init()
         uri = application_uri(self._system.name, self._config.name)
         await server.set_application_uri(uri)
@@ -103,6 +106,10 @@ class OpcuaServer:
         self._nodes, self.variables = await build(server, self._system)
         self.writes = TagWrites(self._config.name, self._call, self.variables.data_types, self.variables.inputs)
         server.iserver.write_value = self._write_for_client
+        if self._system.alarms:
+            self._conditions = Conditions(self._nodes, server, self._config.name, self._system.alarms, self._call)
+            await self._conditions.add_nodes()
+            server.iserver.call_method = self._call_method
         waiting = Sample(None, Quality.BAD, Reason.NEVER_READ, 0)
         for name in self.variables.data_types:
             await self._write(name, waiting, None)
@@ -163,6 +170,18 @@ class OpcuaServer:
             else:
                 await self._write(name, sample, source_time)
             self.updates += 1
+
+    async def publish_alarms(self, changes: list[AlarmEvent]) -> None:
+        """Publish changes of alarms as events and as values of the conditions' variables."""
+        assert self._conditions is not None
+        self._times.follow()
+        await self._conditions.publish(changes, self._utc, self._clock.monotonic_ns())
+
+    async def _call_method(self, request: Any, account: Account | None, address: str) -> str:
+        assert self._conditions is not None
+        now = self._utc(self._clock.monotonic_ns())
+        assert now is not None
+        return await self._conditions.call(request, account, address, now)
 
     async def permit_writes(self, tags: Iterable[str]) -> None:
         """Give exactly these tags the access level for writes, and no tag if the server has no users."""

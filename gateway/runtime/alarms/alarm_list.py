@@ -117,8 +117,9 @@ class AlarmList:
 
     # -- actions of operators ------------------------------------------------------------------------------------------
 
-    def acknowledge(self, name: str, by: str, now_ns: int) -> None:
-        """Acknowledge an alarm for the user `by`. Raises `UsageError` if there is nothing to acknowledge.
+    def acknowledge(self, name: str, by: str, now_ns: int, comment: str = "") -> None:
+        """Acknowledge an alarm for the user `by`, whose `comment` goes to the audit log. Raises `UsageError` if there is nothing
+        to acknowledge.
 
         This and the next two actions are recorded in the audit log first. They raise `Unreachable` if that fails.
         """
@@ -129,7 +130,8 @@ class AlarmList:
                 expected=" or ".join(state.value for state in ACKNOWLEDGEABLE),
                 got=alarm.machine.state.value,
             )
-        self._audit.note("acknowledge", f"{ALARM}.{name}", by=by, result="done")
+        details = {"comment": comment} if comment else {}
+        self._audit.note("acknowledge", f"{ALARM}.{name}", by=by, result="done", **details)
         alarm.machine.acknowledge()
         self._note(alarm, now_ns, by)
 

@@ -89,13 +89,18 @@ START_WITHIN_S = 60.0
 SECURITY = "security: {certificate: pki/own.der, key: pki/own.key, trusted: pki/trusted, users: pki/users.yaml}"
 
 
-def write_site(folder: Path, *, secured: bool = False) -> Path:
-    """Write the files, and return the system file. With `secured` its OPC UA server has certificates and users."""
+def write_site(folder: Path, *, secured: bool = False, more: str = "") -> Path:
+    """Write the files, and return the system file. With `secured` its OPC UA server has certificates and users.
+
+    `more` are further sections of the system file.
+    """
     for name, text in FILES.items():
         (folder / name).write_text(text, encoding="utf-8")
     path = folder / "hall.yaml"
+    path.write_text(FILES["hall.yaml"] + more, encoding="utf-8")
     if secured:
-        path.write_text(FILES["hall.yaml"].replace("every_ms: 50}", f"every_ms: 50, {SECURITY}}}"), encoding="utf-8")
+        text = path.read_text(encoding="utf-8").replace("every_ms: 50}", f"every_ms: 50, {SECURITY}}}")
+        path.write_text(text, encoding="utf-8")
         make_pki(path)
     return path
 
@@ -112,9 +117,9 @@ def make_pki(system_file: Path) -> None:
 
 
 @contextmanager
-def running(folder: Path, *options: str, secured: bool = False) -> Iterator[tuple[Fieldtwin, str]]:
+def running(folder: Path, *options: str, secured: bool = False, more: str = "") -> Iterator[tuple[Fieldtwin, str]]:
     """A run of the site's prototype, with the URL of its OPC UA server."""
-    with fieldtwin(folder, "run", str(write_site(folder, secured=secured)), "--prototype", *options) as run:
+    with fieldtwin(folder, "run", str(write_site(folder, secured=secured, more=more)), "--prototype", *options) as run:
         wait_for((folder / "hall" / "gateway.sock").is_socket, START_WITHIN_S, "the gateway")
         gateway = run.control("hall", "gateway")
         url = wait_for(lambda: gateway("get", brief=True)["serve"]["scada"]["listening"], START_WITHIN_S, "the server")

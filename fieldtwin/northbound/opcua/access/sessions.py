@@ -34,6 +34,20 @@ WriteValue = Callable[[Any, Account | None, str], Awaitable[str]]
 """Writes a `ua.WriteValue` for a user at an address. Returns the name of the status code."""
 
 
+CallMethod = Callable[[Any, Account | None, str], Awaitable[str]]
+"""Carries out a `ua.CallMethodRequest` for a user at an address. Returns the name of the status code."""
+MOST_CALLS = 100
+"""The largest number of method calls in one request."""
+_REFRESH = (
+    ua.NodeId(ua.ObjectIds.ConditionType_ConditionRefresh),
+    ua.NodeId(ua.ObjectIds.ConditionType_ConditionRefresh2),
+)
+
+
+async def _refuse_call(request: Any, account: Account | None, address: str) -> str:
+    return "BadMethodInvalid"
+
+
 async def _refuse_write(item: Any, account: Account | None, address: str) -> str:
     return "BadNotWritable"
 
@@ -62,6 +76,24 @@ class Session(InternalSession):  # type: ignore[misc]
         write, address = self.iserver.write_value, str(self.name[0])
         codes = [await write(item, self.account, address) for item in params.NodesToWrite]
         return [ua.StatusCode(getattr(ua.StatusCodes, code)) for code in codes]
+
+    async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
+        """Carry out methods: the refresh of conditions for this session's subscriptions, and those of alarms. No other method can
+        be called.
+        """
+        if len(params) > MOST_CALLS:
+            raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+        return [await self._call_one(each) for each in params]
+
+    async def _call_one(self, request: ua.CallMethodRequest) -> ua.CallMethodResult:
+        if request.MethodId in _REFRESH and self.iserver.bind_condition_methods:
+            arguments = request.InputArguments or []
+            if not arguments or not self._owns(arguments[0].Value):
+                return ua.CallMethodResult(StatusCode=ua.StatusCode(ua.StatusCodes.BadSubscriptionIdInvalid))
+            [found] = await super().call([request])
+            return found
+        code = await self.iserver.call_method(request, self.account, str(self.name[0]))
+        return ua.CallMethodResult(StatusCode=ua.StatusCode(getattr(ua.StatusCodes, code)))
 
     def _owns(self, subscription: int) -> bool:
         """Return whether a subscription exists and is that of this session (OPC 10000-4, 5.14.1)."""
@@ -143,6 +175,8 @@ class SessionServer(InternalServer):  # type: ignore[misc]
         super().__init__(user_manager=_Accounts(load_users))
         self.write_value: WriteValue = _refuse_write
         """Writes one value of a client."""
+        self.call_method: CallMethod = _refuse_call
+        """Carries out a method for a client."""
         tokens = [ua.UserNameIdentityToken, ua.X509IdentityToken]
         self.supported_tokens = tuple(tokens) if load_users is not None else (ua.AnonymousIdentityToken,)
 

@@ -1,0 +1,1 @@
+"""Alarms & Conditions of an OPC UA server (OPC 10000-9)."""

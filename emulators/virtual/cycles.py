@@ -51,40 +51,53 @@ class CycleCall:
 
     def run(self) -> None:
         """Run the cycle now, and set the timer of the next run. An error ends the cycle."""
-        cycle, loop = self.cycle, self.loop
-        now_ns = loop.now_ns
+        cycle, now_ns = self.cycle, self.loop.now_ns
         try:
-            while cycle.running:
-                if cycle.deadline_ns == now_ns and cycle.repeats_until(now_ns + 1):
-                    cycle.skip(1, now_ns)
-                else:
+            if cycle.repeats_until(now_ns + 1):
+                cycle.skip(1, now_ns)
+            else:
+                while cycle.running:
                     cycle.run_once()
-                if cycle.running and cycle.deadline_ns > now_ns:
-                    loop.set_timer(cycle.deadline_ns, self)
-                    return
+                    if cycle.deadline_ns > now_ns:
+                        break
+            if cycle.running:
+                self.loop.set_timer(cycle.deadline_ns, self)
+            else:
+                self.ended.set_result(None)
         except BaseException as e:
             self.ended.set_exception(e)
             if isinstance(e, KeyboardInterrupt | SystemExit):
                 raise
-        else:
-            self.ended.set_result(None)
 
 
 def skip_runs(timers: Timers, sequence: int) -> int:
-    """Skip the runs of the cycles whose timers come first in `timers`, until the next timer of anything else, if all of them
-    would change nothing.
+    """Skip the runs of the cycles whose timers come first in `timers`, as far as they would change nothing.
 
-    The timers of the next runs get the sequence numbers after `sequence`, in the order in which the runs would have set them.
-    Return the last number.
+    If all of them only repeat their last run, their runs until the next timer of anything else are skipped, otherwise the runs
+    before the first one that has to take place. The timers of the next runs get the sequence numbers after `sequence`, in the
+    order in which the runs would have set them. Return the last number.
     """
-    first: Timers = []
-    while timers and type(timers[0][2]) is CycleCall and (not first or _run_in_turn(first[0], timers[0])):
+    left: Timers = []
+    while timers and type(timers[0][2]) is CycleCall and (not left or _run_in_turn(left[0], timers[0])):
         timer = heappop(timers)
-        if not timer[2].is_cancelled:
-            first.append(timer)
-    if first and timers and first[0][0] < timers[0][0] and _are_repeated(first, timers[0][0]):
-        sequence = _skip(first, timers[0][0], sequence)
-    for timer in first:
+        if not timer[2].ended.done():
+            left.append(timer)
+    if left and timers and left[0][0] < timers[0][0]:
+        until_ns = timers[0][0]
+        repeated: Timers = []
+        for timer in left:
+            if not timer[2].cycle.repeats_until(until_ns):
+                break
+            repeated.append(timer)
+        counts = _skip_to_last(repeated, until_ns) if len(repeated) == len(left) else [1] * len(repeated)
+        left = left[len(repeated) :]
+        for (when_ns, order, call), count in zip(repeated, counts, strict=True):
+            if when_ns < until_ns:
+                call.cycle.skip(count, when_ns)
+                sequence += 1
+                when_ns, order = call.cycle.deadline_ns, sequence
+            heappush(timers, (when_ns, order, call))
+    for timer in left:
         heappush(timers, timer)
     return sequence
 
@@ -98,29 +111,17 @@ def _run_in_turn(one: tuple[int, int, CycleCall], other: tuple[int, int, CycleCa
     return period_ns == other[2].cycle.period_ns and other[0] - one[0] < period_ns
 
 
-def _are_repeated(calls: Timers, until_ns: int) -> bool:
-    """Return whether all runs before `until_ns` only repeat the last ones."""
-    return all(call.cycle.repeats_until(until_ns) for _, _, call in calls)
+def _skip_to_last(timers: Timers, until_ns: int) -> list[int]:
+    """Skip the runs of cycles before their last ones before `until_ns`, and replace `timers` by those of the last ones, in order.
+    Return how many runs of each are still to be skipped.
 
-
-def _skip(calls: Timers, until_ns: int, sequence: int) -> int:
-    """Skip all runs before `until_ns`, and replace `calls` by the timers of the next runs. Return the last sequence number.
-
-    The last run of each cycle is skipped after the earlier ones of all cycles, because it reads what they published.
+    The last run of a cycle is skipped after the earlier ones of the others, because it reads what they published. Nothing reads
+    what the earlier runs of the first cycle publish, so they are skipped together with its last run.
     """
-    last: Timers = []
-    for when_ns, order, call in calls:
-        period_ns = call.cycle.period_ns
-        earlier = (until_ns - when_ns - 1) // period_ns  # -1 if there is no run before `until_ns`
-        if earlier > 0:
-            call.cycle.skip(earlier, when_ns + (earlier - 1) * period_ns)
-        last.append((when_ns + earlier * period_ns if earlier >= 0 else when_ns, order, call))
-    calls.clear()
-    for when_ns, order, call in sorted(last):
-        if when_ns < until_ns:
-            call.cycle.skip(1, when_ns)
-            sequence += 1
-            calls.append((call.cycle.deadline_ns, sequence, call))
-        else:
-            calls.append((when_ns, order, call))
-    return sequence
+    period_ns = timers[0][2].cycle.period_ns
+    earlier = {order: max(0, (until_ns - when_ns - 1) // period_ns) for when_ns, order, _ in timers}
+    timers[:] = sorted((when_ns + earlier[order] * period_ns, order, call) for when_ns, order, call in timers)
+    for when_ns, order, call in timers[1:]:
+        if earlier[order]:
+            call.cycle.skip(earlier[order], when_ns - period_ns)
+    return [earlier[timers[0][1]] + 1, *[1] * (len(timers) - 1)]

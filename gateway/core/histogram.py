@@ -42,20 +42,27 @@ class Histogram:
         self.count = self.min_ns = self.max_ns = self.total_ns = 0
         self._recent: deque[int] = deque(maxlen=recent)
 
-    def record(self, duration_ns: int, times: int = 1) -> None:
-        """Count one duration, or the same duration several `times`."""
-        ns = duration_ns if duration_ns > 0 else 0
-        if not self.count or ns < self.min_ns:
-            self.min_ns = ns
-        if ns > self.max_ns:
-            self.max_ns = ns
+    def record(self, duration_ns: int) -> None:
+        """Count one duration."""
+        if duration_ns <= 0:
+            self.record_zeros(1)  # in virtual time every scan takes 0 ns
+            return
+        if not self.count or duration_ns < self.min_ns:
+            self.min_ns = duration_ns
+        if duration_ns > self.max_ns:
+            self.max_ns = duration_ns
+        self.count += 1
+        self.total_ns += duration_ns
+        self.counts[bisect_left(self.limits_ns, duration_ns)] += 1
+        self._recent.append(duration_ns)
+
+    def record_zeros(self, times: int) -> None:
+        """Count a duration of 0 several `times`."""
+        self.min_ns = 0
         self.count += times
-        self.total_ns += ns * times
-        self.counts[bisect_left(self.limits_ns, ns) if ns else 0] += times  # in virtual time every scan takes 0 ns
-        if times == 1:  # the usual case, once for each scan and each request
-            self._recent.append(ns)
-        elif self._recent.maxlen:
-            self._recent.extend([ns] * min(times, self._recent.maxlen))
+        self.counts[0] += times
+        if self._recent.maxlen:
+            self._recent.extend([0] * min(times, self._recent.maxlen))
 
     @property
     def recent_longest_ns(self) -> int:

@@ -275,15 +275,22 @@ class Gateway:
         """Return whether every `tick` before `until_ns` would only repeat the last one, see `Cycle`."""
         lost_ns = self.config.plc_lost_ms * NS_PER_MS
         return (
-            self.plc_alive
+            self.exchange.repeats_until(until_ns)
+            and self.plc_alive
             and not self._stopping
-            and self.exchange.repeats_until(until_ns)
             and self.alarms.repeats_until(until_ns)
             and until_ns - self.exchange.plc_heard_ns <= lost_ns
             and self.outputs.is_idle
-            and all(pump.is_idle for pump in self.pumps)
-            and self._undelivered() == self.exchange.undelivered
+            and self._is_idle()
         )
+
+    def _is_idle(self) -> bool:
+        """Return whether no message is passed on, and none was delivered since the last `tick`."""
+        before = self.exchange.undelivered
+        for pump in self.pumps:
+            if not pump.is_idle or pump.undelivered != before.get(pump.driver.outbox_tag):
+                return False
+        return all(self.log.pending(tag) == before.get(tag) for tag in self.config.log_tags)
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count ticks that do not take place, see `Cycle`."""

@@ -39,6 +39,7 @@ class ImageExchange:
         self._reader = image.reader(OUTPUTS)
         self._tags = tags
         self._sources = dict(sources)
+        self._queues = [source.queue for source in sources.values()]
         inputs = {region.name: region for region in image.layout.regions}[INPUTS]
         self._inputs = inputs.tags
         self._depth = {t.name: t.depth for t in self._inputs if t.kind is TagKind.MESSAGE}
@@ -96,12 +97,12 @@ class ImageExchange:
         times. See `fieldtwin.gateway.core.concurrency.cycle.Cycle`.
         """
         return (
-            self._reader.repeats
+            self._columns.repeats_until(until_ns)
+            and self._reader.repeats
             and self._writer.repeats
             and not self.plc_stopped
             and not self.new_messages
-            and self._columns.repeats_until(until_ns)
-            and not any(source.queue for source in self._sources.values())
+            and not any(self._queues)
         )
 
     def skip(self, count: int, last_ns: int) -> None:
@@ -110,7 +111,7 @@ class ImageExchange:
         times_ns = self._columns.times_ns
         for at, _ in self._taken:
             times_ns[at] = last_ns
-        self._writer.skip(count, times_ns, last_ns)
+        self._writer.skip(count, last_ns, times_ns)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
         """Return whether values, qualities and reasons are the same as at the last call.
@@ -206,7 +207,7 @@ class _Columns:
 
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether `refresh` finds nothing new before `until_ns`."""
-        return until_ns <= self._earliest_ns and not self._tags.has_changes
+        return not self._tags.has_changes and until_ns <= self._earliest_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
         """Set the number at position `at`, which the exchange itself provides. Its quality is good."""

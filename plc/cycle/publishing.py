@@ -295,7 +295,7 @@ class OutputImage:
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count publications that would have repeated the last one, and publish the last of them, which was at `last_ns`."""
-        self.writer.skip(count, [last_ns] * len(self._values), last_ns)
+        self.writer.skip(count, last_ns)
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
         """Return (program, ``FILE:LINE``) that set `tag` to `value` (None: to NaN), from the recorded changes.

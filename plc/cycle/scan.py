@@ -221,12 +221,12 @@ class Scan:
         """
         latest = self._reader.latest
         return (
-            self._settling.settled
+            self._reader.repeats
+            and self._settling.settled
             and not self._not_run
             and self.gateway_alive
             and until_ns - latest.t_ns <= self._limit_ns
             and latest.values is self._columns
-            and self._reader.repeats
             and self.output_image.repeats
             and not self.output_image.forces.inputs
         )

@@ -191,7 +191,7 @@ class CyclicTask:
 
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether every scan before `until_ns` would only repeat the last one, see `Cycle`."""
-        return self.running and not self.paused and not self._scan.waiting and self._scan.repeats_until(until_ns)
+        return self.state is _RUNNING and not self.paused and self._scan.repeats_until(until_ns)
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count scans that do not take place, see `Cycle`. They would have been punctual, and would have taken no time."""
@@ -200,8 +200,8 @@ class CyclicTask:
         self.scans += count
         self.ended_ns = last_ns
         self.deadline_ns += count * self._cycle_ns
-        self.lateness.record(0, count)
-        self.duration.record(0, count)
+        self.lateness.record_zeros(count)
+        self.duration.record_zeros(count)
 
     def _guarded(self, guard: Guard, now_ns: int) -> None:
         try:

@@ -36,8 +36,8 @@ class Cycle(Protocol):
         ...
 
     def repeats_until(self, until_ns: int) -> bool:
-        """Return whether all runs before `until_ns` would only repeat the last one, if nothing but cycles that also repeat runs
-        until then. Counters and times are the only things that such runs change.
+        """Return whether the cycle runs, and all runs before `until_ns` would only repeat the last one, if until then only cycles
+        run that also repeat themselves. Counters and times are the only things that such runs change.
         """
         ...
 

@@ -185,9 +185,9 @@ class RegionWriter(_Region):
         `missing` holds for its index, else NEVER_READ. `same` says that `values`, `quality`, `reason` and `but` are unchanged
         since the last publication; they are then not examined.
         """
-        count = len(values)
         if same and not messages and self._packed:
-            return self._repeat(now_ns.to_bytes(8, "little", signed=True) * count, now_ns, flags)
+            return self._repeat(self._same_stamps(now_ns), now_ns, flags)
+        count = len(values)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
         if but:
             mixed = bytearray(marks)
@@ -202,8 +202,10 @@ class RegionWriter(_Region):
                 for index, other_reason in missing.items():
                     mixed[index] = other_reason if values[index] is None else mixed[index]
                 reasons = bytes(mixed)
-        stamps = now_ns.to_bytes(8, "little", signed=True) * count
-        return self._publish(values, marks, reasons, stamps, now_ns, messages, flags)
+        return self._publish(values, marks, reasons, self._same_stamps(now_ns), now_ns, messages, flags)
+
+    def _same_stamps(self, t_ns: int) -> bytes:
+        return t_ns.to_bytes(8, "little", signed=True) * self.shape.count
 
     def _stamps(self, times_ns: Sequence[int]) -> bytes:
         try:
@@ -260,12 +262,13 @@ class RegionWriter(_Region):
         """Return whether a publication of the same values stays outside of the memory, so that `skip` can count it."""
         return self._heartbeat is not None and self._packed and not self._flags
 
-    def skip(self, count: int, times_ns: Sequence[int], last_ns: int) -> None:
+    def skip(self, count: int, last_ns: int, times_ns: Sequence[int] | None = None) -> None:
         """Count `count` publications that repeat the values of the last one. The last of them was made at `last_ns`, with the
-        times `times_ns`. `repeats` must be true.
+        times `times_ns`; None: all of them are `last_ns`. `repeats` must be true.
         """
         self.counter += count - 1
-        self._repeat(self._stamps(times_ns), last_ns, _UNFLAGGED)
+        stamps = self._same_stamps(last_ns) if times_ns is None else self._stamps(times_ns)
+        self._repeat(stamps, last_ns, _UNFLAGGED)
 
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
         """Publish the columns packed in `_body`. `stamps` holds the packed time of each tag, `now_ns` is the heartbeat."""

@@ -15,6 +15,7 @@ from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.plc.check_command import check
+from fieldtwin.cli.plc.debug_command import debug
 from fieldtwin.cli.plc.diagram_command import diagram
 from fieldtwin.cli.plc.sources import agreed_system, source_file
 from fieldtwin.cli.template_question import TemplateSearchOptions
@@ -57,6 +58,7 @@ def command() -> None:
 
 
 command.add_command(check)
+command.add_command(debug)
 command.add_command(diagram)
 
 

@@ -27,7 +27,7 @@ from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, Programs
 from fieldtwin.plc.st.compiler.pous.recursion import refuse_recursion
 from fieldtwin.plc.st.compiler.pous.source_lines import SourceLines
 from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.edges import without_edges
 from fieldtwin.plc.st.syntax import tree as t
@@ -62,6 +62,11 @@ class CompiledUnit:
     """The declarations as they were parsed."""
     instances: tuple[CompiledInstance, ...] = ()
     """The programs that configurations run."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """The names of the POUs as declared, by their names in lower case."""
+    symbols: Mapping[str, tuple[Symbol, ...]] = field(default_factory=dict)
+    """By POU in lower case: its variables, with the Python expressions that read them inside of its code."""
+    global_symbols: tuple[Symbol, ...] = ()
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -147,6 +152,9 @@ class _Unit:
             probed,
             self.source,
             self.instances,
+            {pou.name.lower(): pou.name for pou in self.unit.pous},
+            {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
+            tuple(dict.fromkeys(self.env.globals.values())),
         )
 
     def _kinds(self) -> tuple[str, ...]:

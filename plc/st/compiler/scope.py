@@ -200,6 +200,8 @@ class Environment:
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
     missing: dict[str, Missing] = field(default_factory=dict)
     """The declarations that were not imported, because a part of them is not supported."""
+    symbols: dict[str, dict[str, Symbol]] = field(default_factory=dict)
+    """By POU: its variables."""
     recorded: dict[int, tuple[ty.Type, ...]] = field(default_factory=dict)
     """By number of an assertion: the types of the values that it shows."""
     probed: dict[int, ty.Type] = field(default_factory=dict)

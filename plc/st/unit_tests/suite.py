@@ -42,8 +42,12 @@ class Suite:
         }
 
 
-def load_suite(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> Suite:
+def load_suite(
+    path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = (), *, coverage: bool = True
+) -> Suite:
     """Read a file of tests. They may use the declarations of the other files in its folder, and of `libraries`.
+
+    Without `coverage` the code has no probes, as in a plant.
 
     Raises `FileInvalid` for the first error, with the others.
     """
@@ -56,7 +60,9 @@ def load_suite(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, .
     libraries_files = {str(file) for library in libraries for file in source_files(library)} - set(map(str, beside))
     for other in others:
         unused.insert(other, [*files, *libraries_files])
-    unit, tests = tests_as_programs(probes.insert(unit, [*files, *libraries_files]))
+    if coverage:
+        unit = probes.insert(unit, [*files, *libraries_files])
+    unit, tests = tests_as_programs(unit)
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     compiled = compile_unit(unit, str(path), tuple(dict.fromkeys((str(path), *sorted(used)))), dialect)
     return Suite(path, compiled, tests, probes, unused, Recorded())

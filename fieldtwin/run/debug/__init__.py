@@ -1,0 +1,1 @@
+"""A debugger for Structured Text over the Debug Adapter Protocol, which editors such as VS Code speak."""

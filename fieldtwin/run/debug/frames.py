@@ -1,0 +1,133 @@
+"""The POUs on the call stack of a stopped program, and their variables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice, product
+from types import FrameType
+from typing import Any
+
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.scope import Symbol
+from fieldtwin.plc.st.inspection import literal
+
+MAX_ELEMENTS = 1000
+"""How many elements of an array are listed."""
+_STEP = re.compile(r"\.(\w+)|\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\]")
+_POU = re.compile(r"(?:f|B|P)_(\w+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A variable, or a part of one, of a stopped program."""
+
+    name: str
+    type: ty.Type
+    value: Any
+
+    @property
+    def has_parts(self) -> bool:
+        return isinstance(self.type, ty.Struct | ty.Block | ty.Array)
+
+    @property
+    def text(self) -> str:
+        """Return the value as in the source; for a variable with parts its type."""
+        return (
+            str(self.type) if self.has_parts and not isinstance(self.type, ty.Array) else literal(self.type, self.value)
+        )
+
+
+class Units:
+    """The compiled units of a session, by the names of their files."""
+
+    def __init__(self, units: Sequence[CompiledUnit], names: Mapping[str, str]) -> None:
+        """`names` are the names to show of POUs that the source does not name, such as tests, in lower case."""
+        self._by_file = {file: unit for unit in units for file in unit.files}
+        self._names = names
+
+    def of(self, frame: FrameType) -> CompiledUnit | None:
+        return self._by_file.get(frame.f_code.co_filename)
+
+    def title(self, frame: FrameType) -> str:
+        """Return the name of the POU that a frame executes."""
+        key, _, inner = _key(frame).partition(".")
+        unit = self.of(frame)
+        name = self._names.get(key) or (unit.names.get(key, key) if unit is not None else key)
+        return f"{name}.{inner[2:]}" if inner and inner != "execute" else name
+
+    def variables(self, frame: FrameType) -> list[Variable]:
+        """Return the variables of the POU that a frame executes, without global ones."""
+        return [
+            found
+            for symbol in self._symbols(frame)
+            if not symbol.code.startswith("_G.")
+            for found in _read(symbol, frame)
+        ]
+
+    def global_variables(self, frame: FrameType) -> list[Variable]:
+        """Return the global variables of the unit of a frame."""
+        unit = self.of(frame)
+        return [found for symbol in unit.global_symbols for found in _read(symbol, frame)] if unit is not None else []
+
+    def parts(self, variable: Variable, frame: FrameType) -> list[Variable]:
+        """Return the members or elements of a variable; at most `MAX_ELEMENTS` of an array."""
+        unit = self.of(frame)
+        return list(_parts(variable, unit)) if unit is not None else []
+
+    def find(self, path: str, frame: FrameType) -> Variable | None:
+        """Return the variable with this path, such as ``levels[3]`` or ``timer.ET``, in any case of letters; None without one."""
+        end = next((at for at, letter in enumerate(path) if letter in ".["), len(path))
+        name, at = path[:end].strip().lower(), end
+        known = [*self.variables(frame), *self.global_variables(frame)]
+        found = next((one for one in known if one.name.lower() == name), None)
+        while found is not None and at < len(path):
+            step = _STEP.match(path, at)
+            if step is None:
+                return None
+            at = step.end()
+            wanted = step[1].lower() if step[1] else f"[{','.join(part.strip() for part in step[2].split(','))}]"
+            found = next((one for one in self.parts(found, frame) if one.name.lower() == wanted), None)
+        return found
+
+    def _symbols(self, frame: FrameType) -> Sequence[Symbol]:
+        unit = self.of(frame)
+        return unit.symbols.get(_key(frame).partition(".")[0], ()) if unit is not None else ()
+
+
+def _key(frame: FrameType) -> str:
+    """Return the name of the POU in lower case, with the name of the Python method after it."""
+    return _POU.sub(r"\1", frame.f_code.co_qualname, count=1)
+
+
+def _read(symbol: Symbol, frame: FrameType) -> Iterator[Variable]:
+    """Yield the variable of a symbol, if it has a value at this place. The compiler wrote the expression that is evaluated."""
+    if symbol.name[:1].isdigit():  # of the translation of charts and drawings
+        return
+    try:
+        value = eval(symbol.code, frame.f_globals, frame.f_locals)
+    except (NameError, AttributeError):
+        return
+    yield Variable(symbol.name, symbol.type, value)
+
+
+def _parts(variable: Variable, unit: CompiledUnit) -> Iterator[Variable]:
+    kind, value = variable.type, variable.value
+    if isinstance(kind, ty.Struct):
+        for field, (name, of) in kind.fields.items():
+            yield Variable(name, of, getattr(value, f"m_{field}"))
+    elif isinstance(kind, ty.Block) and kind.standard is not None:
+        for name, of in (*kind.inputs.values(), *kind.outputs.values()):
+            yield Variable(name, of, getattr(value, name))
+    elif isinstance(kind, ty.Block):
+        for name, of in unit.blocks.get(kind.name.lower(), ()):
+            if not name[:1].isdigit():
+                yield Variable(name, of, getattr(value, f"v_{name.lower()}"))
+    elif isinstance(kind, ty.Array):
+        for at in islice(product(*(range(low, high + 1) for low, high in kind.ranges)), MAX_ELEMENTS):
+            element = value
+            for i, (low, _) in zip(at, kind.ranges, strict=True):
+                element = element[i - low]
+            yield Variable(f"[{','.join(map(str, at))}]", kind.of, element)

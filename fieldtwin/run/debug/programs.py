@@ -1,0 +1,64 @@
+"""The programs that can be debugged: unit tests in Structured Text, and the programs of a system in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.dialects import Dialect
+from fieldtwin.plc.st.unit_tests.suite import load_suite
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
+
+Output = Callable[[str], None]
+
+
+@dataclass
+class Debuggee:
+    """A program that is ready to run: its compiled units, the names of POUs that the source does not name, and `run`.
+
+    `run` gets a function for lines of text, and returns whether all went well.
+    """
+
+    units: list[CompiledUnit]
+    run: Callable[[Output], bool]
+    names: Mapping[str, str] = field(default_factory=dict)
+
+
+def unit_tests(path: Path, dialect: Dialect, libraries: tuple[Path, ...]) -> Debuggee:
+    """Return the unit tests of a file. Raises `FileInvalid`."""
+    suite = load_suite(path, dialect, libraries, coverage=False)
+
+    def run(say: Output) -> bool:
+        well = True
+        for result in suite.run():
+            failed = result.failed
+            well = well and not failed and not result.error
+            verdict = "error" if result.error else "failed" if failed else "passed"
+            say(f"{verdict}  {result.test.name}  {result.simulated_ns / NS_PER_S:g} s")
+            if result.error:
+                say(f"  {result.error} ({result.error_place[0]}:{result.error_place[1]})")
+            for one in failed:
+                say(
+                    f"  {one.text.text}: expected {one.expected}, got {one.got} ({one.text.pos.path}:{one.text.pos.line})"
+                )
+        return well
+
+    return Debuggee([suite.unit], run, {test.program: test.name for test in suite.tests})
+
+
+def virtual_run(options: VirtualOptions, units: list[CompiledUnit]) -> Debuggee:
+    """Return the programs of a system, which runs in virtual time with its emulated devices. Raises `FileInvalid`."""
+    made = VirtualRun(options)
+
+    def run(say: Output) -> bool:
+        made.run(lambda elapsed_s: say(f"{elapsed_s:g} s of {options.duration_s:g} s"))
+        summary = made.summary()
+        for error in summary.get("errors", ()):
+            say(str(error))
+        say("passed" if summary["ok"] else "failed")
+        return bool(summary["ok"])
+
+    return Debuggee(units, run)

@@ -1,0 +1,299 @@
+"""A debug session over the Debug Adapter Protocol, with the command as a process and a client on its pipes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SOURCE = """TYPE States : (IDLE, RUN); END_TYPE
+FUNCTION Twice : INT
+VAR_INPUT x : INT; END_VAR
+  Twice := 2 * x;
+END_FUNCTION
+FUNCTION_BLOCK Counter
+VAR_INPUT go : BOOL; END_VAR
+VAR_OUTPUT n : INT; state : States; END_VAR
+VAR timer : TON; last : ARRAY[1..3] OF INT; END_VAR
+  timer(IN := go, PT := T#5s);
+  IF go THEN
+    n := n + 1;
+    state := RUN;
+    last[2] := Twice(n);
+  END_IF
+END_FUNCTION_BLOCK
+"""
+TESTS = """VAR_GLOBAL limit : INT := 7; END_VAR
+TEST 'counts'
+VAR c : Counter; zero : INT; END_VAR
+  c(go := TRUE);
+  ADVANCE_TIME(T#1s500ms);
+  c();
+  ASSERT_EQ(c.n, 2);
+  ASSERT_LT(c.n, limit);
+END_TEST
+"""
+
+
+class Editor:
+    """A client of the protocol."""
+
+    def __init__(self, *arguments: str) -> None:
+        command = [sys.executable, "-m", "fieldtwin", "plc", "debug", *arguments]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        self.sequence = 0
+        self.events: list[dict[str, Any]] = []
+
+    def read(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        length = 0
+        while line := self.process.stdout.readline().strip():
+            name, _, value = line.partition(b":")
+            if name.lower() == b"content-length":
+                length = int(value)
+        assert length, self.process.stderr.read().decode() if self.process.stderr else ""
+        found: dict[str, Any] = json.loads(self.process.stdout.read(length))
+        return found
+
+    def send(self, data: bytes) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(b"Content-Length: %d\r\n\r\n" % len(data) + data)
+        self.process.stdin.flush()
+
+    def request(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Return the response. Events that come before it are kept."""
+        self.sequence += 1
+        self.send(
+            json.dumps({"seq": self.sequence, "type": "request", "command": command, "arguments": arguments}).encode()
+        )
+        while (message := self.read())["type"] == "event":
+            self.events.append(message)
+        assert (message["request_seq"], message["command"]) == (self.sequence, command)
+        return message
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Return the body of a response to a request that succeeds."""
+        answer = self.request(command, **arguments)
+        assert answer["success"], answer
+        body: dict[str, Any] = answer.get("body", {})
+        return body
+
+    def wait(self, event: str) -> dict[str, Any]:
+        """Return the body of the next event of this kind; those before it are dropped."""
+        while True:
+            message = self.events.pop(0) if self.events else self.read()
+            assert message["type"] == "event"
+            if message["event"] == event:
+                return message.get("body", {})
+
+    def begin(self, lines: dict[Path, list[int]], **launch: Any) -> None:
+        self.ask("initialize", adapterID="fieldtwin")
+        self.ask("launch", **launch)
+        self.wait("initialized")
+        for path, wanted in lines.items():
+            self.ask("setBreakpoints", source={"path": str(path)}, breakpoints=[{"line": line} for line in wanted])
+        self.ask("setExceptionBreakpoints", filters=["errors"])
+        self.ask("configurationDone")
+
+    def place(self) -> tuple[str, int]:
+        frame = self.ask("stackTrace", threadId=1)["stackFrames"][0]
+        return frame["name"], frame["line"]
+
+    def value(self, path: str) -> str:
+        return str(self.ask("evaluate", expression=path, frameId=1)["result"])
+
+    def ends(self) -> int:
+        self.ask("disconnect")
+        return self.process.wait(20)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / "counter.st").write_text(SOURCE)
+    (tmp_path / "counter.test.st").write_text(TESTS)
+    return tmp_path
+
+
+Open = Callable[..., Editor]
+
+
+@pytest.fixture
+def opened() -> Iterator[Open]:
+    made: list[Editor] = []
+
+    def one(*arguments: str) -> Editor:
+        made.append(Editor(*arguments))
+        return made[-1]
+
+    yield one
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def editor(opened: Open, project: Path) -> Editor:
+    return opened(str(project / "counter.test.st"))
+
+
+def test_a_breakpoint_stops_with_the_call_stack_and_the_variables(editor: Editor, project: Path) -> None:
+    editor.begin({project / "counter.st": [4]})
+    stopped = editor.wait("stopped")
+    assert (stopped["reason"], stopped["description"]) == ("breakpoint", "at 0.000 s")
+    frames = editor.ask("stackTrace", threadId=1)["stackFrames"]
+    assert [(frame["name"], frame["line"], frame["source"]["name"]) for frame in frames] == [
+        ("Twice", 4, "counter.st"),
+        ("Counter", 14, "counter.st"),
+        ("counts", 4, "counter.test.st"),
+    ]
+    local, _ = editor.ask("scopes", frameId=1)["scopes"]
+    variables = editor.ask("variables", variablesReference=local["variablesReference"])["variables"]
+    assert [(v["name"], v["value"], v["type"]) for v in variables] == [("x", "1", "INT"), ("Twice", "0", "INT")]
+    assert editor.ends() == 0
+
+
+def test_members_elements_and_global_variables_are_listed(editor: Editor, project: Path) -> None:
+    editor.begin({project / "counter.test.st": [7]})
+    editor.wait("stopped")
+    scopes = editor.ask("scopes", frameId=1)["scopes"]
+    assert [scope["name"] for scope in scopes] == ["counts", "Globals"]
+    globals_ = editor.ask("variables", variablesReference=scopes[1]["variablesReference"])["variables"]
+    assert [(v["name"], v["value"]) for v in globals_] == [("limit", "7")]
+    counter, _ = editor.ask("variables", variablesReference=scopes[0]["variablesReference"])["variables"]
+    assert (counter["name"], counter["value"]) == ("c", "Counter")
+    members = editor.ask("variables", variablesReference=counter["variablesReference"])["variables"]
+    assert {v["name"]: v["value"] for v in members} == {
+        "go": "TRUE", "n": "2", "state": "RUN", "timer": "TON", "last": "[0, 4, 0]",
+    }  # fmt: skip
+    timer = next(v for v in members if v["name"] == "timer")
+    inside = editor.ask("variables", variablesReference=timer["variablesReference"])["variables"]
+    assert {v["name"]: v["value"] for v in inside} == {"IN": "TRUE", "PT": "T#5s", "Q": "FALSE", "ET": "T#1s500ms"}
+    assert [editor.value(path) for path in ("c.last[2]", "C.TIMER.et", "limit")] == ["4", "T#1s500ms", "7"]
+    wrong = editor.request("evaluate", expression="c.nothing", frameId=1)
+    assert not wrong["success"]
+    assert "no variable 'c.nothing' here" in wrong["message"]
+    assert editor.ends() == 0
+
+
+def test_steps_go_over_into_and_out_of_calls(editor: Editor, project: Path) -> None:
+    editor.begin({project / "counter.st": [12]})
+    editor.wait("stopped")
+    seen = [editor.place()]
+    for command in ("next", "next", "stepIn", "stepOut", "next"):
+        editor.ask(command, threadId=1)
+        assert editor.wait("stopped")["reason"] == "step"
+        seen.append(editor.place())
+    assert seen == [
+        ("Counter", 12), ("Counter", 13), ("Counter", 14), ("Twice", 4), ("counts", 5), ("counts", 6),
+    ]  # fmt: skip
+    assert editor.ends() == 0
+
+
+def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(editor: Editor, project: Path) -> None:
+    editor.ask("initialize")
+    editor.ask("launch")
+    source = {"path": str(project / "counter.st")}
+    answer = editor.ask("setBreakpoints", source=source, breakpoints=[{"line": 9}, {"line": 400}])
+    assert [(one["verified"], one["line"]) for one in answer["breakpoints"]] == [(True, 10), (False, 400)]
+    foreign = editor.ask("setBreakpoints", source={"path": "/other.st"}, breakpoints=[{"line": 1}])
+    assert foreign["breakpoints"][0]["message"] == "this file is not part of the program"
+    editor.ask("configurationDone")
+    times = []
+    for _ in range(2):
+        times.append(editor.wait("stopped")["description"])
+        editor.ask("continue", threadId=1)
+    assert times == ["at 0.000 s", "at 1.500 s"]
+    assert editor.wait("exited") == {"exitCode": 0}
+    assert editor.ends() == 0
+
+
+def test_the_result_of_the_tests_is_shown(editor: Editor) -> None:
+    editor.begin({})
+    assert editor.wait("output")["output"] == "passed  counts  1.5 s\n"
+    assert editor.wait("exited") == {"exitCode": 0}
+    assert editor.ends() == 0
+
+
+def test_an_error_in_a_scan_stops_at_its_line(project: Path, opened: Open) -> None:
+    (project / "bad.test.st").write_text("TEST 'bad'\nVAR n : INT; END_VAR\n  n := 0;\n  n := 1 / n;\nEND_TEST\n")
+    editor = opened(str(project / "bad.test.st"))
+    editor.begin({})
+    stopped = editor.wait("stopped")
+    assert (stopped["reason"], stopped["text"]) == ("exception", "division by zero")
+    assert editor.place() == ("bad", 4)
+    editor.ask("continue", threadId=1)
+    assert "division by zero" in [editor.wait("output")["output"] for _ in range(2)][1]
+    assert editor.wait("exited") == {"exitCode": 1}
+    assert editor.ends() == 0
+
+
+def test_a_source_with_an_error_is_a_failed_launch(project: Path, opened: Open) -> None:
+    (project / "bad.test.st").write_text("TEST 'bad'\n  nothing := 1;\nEND_TEST\n")
+    editor = opened()
+    editor.ask("initialize")
+    answer = editor.request("launch", program=str(project / "bad.test.st"))
+    assert not answer["success"]
+    assert "bad.test.st:2:3: a variable 'nothing' is not declared" in answer["message"]
+    assert editor.ends() == 0
+
+
+def test_an_endless_program_is_paused_and_ended(project: Path, opened: Open) -> None:
+    (project / "long.test.st").write_text(
+        "TEST 'long'\nVAR n : DINT; END_VAR\n  WHILE TRUE DO\n    n := n + 1;\n    ADVANCE_TIME(T#1ms);\n  END_WHILE\nEND_TEST\n"
+    )
+    editor = opened(str(project / "long.test.st"))
+    editor.begin({})
+    editor.ask("pause", threadId=1)
+    assert editor.wait("stopped")["reason"] == "pause"
+    assert int(editor.value("n")) >= 0
+    assert editor.ends() == 0
+
+
+def test_requests_at_the_wrong_time_and_bad_messages_are_answered(editor: Editor) -> None:
+    assert "not supported: fly" in editor.request("fly")["message"]
+    assert "the program is not stopped" in editor.request("continue")["message"]
+    assert "the arguments of setBreakpoints" in editor.request("setBreakpoints")["message"]
+    assert "these variables no longer exist" in editor.request("variables", variablesReference=3)["message"]
+    editor.send(b"[]")
+    assert editor.process.wait(20) == 2
+    assert editor.process.stderr is not None
+    assert b"a message that is not a JSON object" in editor.process.stderr.read()
+
+
+def test_the_programs_of_a_system_stop_in_virtual_time(opened: Open) -> None:
+    editor = opened("lab_vehicle", "--for", "5s")
+    program = Path(__file__).parents[3] / "profiles" / "systems" / "vehicle.st"
+    editor.begin({program: [45]})
+    assert editor.wait("stopped")["reason"] == "breakpoint"
+    assert editor.place() == ("Vehicle", 45)
+    assert editor.value("driving") == "FALSE"
+    editor.ask("setBreakpoints", source={"path": str(program)}, breakpoints=[])
+    editor.ask("continue", threadId=1)
+    assert editor.wait("exited") == {"exitCode": 0}
+    assert editor.ends() == 0
+
+
+def test_an_editor_can_connect_to_a_port(project: Path) -> None:
+    import socket
+
+    command = [sys.executable, "-m", "fieldtwin", "plc", "debug", str(project / "counter.test.st"), "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, "NO_COLOR": "1"}) as process:
+        assert process.stderr is not None
+        port = int(process.stderr.readline().rsplit(b":", 1)[1])
+        with socket.create_connection(("127.0.0.1", port)) as connection, connection.makefile("rb") as stream:
+            data = json.dumps({"seq": 1, "type": "request", "command": "initialize"}).encode()
+            connection.sendall(b"Content-Length: %d\r\n\r\n" % len(data) + data)
+            assert stream.readline().startswith(b"Content-Length: ")
+        assert process.wait(20) == 0

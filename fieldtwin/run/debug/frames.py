@@ -56,7 +56,10 @@ class Units:
         key, _, inner = _key(frame).partition(".")
         unit = self.of(frame)
         name = self._names.get(key) or (unit.names.get(key, key) if unit is not None else key)
-        return f"{name}.{inner[2:]}" if inner and inner != "execute" else name
+        if not inner or inner == "execute":
+            return name
+        own = unit.names.get(f"{key}.{inner[2:]}", inner[2:]) if unit is not None else inner[2:]
+        return f"{name}.{own}"
 
     def variables(self, frame: FrameType) -> list[Variable]:
         """Return the variables of the POU that a frame executes, without global ones."""
@@ -92,9 +95,13 @@ class Units:
             found = next((one for one in self.parts(found, frame) if one.name.lower() == wanted), None)
         return found
 
-    def _symbols(self, frame: FrameType) -> Sequence[Symbol]:
+    def _symbols(self, frame: FrameType) -> list[Symbol]:
+        """Return the variables of the POU of a frame, and those of the method that the frame executes, which come first."""
         unit = self.of(frame)
-        return unit.symbols.get(_key(frame).partition(".")[0], ()) if unit is not None else ()
+        if unit is None:
+            return []
+        pou, _, inner = _key(frame).partition(".")
+        return [*unit.symbols.get(f"{pou}.{inner.removeprefix('m_')}", ()), *unit.symbols.get(pou, ())]
 
 
 def _key(frame: FrameType) -> str:

@@ -24,7 +24,7 @@ class Messages:
         self._sequence = 0
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next message; None at the end of the stream. Raises `UsageError` for bytes that are no message."""
+        """Return the next message; None at the end of the stream. Raises `UsageError` for bytes that are not a message."""
         length = self._length()
         if length is None:
             return None

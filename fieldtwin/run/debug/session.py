@@ -45,7 +45,7 @@ class Session:
         self._lines: dict[str, set[int]] = {}
         """By file: the lines at which a program can stop."""
         self._handles: list[tuple[FrameType, Variable | str]] = []
-        """What the editor may list: a scope ("local" or "global"), or a variable with parts. The number of a handle is its place
+        """The things that the editor may list: a scope ("local" or "global"), or a variable with parts. The number of a handle is its place
         here, from 1.
         """
         self._thread: threading.Thread | None = None

@@ -31,7 +31,7 @@ class SessionEnded(BaseException):
 
 
 class Tracer:
-    """The control of one program, which runs in a thread of its own. `resume`, `pause` and `end` are for other threads."""
+    """The control of one program, which runs in a separate thread. `resume`, `pause` and `end` are for other threads."""
 
     def __init__(self, stopped: Callable[[str, str], None]) -> None:
         """`stopped` is called in the program's thread with the reason of a stop (breakpoint, step, pause or exception) and a text

@@ -8,7 +8,7 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import CodeType
 
@@ -63,9 +63,9 @@ class CompiledUnit:
     instances: tuple[CompiledInstance, ...] = ()
     """The programs that configurations run."""
     names: Mapping[str, str] = field(default_factory=dict)
-    """The names of the POUs as declared, by their names in lower case."""
+    """The names of POUs, and of actions and methods (``pou.action``), as declared, by their names in lower case."""
     symbols: Mapping[str, tuple[Symbol, ...]] = field(default_factory=dict)
-    """By POU in lower case: its variables, with the Python expressions that read them inside of its code."""
+    """By POU, and by method (``pou.method``), in lower case: its variables, with the Python expressions that read them inside of its code."""
     global_symbols: tuple[Symbol, ...] = ()
 
 
@@ -152,10 +152,16 @@ class _Unit:
             probed,
             self.source,
             self.instances,
-            {pou.name.lower(): pou.name for pou in self.unit.pous},
+            dict(self._names()),
             {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
             tuple(dict.fromkeys(self.env.globals.values())),
         )
+
+    def _names(self) -> Iterator[tuple[str, str]]:
+        for pou in self.unit.pous:
+            yield pou.name.lower(), pou.name
+            for part in (*pou.actions, *pou.methods):
+                yield f"{pou.name}.{part.name}".lower(), part.name
 
     def _kinds(self) -> tuple[str, ...]:
         pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous if not is_hidden(pou.name)]

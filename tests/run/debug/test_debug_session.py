@@ -226,6 +226,22 @@ def test_the_result_of_the_tests_is_shown(editor: Editor) -> None:
     assert editor.ends() == 0
 
 
+def test_a_method_shows_its_variables_and_those_of_its_block(project: Path, opened: Open) -> None:
+    (project / "tank.st").write_text(
+        "FUNCTION_BLOCK Tank\nVAR level : INT := 3; END_VAR\nMETHOD PUBLIC Fill : INT\nVAR_INPUT by : INT; END_VAR\n"
+        "  level := level + by;\n  Fill := level;\nEND_METHOD\nEND_FUNCTION_BLOCK\n"
+    )
+    (project / "tank.test.st").write_text(
+        "TEST 'fills'\nVAR t : Tank; n : INT; END_VAR\n  n := t.Fill(by := 4);\n  ASSERT_EQ(n, 7);\nEND_TEST\n"
+    )
+    editor = opened(str(project / "tank.test.st"))
+    editor.begin({project / "tank.st": [6]})
+    editor.wait("stopped")
+    assert editor.place() == ("Tank.Fill", 6)
+    assert [editor.value(path) for path in ("by", "level", "Fill")] == ["4", "7", "0"]
+    assert editor.ends() == 0
+
+
 def test_an_error_in_a_scan_stops_at_its_line(project: Path, opened: Open) -> None:
     (project / "bad.test.st").write_text("TEST 'bad'\nVAR n : INT; END_VAR\n  n := 0;\n  n := 1 / n;\nEND_TEST\n")
     editor = opened(str(project / "bad.test.st"))

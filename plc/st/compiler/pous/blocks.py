@@ -53,7 +53,8 @@ class Bodies:
             if method is None or method.abstract:
                 continue
             with self.env.declaring(declared.name, self.env.faulty_here), self.declarations.within(declared):
-                body = self.body_of(pou, {**visible, **self.variables.symbols_of(declared, "")}, method.key)
+                local = self.env.symbols[method.key] = self.variables.symbols_of(declared, "")
+                body = self.body_of(pou, {**visible, **local}, method.key)
                 body.program_inputs = set(inputs)
                 self.functions.write_body(declared, method.signature, body, method.attribute, "self")
         for method in own.methods.values():
@@ -94,7 +95,7 @@ class Blocks(Bodies):
 
     def write(self, pou: t.Pou) -> None:
         """Write the Python class of a FUNCTION_BLOCK or CLASS."""
-        symbols = self.variables.symbols_of(pou, "self.")
+        symbols = self.env.symbols[pou.name.lower()] = self.variables.symbols_of(pou, "self.")
         self.note_parts(pou, symbols)
         held = [s for s in symbols.values() if s.code.startswith("self.")]
         kept = [s.code.split(".")[1] for s in held]

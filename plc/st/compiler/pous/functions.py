@@ -40,7 +40,8 @@ class Functions:
         """Write the Python function of a FUNCTION."""
         signature = self.env.functions[pou.name.lower()]
         key = pou.name.lower()
-        body = Statements(self.env, self.variables.symbols_of(pou, ""), self.out, key)
+        symbols = self.env.symbols[key] = self.variables.symbols_of(pou, "")
+        body = Statements(self.env, symbols, self.out, key)
         self.write_body(pou, signature, body, f"f_{key}", "")
 
     def write_body(self, pou: t.Pou, signature: Signature, body: Statements, name: str, instance: str) -> None:

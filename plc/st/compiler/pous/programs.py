@@ -63,7 +63,7 @@ class Programs(Bodies):
 
     def write(self, pou: t.Pou) -> CompiledProgram:
         """Write the class of a PROGRAM."""
-        symbols = self.variables.symbols_of(pou, "self.")
+        symbols = self.env.symbols[pou.name.lower()] = self.variables.symbols_of(pou, "self.")
         self.note_parts(pou, symbols)
         variables = []
         for block in pou.blocks:

@@ -96,12 +96,12 @@ class Units:
         return found
 
     def _symbols(self, frame: FrameType) -> list[Symbol]:
-        """Return the variables of the POU of a frame, and those of the method that the frame executes, which come first."""
+        """Return the variables that a frame sees, without global ones."""
         unit = self.of(frame)
         if unit is None:
             return []
         pou, _, inner = _key(frame).partition(".")
-        return [*unit.symbols.get(f"{pou}.{inner.removeprefix('m_')}", ()), *unit.symbols.get(pou, ())]
+        return list(unit.symbols.get(f"{pou}.{inner.removeprefix('m_')}") or unit.symbols.get(pou, ()))
 
 
 def _key(frame: FrameType) -> str:

@@ -45,8 +45,8 @@ class Session:
         self._lines: dict[str, set[int]] = {}
         """By file: the lines at which a program can stop."""
         self._handles: list[tuple[FrameType, Variable | str]] = []
-        """The things that the editor may list: a scope ("local" or "global"), or a variable with parts. The number of a handle is its place
-        here, from 1.
+        """The things that the editor may list: a scope ("local" or "global"), or a variable with parts. The number of a handle is
+        its place here, from 1.
         """
         self._thread: threading.Thread | None = None
         self._entry = False

@@ -201,7 +201,7 @@ class Environment:
     missing: dict[str, Missing] = field(default_factory=dict)
     """The declarations that were not imported, because a part of them is not supported."""
     symbols: dict[str, dict[str, Symbol]] = field(default_factory=dict)
-    """By POU, and by method with its POU before it: its variables."""
+    """By POU: its variables; by method with its POU before it: all variables that it sees."""
     recorded: dict[int, tuple[ty.Type, ...]] = field(default_factory=dict)
     """By number of an assertion: the types of the values that it shows."""
     probed: dict[int, ty.Type] = field(default_factory=dict)

@@ -53,8 +53,8 @@ class Bodies:
             if method is None or method.abstract:
                 continue
             with self.env.declaring(declared.name, self.env.faulty_here), self.declarations.within(declared):
-                local = self.env.symbols[method.key] = self.variables.symbols_of(declared, "")
-                body = self.body_of(pou, {**visible, **local}, method.key)
+                body = self.body_of(pou, {**visible, **self.variables.symbols_of(declared, "")}, method.key)
+                self.env.symbols[method.key] = body.symbols
                 body.program_inputs = set(inputs)
                 self.functions.write_body(declared, method.signature, body, method.attribute, "self")
         for method in own.methods.values():

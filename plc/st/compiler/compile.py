@@ -65,7 +65,7 @@ class CompiledUnit:
     names: Mapping[str, str] = field(default_factory=dict)
     """The names of POUs, and of actions and methods (``pou.action``), as declared, by their names in lower case."""
     symbols: Mapping[str, tuple[Symbol, ...]] = field(default_factory=dict)
-    """By POU, or method (``pou.method``), in lower case: its variables, with the Python expressions that read them in its code."""
+    """By POU, or method (``pou.method``), in lower case: its variables, each with the Python code that reads it."""
     global_symbols: tuple[Symbol, ...] = ()
 
 

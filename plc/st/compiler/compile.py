@@ -160,8 +160,8 @@ class _Unit:
     def _names(self) -> Iterator[tuple[str, str]]:
         for pou in self.unit.pous:
             yield pou.name.lower(), pou.name
-            for part in (*pou.actions, *pou.methods):
-                yield f"{pou.name}.{part.name}".lower(), part.name
+            for name in (*(one.name for one in pou.actions), *(one.name for one in pou.methods)):
+                yield f"{pou.name}.{name}".lower(), name
 
     def _kinds(self) -> tuple[str, ...]:
         pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous if not is_hidden(pou.name)]

@@ -15,9 +15,10 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.image.image import Image
-from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.gateway.runtime.gateway_status import AlarmEvent, ServerStatus
 from fieldtwin.gateway.runtime.outputs.refusals import RefusalCause
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.northbound.alarm_changes import follow_alarms, quality_of
 from fieldtwin.northbound.following import Changes, ImageFollower, follow_texts
 from fieldtwin.northbound.mqtt.publication import WriteRequest
 from fieldtwin.northbound.mqtt.publications import publication_of
@@ -64,6 +65,7 @@ class MqttProcess:
         )
         self._gateway = Channel(self._run_dir / "gateway.sock", "gateway")
         self._writes = Channel(self._run_dir / "gateway.sock", "gateway")
+        self._alarms = Channel(self._run_dir / "gateway.sock", "gateway")
 
     async def run(self) -> int:
         stop = stop_signal()
@@ -77,6 +79,7 @@ class MqttProcess:
                     nursery.start(self._follow_texts(), "texts"),
                     nursery.start(self._publisher.run(), "publisher"),
                 ]
+                nursery.start(self._follow_alarms(), "alarms")
                 stopping = asyncio.ensure_future(stop.wait())
                 await asyncio.wait([*running, stopping], return_when=asyncio.FIRST_COMPLETED)
                 stopping.cancel()
@@ -84,6 +87,7 @@ class MqttProcess:
                     raise error
         await self._gateway.aclose()
         await self._writes.aclose()
+        await self._alarms.aclose()
         return 0
 
     def status(self) -> ServerStatus:
@@ -107,7 +111,7 @@ class MqttProcess:
 
     async def _follow_image(self, image: Image) -> None:
         of_devices = {tag.source: tag.name for tag in self._tags if tag.device and not tag.is_text}
-        of_programs = {tag.source: tag.name for tag in self._tags if not tag.device}
+        of_programs = {tag.source: tag.name for tag in self._tags if not tag.device and not tag.is_alarm}
 
         async def publish(tags: Changes, variables: Changes, now_ns: int) -> None:
             self._times.follow()
@@ -122,7 +126,7 @@ class MqttProcess:
         await follower.run(image, self._clock, publish)
 
     async def _follow_texts(self) -> None:
-        names = {tag.source: tag.data_type for tag in self._tags if tag.is_text}
+        names = {tag.source: tag.data_type for tag in self._tags if tag.is_text and not tag.is_alarm}
         texts = TextSamples(names, [name for name, kind in names.items() if kind == "ByteString"])
 
         async def publish(changes: Changes, now_ns: int) -> None:
@@ -131,6 +135,18 @@ class MqttProcess:
             self._publisher.wake()
 
         await follow_texts(self._gateway, texts, self._clock, publish)
+
+    async def _follow_alarms(self) -> None:
+        names = {tag.source: tag.name for tag in self._tags if tag.is_alarm}
+
+        async def publish(changes: list[AlarmEvent]) -> None:
+            self._times.follow()
+            for change in changes:
+                sample = Sample(None if change.quality == "bad" else change.state, *quality_of(change), change.t_ns)
+                self._note(names[change.name], sample, self._clock.monotonic_ns())
+            self._publisher.wake()
+
+        await follow_alarms(self._alarms, names, self._clock, self._config.every_ms * NS_PER_MS, publish)
 
     def _note(self, name: str, sample: Sample, now_ns: int) -> None:
         self._publication.note(name, sample, self._times.ms(sample.source_ns or now_ns))

@@ -1,4 +1,6 @@
-"""The tags that an MQTT server publishes: readable tags of devices that are not secret, and published variables of programs."""
+"""The tags that an MQTT server publishes: readable tags of devices that are not secret, published variables of programs, and the
+states of alarms.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.errors import Bug
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.image.layout import TagKind
+from fieldtwin.gateway.runtime.alarms.alarm_list import ALARM
 from fieldtwin.northbound.data_types import OF_KIND, data_type
 from fieldtwin.twin.plant.physical import bound_programs
 from fieldtwin.twin.site.system import System
@@ -17,20 +20,21 @@ from fieldtwin.twin.site.system import System
 class ServedTag:
     """One published tag.
 
-    `name` is DEVICE.TAG or PROGRAM.VARIABLE. `device` is "" for a variable of a program, and `data_type` a type of OPC 10000-6.
+    `name` is DEVICE.TAG, PROGRAM.VARIABLE or alarm.NAME. `device` is "" for the last two, and `data_type` a type of OPC 10000-6.
     """
 
     device: str
     owner: str
-    """The device, or the program."""
+    """The device, the program, or ``alarm``."""
     local: str
     """The name of the tag within its owner."""
     source: str
-    """The name of the tag in its region of the process image."""
+    """The name of the tag in its region of the process image; of an alarm, its name."""
     data_type: str
     unit: str = ""
     limits: tuple[float, float] | None = None
     words: tuple[tuple[int, str], ...] = ()
+    is_alarm: bool = False
 
     @property
     def name(self) -> str:
@@ -48,8 +52,9 @@ class ServedTag:
 
 
 def served_tags(system: System) -> list[ServedTag]:
-    """Return the tags of a system, devices first, in the order of the system file."""
-    tags = [*_of_devices(system), *_of_programs(system)]
+    """Return the tags of a system, devices first and alarms last, in the order of the system file."""
+    alarms = [ServedTag("", ALARM, name, name, "String", is_alarm=True) for name in system.alarms]
+    tags = [*_of_devices(system), *_of_programs(system), *alarms]
     if len({tag.name for tag in tags}) != len(tags):
         raise Bug("two published tags have the same name")
     return tags

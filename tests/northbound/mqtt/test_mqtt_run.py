@@ -22,6 +22,8 @@ SERVE = """\
 serve:
   scada: {kind: mqtt, url: "mqtt://127.0.0.1:%(port)d", every_ms: 50, sparkplug: {group: plant, node: hall, writes: true}}
   dashboard: {kind: mqtt, url: "mqtt://127.0.0.1:%(port)d", every_ms: 50, json: {topic: "hall/{device}/{tag}", status: "hall"}}
+alarms:
+  limit_high: {condition: "fan.limit > 50"}
 """
 
 
@@ -138,6 +140,36 @@ def test_the_status_of_the_gateway_shows_broker_and_counters(hall: tuple[Fieldtw
     assert found["scada"]["counters"]["births"] >= 1
     assert found["scada"]["counters"]["sent"] > 0
     assert found["scada"]["counters"]["dropped"] == 0
+
+
+def test_the_state_of_an_alarm_is_published_and_is_null_while_it_is_not_known(
+    hall: tuple[Fieldtwin, Mosquitto, Host],
+) -> None:
+    run, mosquitto, watching = hall
+    field, messages = run.control("hall", "field"), list[dict[str, Any]]()
+    client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+    client.on_message = lambda _, __, m: messages.append(json.loads(m.payload))
+    client.connect("127.0.0.1", mosquitto.port)
+    client.subscribe("prototype/hall/alarm/limit_high", 1)
+    client.loop_start()
+
+    def last(value: str | None, quality: str) -> bool:
+        return bool(messages) and (messages[-1]["value"], messages[-1]["quality"]) == (value, quality)
+
+    try:
+        watching.until(lambda: last("normal", "good"), "the alarm is normal", WITHIN_S)
+        field("set", device="fan", tag="limit", value=60.0)
+        watching.until(lambda: last("active_unacknowledged", "good"), "the alarm is active", WITHIN_S)
+        field("fault", fault={"id": "f", "name": "silence", "device": "fan"})
+        watching.until(lambda: last(None, "bad"), "the alarm is not known", WITHIN_S)
+        field("clear", id="f")
+        watching.until(lambda: last("active_unacknowledged", "good"), "the alarm is active again", WITHIN_S)
+        field("set", device="fan", tag="limit", value=None)
+        metric = watching.of("NBIRTH")[-1].by_name["alarm/limit_high"]
+        assert metric.datatype == 12  # String
+    finally:
+        client.disconnect()
+        client.loop_stop()
 
 
 def test_the_end_of_the_run_is_the_death_of_the_node(hall: tuple[Fieldtwin, Mosquitto, Host]) -> None:

@@ -16,6 +16,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.classes.inheritance import with_inherited
+from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
 from fieldtwin.plc.st.compiler.configurations.located import shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.declarations import Declarations
@@ -93,7 +94,8 @@ class _Unit:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
         unit = with_configured(unit)
-        self.unit = with_inherited(without_edges(without_charts(without_addresses(unit))))
+        self.unit = without_edges(without_charts(without_addresses(unit)))
+        self.unit = with_inherited(without_instance_variables(self.unit, dialect))
         if not dialect.vendor:
             self.unit = with_execution_control(self.unit)
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}

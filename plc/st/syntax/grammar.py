@@ -19,7 +19,6 @@ MAX_EXPECTED = 8
 _UNSUPPORTED = {
     word: construct
     for construct, words in {
-        "variables of an instance in a method": "VAR_INST",
         "namespaces": "NAMESPACE END_NAMESPACE USING",
         "labels and jumps": "JMP",
     }.items()

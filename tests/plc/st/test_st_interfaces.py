@@ -378,6 +378,32 @@ def test_codesys_compares_an_interface_with_0() -> None:
     assert (made.a, made.b, made.st_body.v_i) == (True, True, None)
 
 
+def test_variables_in_var_inst_keep_their_values_in_each_instance() -> None:
+    text = """
+        FUNCTION_BLOCK Base
+          METHOD Next : INT
+            VAR_INST n : INT := 10; after : TON; END_VAR
+            after(IN := TRUE, PT := T#15ms);
+            n := n + 1;
+            Next := n;
+            IF after.Q THEN Next := -n; END_IF
+          END_METHOD
+        END_FUNCTION_BLOCK
+        FUNCTION_BLOCK Derived EXTENDS Base METHOD Other : INT VAR_INST n : INT; END_VAR n := n + 1; Other := n; END_METHOD
+        END_FUNCTION_BLOCK
+        PROGRAM Main VAR a : Base; b : Derived; x, y, z : INT; END_VAR
+          x := a.Next(); y := b.Next(); z := b.Other(); y := b.Next();
+        END_PROGRAM"""
+    made = vendor(text)
+    assert (made.x, made.y, made.z) == (11, 12, 1)
+    for number in (2, 3):
+        scan(made, number)
+    assert (made.x, made.y, made.z) == (-13, -16, 3)
+    for refused, dialect in ((text, "standard"), ("PROGRAM p VAR_INST n : INT; END_VAR END_PROGRAM", "codesys")):
+        with pytest.raises(FileInvalid, match="VAR_INST; expected VAR"):
+            compile_text(refused, "", DIALECTS[dialect])
+
+
 def test_a_program_has_methods_in_codesys() -> None:
     made = vendor("""PROGRAM Main VAR n : INT; END_VAR
         n := Twice(4);

@@ -1,0 +1,62 @@
+"""Variables of a method that keep their values (``VAR_INST``), an addition of CODESYS and TwinCAT to the standard.
+
+Each instance of the owner has such a variable. So it is translated into a variable of the owner, whose name begins with 0, so no
+source can contain it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.plc.st.dialects import Dialect
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import with_parts
+
+_KIND = "VAR_INST"
+
+
+def without_instance_variables(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit:
+    """Return `unit` with the VAR_INST of methods as variables of their owners.
+
+    Raises `FileInvalid` with line and column for the first VAR_INST that is not allowed, and with the others.
+    """
+    errors = ErrorCollector()
+    pous = []
+    for pou in unit.pous:
+        for block in (*pou.blocks, *(b for method in pou.methods for b in method.blocks if not dialect.vendor)):
+            if block.kind == _KIND:
+                pos = block.pos
+                hint = "the dialects codesys and twincat have it in a METHOD"
+                errors.add(
+                    FileInvalid(_KIND, path=pos.path, line=pos.line, column=pos.column, expected="VAR", hint=hint)
+                )
+        pous.append(_moved(pou))
+    errors.raise_all()
+    return replace(unit, pous=tuple(pous))
+
+
+def _moved(pou: t.Pou) -> t.Pou:
+    kept: list[t.VarBlock] = []
+    methods = []
+    for method in pou.methods:
+        names: dict[str, str] = {}
+        for block in (b for b in method.blocks if b.kind == _KIND):
+            found = {
+                v.name.lower(): f"0inst_{method.kind.lower()}_{method.name.lower()}_{v.name.lower()}"
+                for v in block.variables
+            }
+            variables = tuple(replace(v, name=found[v.name.lower()]) for v in block.variables)
+            kept.append(replace(block, kind="VAR", variables=variables))
+            names.update(found)
+        blocks = tuple(b for b in method.blocks if b.kind != _KIND)
+        methods.append(replace(method, blocks=blocks, body=_renamed(method.body, names)) if names else method)
+    return replace(pou, blocks=(*pou.blocks, *kept), methods=tuple(methods))
+
+
+def _renamed(node: Any, names: dict[str, str]) -> Any:
+    if isinstance(node, t.Ref) and node.name.lower() in names:
+        return replace(node, name=names[node.name.lower()], selectors=_renamed(node.selectors, names))
+    return with_parts(node, lambda part: _renamed(part, names))

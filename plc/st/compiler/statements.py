@@ -71,7 +71,11 @@ class Statements(Calls):
         condition = self.condition(s.condition, "an assertion")
         shown = [self.value(expr) for expr in s.shown]
         self.env.recorded[s.number] = tuple(value.type for value in shown)
-        self.out.line(f"_c.asserted({s.number}, {condition}, ({''.join(f'{v.code}, ' for v in shown)}))", s.pos)
+        values = "".join(f"{value.code}, " for value in shown)
+        self.out.line(f"_c.asserted({s.number}, {condition}, ({values}), {s.of_test})", s.pos)
+
+    def _finished(self, s: t.Finished) -> None:
+        self.out.line(f"_c.finished.add({s.test})", s.pos)
 
     def _advance(self, s: t.Advance) -> None:
         by = self.coerced(self.value(s.by), ty.LTIME, s.pos, "BY of ADVANCE_TIME")

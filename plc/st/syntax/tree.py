@@ -490,12 +490,24 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Assertion:
-    """An assertion of a unit test. `number` identifies it in the unit; `shown` are the values that a failure shows."""
+    """An assertion of a unit test. `number` identifies it in the unit; `shown` are the values that a failure shows.
+
+    An assertion of a cyclic test has the number of the test (`of_test`), because it does not count after the end of that test.
+    """
 
     pos: Pos
     number: int
     condition: Expr
     shown: tuple[Expr, ...]
+    of_test: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """The end of a cyclic unit test, whose number is `test`."""
+
+    pos: Pos
+    test: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -516,5 +528,6 @@ class Probe:
 
 
 Statement = (
-    Assertion | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement | If | Case | For | While | Repeat | Jump
+    Assertion | Finished | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement
+    | If | Case | For | While | Repeat | Jump
 )  # fmt: skip

@@ -40,7 +40,8 @@ def _no_block(program: t.Pou) -> t.Missing | None:
 
 def _block(program: t.Pou) -> t.Pou:
     inputs = {v.name.lower(): v for b in program.blocks if b.kind == "VAR_INPUT" for v in b.variables}
-    asked = [name for name in inputs if any(_asks(node, name) for node in nodes((program.body, program.actions)))]
+    bodies = (program.body, program.actions, program.methods)
+    asked = [name for name in inputs if any(_asks(node, name) for node in nodes(bodies))]
     blocks = [_visible(part) for block in program.blocks for part in _unlocated(block)]
     if asked:
         blocks.append(

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.plc.program import ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.inspection import literal
 from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource
-from fieldtwin.plc.st.unit_tests.translate import AssertionText, TranslatedTest
+from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest
 
+CYCLE_NS = 10 * NS_PER_MS
+"""The cycle of the programs of cyclic tests."""
+MAX_CYCLIC_NS = 600 * NS_PER_S
+"""How long cyclic tests may take, in virtual time."""
 MAX_ADVANCES = 1_000_000
 """How often a test may advance its time, so that a test with an endless loop ends."""
 
@@ -73,17 +79,21 @@ class Recorded:
 class _TestContext(Context):
     """The context of compiled code in a test: its time is that of the test."""
 
-    __slots__ = ("_advances", "counts", "executed")
+    __slots__ = ("_advances", "counts", "executed", "finished")
 
     def __init__(self, recorded: Recorded) -> None:
         super().__init__()
         self.first_scan = True
         self.counts: dict[int, _Count] = {}
+        self.finished: set[int] = set()
+        """The numbers of the cyclic tests that have ended."""
         self.executed: Callable[[Any], None] = recorded.executed.add
         self._advances = 0
 
-    def asserted(self, number: int, holds: bool, shown: tuple[Any, ...]) -> None:
-        """Record an execution of an assertion. The first failure is kept."""
+    def asserted(self, number: int, holds: bool, shown: tuple[Any, ...], of_test: int) -> None:
+        """Record an execution of an assertion, unless the cyclic test `of_test` has ended. The first failure is kept."""
+        if of_test in self.finished:
+            return
         count = self.counts.setdefault(number, _Count())
         count.executed += 1
         if not count.failed:
@@ -105,20 +115,34 @@ class _TestContext(Context):
 
 def run_tests(unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: Recorded) -> Iterator[TestResult]:
     """Run each test. `recorded` collects what the probes of all of them record."""
-    for test in tests:
-        yield _run(unit, test, recorded)
+    for _, group in groupby(tests, lambda test: test.program):
+        yield from _run(unit, list(group), recorded)
 
 
-def _run(unit: CompiledUnit, test: TranslatedTest, recorded: Recorded) -> TestResult:
+def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: Recorded) -> Iterator[TestResult]:
+    """Run the program of `tests`: once, or if they are cyclic, until all of them have ended."""
     context = _TestContext(recorded)
     error, place = "", ("", 0)
     try:
-        resource = Resource(unit, context)
-        resource.space[f"P_{test.program}"]().execute()
+        program = Resource(unit, context).space[f"P_{tests[0].program}"]()
+        program.execute()
+        while (
+            tests[0].cyclic
+            and context.now_ns < MAX_CYCLIC_NS
+            and any(one.number not in context.finished for one in tests)
+        ):
+            context.advance(CYCLE_NS)
+            program.execute()
     except (FieldtwinError, ArithmeticError, ValueError, RecursionError) as e:
-        error, place = _reason(e), _place(e, unit, test)
-    found = [_result(number, text, context, unit) for number, text in test.assertions.items()]
-    return TestResult(test, tuple(found), context.now_ns, error, place)
+        error, place = _reason(e), _place(e, unit, tests[0])
+    for test in tests:
+        found = tuple(_result(number, text, context, unit) for number, text in test.assertions.items())
+        ended = not test.cyclic or test.number in context.finished
+        reason = error or f"it did not call TEST_FINISHED within {values.duration_text(MAX_CYCLIC_NS, 'T')}"
+        at = place if error else (test.pos.path, test.pos.line)
+        yield TestResult(
+            test, found, context.now_ns, *(("", ("", 0)) if ended and (test.cyclic or not error) else (reason, at))
+        )
 
 
 def _result(number: int, text: AssertionText, context: _TestContext, unit: CompiledUnit) -> AssertionResult:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.source_files import SUFFIXES, is_test_file, source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.coverage.places import Place
 from fieldtwin.plc.st.coverage.probes import Probes
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.project import read_with
+from fieldtwin.plc.st.unit_tests.assertions import TranslatedTest
 from fieldtwin.plc.st.unit_tests.blocks import programs_as_blocks
 from fieldtwin.plc.st.unit_tests.run import Recorded, TestResult, run_tests
-from fieldtwin.plc.st.unit_tests.translate import TranslatedTest, tests_as_programs
+from fieldtwin.plc.st.unit_tests.tcunit import is_suite, suites_as_programs
+from fieldtwin.plc.st.unit_tests.translate import tests_as_programs
 
 
 @dataclass
@@ -53,7 +57,7 @@ def load_suite(
     """
     beside = tuple(_beside(path))
     unit, others = read_with(path, beside, libraries, dialect, programs_as_blocks)
-    if not unit.tests:
+    if not unit.tests and not any(map(is_suite, unit.pous)):
         raise FileInvalid("no test in this file", path=str(path), expected="TEST 'name' ... END_TEST")
     probes, unused = Probes(), Probes()
     files = [str(path), *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))]
@@ -62,7 +66,11 @@ def load_suite(
         unused.insert(other, [*files, *libraries_files])
     if coverage:
         unit = probes.insert(unit, [*files, *libraries_files])
-    unit, tests = tests_as_programs(unit)
+    numbers, errors = count(1), ErrorCollector()
+    unit, tests = tests_as_programs(unit, numbers, errors)
+    unit, cyclic = suites_as_programs(unit, numbers, errors)
+    errors.raise_all()
+    tests += cyclic
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     compiled = compile_unit(unit, str(path), tuple(dict.fromkeys((str(path), *sorted(used)))), dialect)
     return Suite(path, compiled, tests, probes, unused, Recorded())

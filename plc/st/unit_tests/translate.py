@@ -8,7 +8,7 @@ Names that begin with 0 belong to this translation; no source can contain them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -17,14 +17,12 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import with_parts
 from fieldtwin.plc.st.syntax.written import text_of
+from fieldtwin.plc.st.unit_tests.assertions import COMPARISONS, AssertionText, TranslatedTest, condition, invalid
 
-_COMPARISONS = {
-    "ASSERT_EQ": "=", "ASSERT_NE": "<>", "ASSERT_LT": "<", "ASSERT_LE": "<=", "ASSERT_GT": ">", "ASSERT_GE": ">=",
-}  # fmt: skip
 _PARAMETERS = {
     "ASSERT_TRUE": ("IN",),
     "ASSERT_FALSE": ("IN",),
-    **dict.fromkeys(_COMPARISONS, ("IN", "EXPECTED")),
+    **dict.fromkeys(COMPARISONS, ("IN", "EXPECTED")),
     "ASSERT_NEAR": ("IN", "EXPECTED", "TOLERANCE"),
     "ADVANCE_TIME": ("BY",),
 }
@@ -34,59 +32,29 @@ _EXPECTED = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class AssertionText:
-    """The text of an assertion in a report: its place and its text as in the source, the words before the expected value, and
-    the MESSAGE of the user.
-    """
-
-    pos: t.Pos
-    text: str
-    expected: str
-    message: str
-
-
-@dataclass(frozen=True, slots=True)
-class TranslatedTest:
-    """A test as the PROGRAM `program` of a unit, with its assertions by their number."""
-
-    pos: t.Pos
-    name: str
-    program: str
-    assertions: dict[int, AssertionText]
-
-
-def tests_as_programs(unit: t.SourceUnit) -> tuple[t.SourceUnit, list[TranslatedTest]]:
-    """Return `unit` with a PROGRAM for each of its tests, which are removed, and the tests.
-
-    Raises `FileInvalid` with line and column for the first error in a call of an assertion, and with the others.
-    """
-    errors = ErrorCollector()
+def tests_as_programs(
+    unit: t.SourceUnit, numbers: Iterator[int], errors: ErrorCollector
+) -> tuple[t.SourceUnit, list[TranslatedTest]]:
+    """Return `unit` with a PROGRAM for each of its tests, which are removed, and the tests. Errors are added to `errors`."""
     tests: list[TranslatedTest] = []
     programs: list[t.Pou] = []
-    numbers = iter(range(1, 1_000_000))
     seen: dict[str, t.Pos] = {}
     for n, test in enumerate(unit.tests):
         if test.name in seen:
-            errors.add(_error(test.pos, f"a second test with the name {test.name!r}", expected="different names"))
+            errors.add(invalid(test.pos, f"a second test with the name {test.name!r}", expected="different names"))
         seen[test.name] = test.pos
         found = TranslatedTest(test.pos, test.name, f"0test_{n}", {})
         body = _Translation(found, numbers, errors).statements(test.body)
         programs.append(t.Pou(test.pos, "PROGRAM", found.program, None, _variables(test, errors), body))
         tests.append(found)
-    errors.raise_all()
     return replace(unit, pous=(*unit.pous, *programs), tests=()), tests
 
 
 def _variables(test: t.Test, errors: ErrorCollector) -> tuple[t.VarBlock, ...]:
     for block in test.blocks:
         if block.kind not in ("VAR", "VAR_TEMP", "VAR_EXTERNAL"):
-            errors.add(_error(block.pos, "the variables of a test", expected="VAR or VAR_EXTERNAL", got=block.kind))
+            errors.add(invalid(block.pos, "the variables of a test", expected="VAR or VAR_EXTERNAL", got=block.kind))
     return test.blocks
-
-
-def _error(pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
-    return FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint)
 
 
 class _Translation:
@@ -118,7 +86,9 @@ class _Translation:
         name = call.ref.name.upper()
         if name not in _PARAMETERS:
             known = list(_PARAMETERS)
-            raise _error(call.pos, f"{call.ref.name} is no assertion", ", ".join(known), hint=did_you_mean(name, known))
+            raise invalid(
+                call.pos, f"{call.ref.name} is no assertion", ", ".join(known), hint=did_you_mean(name, known)
+            )
         given, message = self._arguments(call, name)
         if name == "ADVANCE_TIME":
             return [t.Advance(call.pos, given[0])]
@@ -128,7 +98,7 @@ class _Translation:
         said = t.Call(call.pos, call.ref, tuple(t.Argument(one.pos, "", one) for one in given))
         text = AssertionText(call.pos, text_of(said), _EXPECTED[name], message)
         self._test.assertions[number] = text
-        return [*held, t.Assertion(call.pos, number, _condition(name, call.pos, shown), tuple(shown))]
+        return [*held, t.Assertion(call.pos, number, condition(name, call.pos, shown), tuple(shown))]
 
     def _arguments(self, call: t.Call, name: str) -> tuple[list[t.Expr], str]:
         """Return the arguments in the order of the parameters, and the text of MESSAGE, which comes last."""
@@ -138,24 +108,13 @@ class _Translation:
             key = argument.name.upper() or (names[n] if n < len(names) else "")
             if key not in names or key in found or argument.value is None:
                 got = argument.name or f"{len(call.arguments)} arguments"
-                raise _error(argument.pos, f"the arguments of {name}", ", ".join(names), got)
+                raise invalid(argument.pos, f"the arguments of {name}", ", ".join(names), got)
             found[key] = argument.value
         missing = [one for one in _PARAMETERS[name] if one not in found]
         if missing:
-            raise _error(call.pos, f"{name} lacks {', '.join(missing)}", expected=", ".join(names))
+            raise invalid(call.pos, f"{name} lacks {', '.join(missing)}", expected=", ".join(names))
         message = found.pop("MESSAGE", None)
         if message is not None and not (isinstance(message, t.Literal) and message.kind == "STRING_LITERAL"):
-            raise _error(message.pos, f"MESSAGE of {name}", expected="a text in quotation marks", got=text_of(message))
+            raise invalid(message.pos, f"MESSAGE of {name}", expected="a text in quotation marks", got=text_of(message))
         text = message.text[1:-1] if isinstance(message, t.Literal) else ""
         return [found[one] for one in _PARAMETERS[name]], text
-
-
-def _condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr:
-    if name == "ASSERT_TRUE":
-        return values[0]
-    if name == "ASSERT_FALSE":
-        return t.Unary(pos, "NOT", values[0])
-    if name in _COMPARISONS:
-        return t.Binary(pos, _COMPARISONS[name], values[0], values[1])
-    difference = t.Argument(pos, "", t.Binary(pos, "-", values[0], values[1]))
-    return t.Binary(pos, "<=", t.Call(pos, t.Ref(pos, "ABS"), (difference,)), values[2])

@@ -168,6 +168,9 @@ class UnitRules(Rules):
     def pou_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
         return t.NamedType(self._pos(meta), str(items[0]))
 
+    def base_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
+        return t.NamedType(self._pos(items[0]), ".".join(map(str, items)))
+
     def extends(self, meta: Meta, items: list[Any]) -> _Bases:
         return _Bases("EXTENDS", tuple(items))
 

@@ -69,6 +69,8 @@ def load_program(
     together: dict[Any, Any] | None = None,
     dialect: str = "standard",
     libraries: Sequence[str] = (),
+    *,
+    takes_writes: bool = False,
 ) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
@@ -78,13 +80,14 @@ def load_program(
     `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``), a PLCopen export (``plant.xml``) or a
     folder of such files (``plc``), followed by ``:NAME`` if there are several programs. `dialect` is the dialect of a text
     (`fieldtwin.plc.st.dialects`), and `libraries` are files or folders with declarations that it uses, searched like `source`.
+    `takes_writes`: a program in Structured Text has a message input for writes of servers (`fieldtwin.plc.st.program.WRITES`).
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
     if language.strip() == "python":
         made = _python_class(source, rest, python_path)
     else:
-        made = partial(_text_class(source, python_path, dialect, libraries), together)
+        made = partial(_text_class(source, python_path, dialect, libraries, takes_writes=takes_writes), together)
     try:
         return made()
     except FieldtwinError:
@@ -127,7 +130,9 @@ def text_source(source: str, folders: Sequence[str]) -> tuple[Path, str] | None:
     return (found, program.strip()) if is_text else None
 
 
-def _text_class(source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str]) -> type[StProgram]:
+def _text_class(
+    source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str], *, takes_writes: bool
+) -> type[StProgram]:
     found = text_source(source, folders)
     if found is None:
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
@@ -135,7 +140,7 @@ def _text_class(source: str, folders: Sequence[str], dialect: str, libraries: Se
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
     places = tuple(_found(library, folders) for library in libraries)
-    return load_source(*found, dialect_of(dialect), places)
+    return load_source(*found, dialect_of(dialect), places, takes_writes=takes_writes)
 
 
 def image_for(

@@ -31,6 +31,7 @@ from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.outputs.output import Output
 from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
+from fieldtwin.gateway.runtime.plc_variables import PlcVariables
 from fieldtwin.gateway.runtime.serve import ServeConfig, TagServer
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
@@ -141,9 +142,13 @@ class Gateway:
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)
         ]
-        self.servers = [TagServer(s, self.tags, self.outputs, clock, listen, audit) for s in config.serve]
-        sources = self._message_sources()
-        self.exchange = ImageExchange(image, self.tags, sources)
+        written = {t.variable.partition(".")[0] for s in config.serve for t in s.tags if t.variable}
+        self.plc_variables = PlcVariables(sorted(written), clock)
+        self.servers = [
+            TagServer(s, self.tags, self.outputs, clock, listen, audit, self.plc_variables) for s in config.serve
+        ]
+        sources = {**self._message_sources(), **self.plc_variables.sources}
+        self.exchange = self.plc_variables.exchange = ImageExchange(image, self.tags, sources)
         self.alarms = AlarmList(config.alarms, self.tags, audit)
         self.plc_alive = False
         self.plc_losses = 0
@@ -184,7 +189,7 @@ class Gateway:
 
     def _make_outputs(self) -> list[Output]:
         """Return every tag that a program or a client of the gateway may write, and every tag that has a safe value."""
-        served = {t.tag for s in self.config.serve for t in s.tags if t.write}
+        served = {t.tag for s in self.config.serve for t in s.tags if t.write and not t.variable}
         safe = {f"{device.name}.{local}" for device in self.config.devices.values() for local in device.safe}
         return [
             self._make_output(tag)
@@ -282,6 +287,7 @@ class Gateway:
             and until_ns - self.exchange.plc_heard_ns <= lost_ns
             and self.outputs.is_idle
             and self._is_idle()
+            and self.plc_variables.is_idle
         )
 
     def _is_idle(self) -> bool:
@@ -320,6 +326,8 @@ class Gateway:
             if tag in self.config.log_tags:
                 self.log.append([(tag, m.seq, m.t_ns, m.data) for m in messages])
         self._check_plc(now_ns)
+        self.plc_variables.alive = self.plc_alive
+        self.plc_variables.tick(now_ns)
         self.alarms.tick(now_ns, self.exchange.outputs, plc_alive=self.plc_alive)
         self.outputs.tick(now_ns)
         for pump in self.pumps:

@@ -126,6 +126,14 @@ class ImageExchange:
         """Return the milliseconds since the PLC last published; infinite if it never did."""
         return (now_ns - self.plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
 
+    def last_published(self, tag: str) -> int:
+        """Return the number of the last message of `tag` that was published."""
+        return self._writer.last_sequence(tag)
+
+    def consumed(self, tag: str) -> int:
+        """Return the number of the last message of `tag` that the PLC has consumed."""
+        return self._consumed.get(tag, 0)
+
     def all_consumed(self, tag: str) -> bool:
         """Return whether the PLC has consumed every message of `tag` that was published; always False if no program reads this
         tag.

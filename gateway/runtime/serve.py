@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Literal, Protocol
 
 from fieldtwin.gateway.connections.sockets.listeners import TcpListener
@@ -38,9 +38,12 @@ from fieldtwin.gateway.runtime.bridge.audit import WriteRecord
 from fieldtwin.gateway.runtime.bridge.policy import EVERYONE, Network, within
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.gateway_status import ServerStatus
+from fieldtwin.gateway.runtime.plc_variables import PlcVariables
 from fieldtwin.gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
 from fieldtwin.gateway.runtime.tags import TagTable
 
+MAX_REGISTERS = 4
+"""The number of registers of the largest value."""
 BIT_TABLES = ("coil", "discrete")
 DIRECT_UNITS = (0, 255)
 """The unit IDs that a client without unit IDs sends to a device directly on TCP (TG 4.4.1.2, case MB-057)."""
@@ -57,7 +60,9 @@ QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
 class ServedTag:
     """A served tag and its address.
 
-    `quality_at` is the address of its quality register, in the table given by `QUALITY_TABLE`.
+    `quality_at` is the address of its quality register, in the table given by `QUALITY_TABLE`. `from_plc`: the PLC publishes
+    the tag. `variable` is ``program.variable`` of the PLC if clients write that variable instead of a tag, within `limits`. A
+    served tag with a `constant` always has this value.
     """
 
     tag: str
@@ -67,6 +72,10 @@ class ServedTag:
     order: str = "ABCD"
     quality_at: int | None = None
     write: bool = False
+    from_plc: bool = False
+    variable: str = ""
+    limits: tuple[float, float] | None = None
+    constant: float | None = None
 
     @property
     def count(self) -> int:
@@ -79,7 +88,8 @@ class ServeConfig:
     """The configuration of one server. With `if_bad` "nan", a bad float reads as NaN; no other type has a value for that purpose.
 
     Clients whose certificate has one of `roles` (MBTLS 8.4) may read, and those with one of `write_roles` may also write; None:
-    every client, also without a certificate. A client that is silent for `idle_s` is disconnected; 0: never.
+    every client, also without a certificate. A client that is silent for `idle_s` is disconnected; 0: never. `sizes`: the number
+    of registers or bits of each table that always exist; those without a tag read as 0, and writes to them have no effect.
     """
 
     name: str
@@ -92,6 +102,7 @@ class ServeConfig:
     roles: frozenset[str] | None = None
     write_roles: frozenset[str] | None = None
     idle_s: float = 0.0
+    sizes: Mapping[ServedTable, int] = field(default_factory=dict)
 
 
 class OutputWrites(Protocol):
@@ -135,16 +146,19 @@ class TagServer:
         clock: Clock,
         listen: Listen = TcpListener.open,
         audit: AuditLog | None = None,
+        plc: PlcVariables | None = None,
     ) -> None:
         """Create the server.
 
-        `audit` records the writes that are refused before they reach `writer`, which records its own refusals.
+        `audit` records the writes that are refused before they reach `writer`, which records its own refusals, and the writes of
+        variables of the PLC. `plc` is necessary for tags `from_plc`.
         """
         self.config = config
         self.counters = ServeCounters()
         self._record = WriteRecord(audit, clock) if audit is not None else None
         self._tags = tags
         self._writer = writer
+        self._plc = plc
         self._clock = clock
         self._cells: dict[ServedTable, dict[int, _Cell]] = {t: {} for t in QUALITY_TABLE}
         for served in config.tags:
@@ -235,15 +249,23 @@ class TagServer:
         found = []
         while at < end:
             cell = cells.get(at)
+            if cell is None and at < self.config.sizes.get(access.table, 0) and not self._is_inside(access.table, at):
+                kind = "bool" if access.table in BIT_TABLES else "uint16"
+                cell = _Cell(ServedTag("", access.table, at, kind, constant=0), is_quality=False)
             if cell is None or at + cell.count > end:
                 raise refusal(function, ILLEGAL_ADDRESS)
             found.append(cell)
             at += cell.count
         return found
 
+    def _is_inside(self, table: ServedTable, address: int) -> bool:
+        """Return whether a value begins before `address` and ends after it."""
+        cells = self._cells[table]
+        return any((cell := cells.get(address - n)) is not None and cell.count > n for n in range(1, MAX_REGISTERS))
+
     def _cell_bytes(self, function: int, cell: _Cell, now_ns: int) -> bytes:
         served = cell.served
-        value = self._tags.current(served.tag, now_ns)
+        value = self._value(served, now_ns)
         data = pack(served.type, served.order, value.value) if self._presentable(served, value) else None
         if cell.is_quality:
             return _quality_word(value, fits=data is not None).to_bytes(2)
@@ -253,6 +275,13 @@ class TagServer:
         if substitute is None:
             raise refusal(function, SERVER_FAILURE)
         return substitute
+
+    def _value(self, served: ServedTag, now_ns: int) -> TagValue:
+        if served.constant is not None:
+            return TagValue(served.constant, Quality.GOOD, t_ns=now_ns)
+        if served.from_plc and self._plc is not None:
+            return self._plc.current(served.tag)
+        return self._tags.current(served.tag, now_ns)
 
     @staticmethod
     def _presentable(served: ServedTag, value: TagValue) -> bool:
@@ -266,6 +295,8 @@ class TagServer:
         """Write one whole tag. The client gets the answer when the device has confirmed the write."""
         function = pdu[0]
         cells = self._covered(function, access)
+        if any(cell.served.variable for cell in cells):
+            return self._write_variables(caller, pdu, access, cells)
         if any(cell.is_quality or not cell.served.write for cell in cells):
             raise refusal(function, ILLEGAL_ADDRESS)
         if len(cells) != 1:
@@ -274,6 +305,30 @@ class TagServer:
         value = unpack(served.type, served.order, _written(pdu, served))
         if value is None:
             raise refusal(function, ILLEGAL_VALUE)
+        done, promise = self._promise(pdu)
+        self._writer.request(served.tag, value, caller.on_record, done)
+        return promise
+
+    def _write_variables(self, caller: Caller, pdu: bytes, access: Access, cells: list[_Cell]) -> Answer:
+        """Write variables of the PLC, which take effect together. The client gets the answer after the scan that used them."""
+        function = pdu[0]
+        if self._plc is None or any(not cell.served.variable and cell.served.tag for cell in cells):
+            raise refusal(function, ILLEGAL_ADDRESS)  # a tag that is no writable variable
+        values: dict[str, dict[str, float]] = {}
+        for served in (cell.served for cell in cells if cell.served.variable):
+            value = unpack(served.type, served.order, _part(pdu, served, access))
+            if value is None or (served.limits and not served.limits[0] <= value <= served.limits[1]):
+                raise refusal(function, ILLEGAL_VALUE)
+            program, _, name = served.variable.partition(".")
+            values.setdefault(program, {})[name] = bool(value) if served.type == "bool" else value
+        if self._record is not None:
+            self._record.asked(caller.on_record, self.config.name, self.config.unit, pdu)
+        done, promise = self._promise(pdu)
+        self._plc.request(values, done)
+        return promise
+
+    def _promise(self, pdu: bytes) -> tuple[Callable[[FieldtwinError | None], None], asyncio.Future[bytes | None]]:
+        """Return the function that completes a write, and the answer to the write, which it sets."""
         promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
 
         def done(error: FieldtwinError | None) -> None:
@@ -281,10 +336,9 @@ class TagServer:
             self.counters.refused += error is not None
             if not promise.done():
                 code = _code_of(error) if error is not None else 0
-                promise.set_result(exception_pdu(refusal(function, code)) if code else pdu[:5])
+                promise.set_result(exception_pdu(refusal(pdu[0], code)) if code else pdu[:5])
 
-        self._writer.request(served.tag, value, caller.on_record, done)
-        return promise
+        return done, promise
 
 
 def _is_one_of(role: str, roles: frozenset[str] | None) -> bool:
@@ -298,6 +352,16 @@ def _written(pdu: bytes, served: ServedTag) -> bytes:
     if pdu[0] == 0x0F:
         return bytes([0, pdu[6] & 1])
     return pdu[3:] if pdu[0] == 0x06 else pdu[6:]
+
+
+def _part(pdu: bytes, served: ServedTag, access: Access) -> bytes:
+    """Return the register bytes of one value of a write request; a bit becomes one register."""
+    if pdu[0] in (0x05, 0x06):
+        return _written(pdu, served)
+    at = served.address - access.address
+    if pdu[0] == 0x0F:
+        return bytes([0, pdu[6 + at // 8] >> at % 8 & 1])
+    return pdu[6 + 2 * at : 6 + 2 * (at + served.count)]
 
 
 def _code_of(error: FieldtwinError) -> int:

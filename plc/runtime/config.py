@@ -22,7 +22,8 @@ class ProgramConfig:
     """The configuration of a program.
 
     It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
-    empty), its policy while it waits for its inputs, and the dialect and the libraries of its source.
+    empty), its policy while it waits for its inputs, and the dialect and the libraries of its source. With `takes_writes`,
+    servers write its variables.
     """
 
     name: str
@@ -33,10 +34,13 @@ class ProgramConfig:
     start: StartPolicy = field(default_factory=StartPolicy)
     dialect: str = "standard"
     libraries: tuple[str, ...] = ()
+    takes_writes: bool = False
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
         """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
-        program = load_program(self.source, python_path, together, self.dialect, self.libraries)
+        program = load_program(
+            self.source, python_path, together, self.dialect, self.libraries, takes_writes=self.takes_writes
+        )
         return BoundProgram(self.name, program, self.inputs, self.outputs)
 
 

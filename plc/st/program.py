@@ -8,6 +8,7 @@ their two's complement.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,8 @@ from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 from fieldtwin.plc.st.runtime.references import REFERENCES
 
+WRITES = "st_writes"
+"""The message input through which servers write variables: a JSON object with values by name (`StProgram.put`)."""
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
 
@@ -75,6 +78,9 @@ class StProgram(Program):
     def execute(self, scan: ScanInfo) -> None:
         self.st_resource.begin(scan, self.tag)
         body, namespace = self.st_body, self.__dict__
+        for message in namespace.get(WRITES, ()):
+            for name, value in json.loads(message.data).items():
+                self.put(name, value)
         for item in self.st_shared_inputs:
             item.put(self.st_resource.globals, namespace[item.name])
         if self.st_instance:
@@ -211,10 +217,11 @@ def _too_deep(error: RecursionError) -> values.LogicError:
     return found.with_traceback(error.__traceback__)
 
 
-def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
+def program_class(unit: CompiledUnit, name: str = "", *, takes_writes: bool = False) -> type[StProgram]:
     """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`.
 
-    `name` may also be that of a program of a configuration, which states the PROGRAM.
+    `name` may also be that of a program of a configuration, which states the PROGRAM. With `takes_writes` the program has a
+    message input whose messages set its variables, each before the next scan.
     """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
     names = [*(p.name for p in unit.programs), *missing]
@@ -255,6 +262,8 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         "source_warnings": tuple(map(str, unit.warnings)),
         "__module__": __name__,
     }
+    if takes_writes:
+        body[WRITES] = message_input()
     for v in found.variables:
         kind = _tag_kind(v.kind)
         if isinstance(v.kind, ty.MessagesIn):
@@ -293,10 +302,15 @@ def instance_of(unit: CompiledUnit, name: str = "") -> CompiledInstance | None:
 
 
 def load_source(
-    path: Path, name: str = "", dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()
+    path: Path,
+    name: str = "",
+    dialect: Dialect = STANDARD,
+    libraries: tuple[Path, ...] = (),
+    *,
+    takes_writes: bool = False,
 ) -> type[StProgram]:
     """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
-    return program_class(compile_source(path, dialect, libraries), name)
+    return program_class(compile_source(path, dialect, libraries), name, takes_writes=takes_writes)
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:

@@ -29,6 +29,7 @@ from fieldtwin.gateway.runtime.alarms.alarm_list import AlarmConfig
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
+from fieldtwin.gateway.runtime.plc_variables import WRITES, writes_tag
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_for
@@ -94,19 +95,28 @@ def plant_tags(system: System) -> dict[str, TagSpec]:
 
 def programs_of(system: System) -> tuple[ProgramConfig, ...]:
     """Return the configuration of the PLC's programs for its process."""
+    written = _written_programs(system)
     return tuple(
         ProgramConfig(
             name,
             form.source,
-            {v: InputBinding(i.tag, i.if_bad) for v, i in form.inputs.items()},
+            {v: InputBinding(i.tag, i.if_bad) for v, i in form.inputs.items()}
+            | ({WRITES: InputBinding(writes_tag(name).name)} if name in written else {}),
             dict(form.outputs),
             form.task or "",
             _start_policy(form.start or system.plc.start),
             form.dialect,
             tuple(form.libraries),
+            takes_writes=name in written,
         )
         for name, form in system.plc.programs.items()
     )
+
+
+def _written_programs(system: System) -> frozenset[str]:
+    """Return the programs whose variables clients of servers write."""
+    written = (tag.variable for server in system.serving.serve for tag in server.tags if tag.variable)
+    return frozenset(variable.partition(".")[0] for variable in written)
 
 
 def program_warnings(system: System) -> tuple[str, ...]:
@@ -134,7 +144,7 @@ def image_layout(system: System) -> ImageLayout:
     errors = ErrorCollector()
     bound = bound_programs(system, errors)
     errors.raise_all()
-    plant = plant_tags(system)
+    plant = plant_tags(system) | {tag.name: tag for tag in map(writes_tag, _written_programs(system))}
     watched = [
         f"{d.name}.{t.name}"
         for d in system.devices.values()
@@ -172,6 +182,8 @@ def bound_programs(system: System, errors: ErrorCollector) -> list[BoundProgram]
     for program in bound:
         for variable, binding in program.inputs.items():
             source = binding.tag.partition(".")[0]
+            if variable == WRITES:
+                continue
             if source in published and source not in system.devices and binding.tag not in published[source]:
                 error = system.file.error(
                     ("plc", "programs", program.name, "inputs", variable, "tag"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from fieldtwin.twin.site.base_forms import Address, SiteModel, TagName
 
@@ -33,12 +33,16 @@ class ServedTagForm(SiteModel):
 
 
 class ModbusServeForm(SiteModel):
-    """The process image as Modbus TCP registers, for HMIs and other controllers."""
+    """Tags, located variables of programs, or both, as Modbus TCP registers for HMIs and other controllers."""
 
     kind: Literal["modbus"] = "modbus"
     url: str = Field(examples=["tcp://127.0.0.1:1502"])
     unit: int = Field(default=1, ge=0, le=255)
-    tags: dict[TagName, ServedTagForm] = Field(min_length=1)
+    tags: dict[TagName, ServedTagForm] = Field(default={})
+    addresses: Literal["openplc"] | None = Field(
+        default=None, description="serve the located variables of the programs at the registers that OpenPLC gives them"
+    )
+    write: bool = Field(default=False, description="with addresses: clients may write %Q and %M variables")
     if_bad: Literal["exception", "nan"] = "exception"
     networks: list[str] = Field(
         default=["0.0.0.0/0", "::/0"], alias="from", description="the addresses that may connect"
@@ -51,6 +55,14 @@ class ModbusServeForm(SiteModel):
     idle_s: int = Field(
         default=0, ge=0, le=86_400, description="silent clients are disconnected after this time; 0: never"
     )
+
+    @model_validator(mode="after")
+    def _has_registers(self) -> ModbusServeForm:
+        if not self.tags and self.addresses is None:
+            raise ValueError("a server needs `tags` or `addresses`")
+        if self.write and self.addresses is None:
+            raise ValueError("`write` is for `addresses`; a tag has a `write` of its own")
+        return self
 
 
 class OpcuaSecurityForm(SiteModel):

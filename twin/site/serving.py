@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from fieldtwin.gateway.connections.sockets.tls_listen import check_files
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -23,7 +24,7 @@ from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, network
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
 from fieldtwin.twin.site.references import no_device
-from fieldtwin.twin.site.schema import AllowForm, BridgeForm
+from fieldtwin.twin.site.schema import AllowForm, BridgeForm, PlcForm
 from fieldtwin.twin.site.serve_forms import (
     HttpServeForm,
     ModbusServeForm,
@@ -40,6 +41,8 @@ TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000
 WORDS = {"read": READ_FUNCTIONS, "write": WRITE_FUNCTIONS}
 
+OPENPLC_SIZES: Mapping[ServedTable, int] = {"coil": 800, "discrete": 800, "input": 1024, "holding": 8192}
+"""The numbers of registers and bits that OpenPLC serves."""
 ListeningServer = OpcuaServeConfig | HttpServeConfig
 """A server that runs in a separate process and listens at an address of this computer."""
 SeparateServer = ListeningServer | MqttServeConfig
@@ -101,11 +104,15 @@ def resolve_serving(
     bridge: Mapping[str, BridgeForm],
     buses: Mapping[str, BusConfig],
     devices: Mapping[str, DeviceConfig],
-    plc_outputs: Iterable[str],
+    plc: PlcForm,
+    folder: Path,
     errors: ErrorCollector,
 ) -> Serving:
-    """Resolve and check both sections. Errors are added to `errors`; the result contains the entries without error."""
-    outputs = set(plc_outputs)
+    """Resolve and check both sections. Errors are added to `errors`; the result contains the entries without error.
+
+    The sources of the programs of `plc` are searched in `folder`.
+    """
+    outputs = {tag for program in plc.programs.values() for tag in program.outputs.values()}
     servers: list[ServeConfig] = []
     opcua: list[OpcuaServeConfig] = []
     http: list[HttpServeConfig] = []
@@ -119,7 +126,8 @@ def resolve_serving(
             elif isinstance(form, MqttServeForm):
                 mqtt.append(resolve_mqtt(file, name, form))
             else:
-                servers.append(_server(file, name, form, devices, outputs, errors))
+                tags = _located(file, name, form, plc, folder)
+                servers.append(_server(file, name, form, devices, outputs, tags, errors))
     bridges: list[BridgeConfig] = []
     for name, bridge_form in bridge.items():
         with errors.collect():
@@ -154,10 +162,11 @@ def _server(
     form: ModbusServeForm,
     devices: Mapping[str, DeviceConfig],
     outputs: set[str],
+    tags: list[ServedTag],
     errors: ErrorCollector,
 ) -> ServeConfig:
+    """Return a server of kind `modbus`. `tags` are its located variables, to which the tags of the file are added."""
     loc: tuple[Key, ...] = ("serve", name)
-    tags: list[ServedTag] = []
     for tag, tag_form in form.tags.items():
         with errors.collect():
             tags.append(_served(file, (*loc, "tags", tag), tag, tag_form, devices, outputs))
@@ -173,7 +182,19 @@ def _server(
         roles=_roles(file, (*loc, "roles"), form.roles, form.url),
         write_roles=_roles(file, (*loc, "write_roles"), form.write_roles, form.url),
         idle_s=form.idle_s,
+        sizes=OPENPLC_SIZES if form.addresses else {},
     )
+
+
+def _located(file: YamlFile, name: str, form: ModbusServeForm, plc: PlcForm, folder: Path) -> list[ServedTag]:
+    """Return the located variables of the programs, if the server has them."""
+    if form.addresses is None:
+        return []
+    from fieldtwin.twin.site.programs.located_variables import (
+        served_by_address,  # load the compiler only if it is needed
+    )
+
+    return served_by_address(file, ("serve", name, "addresses"), plc, folder, write=form.write)
 
 
 def _served(

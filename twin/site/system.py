@@ -27,7 +27,6 @@ from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.exported_tags import ExportedTag, resolve_exported_tags
 from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
-from fieldtwin.twin.site.programs.configured_tasks import with_configured_tasks
 from fieldtwin.twin.site.read_back_warnings import never_read_back, read_only_once
 from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
@@ -103,7 +102,7 @@ def _resolve(
         with errors.collect():
             devices[name] = _device(file, name, device, buses, path, profiles, known, errors)
     buses = connect_pauses(buses, form, devices)
-    plc = with_configured_tasks(file, form.plc, path.parent, errors)
+    plc = _with_configured_tasks(file, form.plc, path.parent, errors)
     _check_addresses(file, buses, devices, errors)
     system = System(
         name=form.system,
@@ -119,13 +118,25 @@ def _resolve(
         warnings=never_read_back(file, devices)
         + read_only_once(file, devices)
         + waits_for_its_command(file, form.plc, devices),
-        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc), errors),
+        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, plc, path.parent, errors),
         alarms=form.alarms,
         exported_tags=resolve_exported_tags(file, form.metrics, devices, errors),
     )
     _check_programs(system, errors)
     _check_write_groups(system, errors)
     return system
+
+
+def _with_configured_tasks(file: YamlFile, plc: PlcForm, folder: Path, errors: ErrorCollector) -> PlcForm:
+    """Return `plc` with the tasks in the sources of its programs, if it needs them."""
+    texts = any(form.source.partition(":")[0].strip() != "python" for form in plc.programs.values())
+    if not texts or plc.model_fields_set & {"tasks", "cycle_ms"}:
+        return plc
+    from fieldtwin.twin.site.programs.configured_tasks import (
+        with_configured_tasks,  # load the compiler only if it is needed
+    )
+
+    return with_configured_tasks(file, plc, folder, errors)
 
 
 def _outputs(plc: PlcForm) -> list[str]:

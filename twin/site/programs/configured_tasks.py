@@ -30,13 +30,11 @@ MAX_INTERVAL_MS = 3_600_000
 
 
 def with_configured_tasks(file: YamlFile, plc: PlcForm, folder: Path, errors: ErrorCollector) -> PlcForm:
-    """Return `plc` with the tasks that its programs have in their sources, if the system file states none.
+    """Return `plc`, which states neither `tasks` nor `cycle_ms`, with the tasks that its programs have in their sources.
 
     A source with an error has no tasks here; its errors are found when the programs are compiled. Errors of tasks are added to
     `errors`.
     """
-    if plc.model_fields_set & {"tasks", "cycle_ms"}:
-        return plc
     found = {name: task for name, form in plc.programs.items() if (task := _task_of(form, folder)) is not None}
     if not found:
         return plc

@@ -83,6 +83,11 @@ _MEANINGS = {
         "use. Its value depends on which task ran last.",
         "Let one task write the variable; give each task its own one, and combine them in one place.",
     ),
+    "ST109": (
+        "Two addresses of different sizes, such as %QX0.0 and %QW0, are separate variables in fieldtwin and in OpenPLC. In "
+        "CODESYS and TwinCAT they share bits, so the program would behave differently there.",
+        "Use addresses that do not overlap, or bits of one variable: `word.3`.",
+    ),
 }
 
 ST_WARNINGS = tuple(

@@ -37,6 +37,7 @@ FINDINGS = {
     "ST106": "division without a test for 0",
     "ST107": "statement that is never executed",
     "ST108": "global variable that programs of several tasks write",
+    "ST109": "addresses that overlap in other systems",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

@@ -18,7 +18,7 @@ from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
-from fieldtwin.plc.st.compiler.configurations.located import shared_addresses, without_addresses
+from fieldtwin.plc.st.compiler.configurations.located import overlaps, shared_addresses, without_addresses
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.execution_control import with_execution_control
 from fieldtwin.plc.st.compiler.pous.blocks import Blocks
@@ -191,6 +191,10 @@ class _Unit:
                             "bind an input to a tag in the system file",
                         )
                         self.env.collected(self.env.error(variable.pos, message, expected=expected, hint=hint))
+        if self.env.dialect.vendor:
+            for pos, address, other in overlaps(unit, in_bytes=self.env.dialect.name == "twincat"):
+                message = f"{address} and {other} share bits in {self.env.dialect.name}, which is not supported"
+                self.env.collected(self.env.error(pos, message, expected="bits of one variable, such as word.3"))
         for blocks in (unit.globals, *(pou.blocks for pou in unit.pous)):
             for variable, first in shared_addresses(blocks):
                 message = f"{variable.name} and {first.name} have one address"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
+from fieldtwin.plc.st.compiler.configurations.located import overlaps
 from fieldtwin.plc.st.dialects import StWarning
 from fieldtwin.plc.st.findings.calls import called_sometimes
 from fieldtwin.plc.st.syntax import tree as t
@@ -25,6 +26,9 @@ Finding = tuple[str, t.Pos, str]
 
 def findings(unit: t.SourceUnit) -> Iterator[StWarning]:
     """Yield the findings about a unit that compiles, POU by POU."""
+    for pos, address, other in overlaps(unit, in_bytes=False):
+        message = f"{address} and {other} are separate variables here and in OpenPLC, but share bits in CODESYS"
+        yield StWarning("ST109", message, pos.path, pos.line, pos.column)
     enums = {one.name.lower(): one for one in unit.types if isinstance(one, t.EnumDecl)}
     pous = {pou.name.lower(): pou for pou in unit.pous}
     for pou in (one for one in unit.pous if one.kind != "INTERFACE"):

@@ -21,6 +21,8 @@ from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
 from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.dialects import dialect_of
+from fieldtwin.plc.st.findings.find import findings
+from fieldtwin.plc.st.syntax.parse import parse_all
 
 GLOBALS = """VAR_GLOBAL
   start AT %IX0.0 : BOOL;
@@ -181,3 +183,38 @@ def test_an_input_address_may_stay_unbound_and_a_bound_one_reads_its_tag(tmp_pat
         now[0] = runner.deadline_ns
         runner.run_once()
     assert (runner.outputs.last()["p.QX0_0"], runner.outputs.last()["p.QX0_1"]) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "codesys", "twincat"),
+    [
+        # CODESYS counts in units of the size: %QW1 is the bytes 2 and 3, %MD1 the words 2 and 3. TwinCAT counts bytes.
+        ("%QX0.0", "%QW0", True, True),
+        ("%QX2.0", "%QW1", True, True),
+        ("%QX3.7", "%QW1", True, False),
+        ("%QX1.0", "%QW1", False, True),
+        ("%MW2", "%MD1", True, True),
+        ("%MW3", "%MD1", True, True),
+        ("%MW4", "%MD1", False, True),
+        ("%MB8", "%ML1", True, True),
+        ("%QX0.0", "%QX0.1", False, False),
+        ("%QW0", "%MW0", False, False),
+        ("%QW0", "%QW0", False, False),
+        ("%IX0.0", "%IW0", False, False),
+    ],
+)
+def test_addresses_that_overlap_elsewhere_are_a_finding_and_an_error_in_the_vendors_dialects(
+    one: str, other: str, codesys: bool, twincat: bool
+) -> None:
+    types = {"X": "BOOL", "B": "BYTE", "W": "WORD", "D": "DWORD", "L": "LWORD"}
+    first, second = types[one[2]], types[other[2]]
+    text = f"VAR_GLOBAL a AT {one} : {first}; END_VAR PROGRAM p VAR x : {second}; END_VAR\nx := {other}; END_PROGRAM"
+    found = [warning for warning in findings(parse_all(text, "p.st")) if warning.id == "ST109"]
+    assert [(w.line, w.column) for w in found] == ([(2, 6)] if codesys else [])
+    compile_text(text)
+    for dialect, expected in (("codesys", codesys), ("twincat", twincat)):
+        if not expected:
+            compile_text(text, dialect=dialect_of(dialect))
+            continue
+        with pytest.raises(FileInvalid, match=f"2:6: {other} and {one} share bits in {dialect}"):
+            compile_text(text, dialect=dialect_of(dialect))

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of, bits_of, short_name
 from fieldtwin.plc.st.syntax.walk import nodes
 
 KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
@@ -90,6 +90,33 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
         if place not in found.setdefault(address, []):
             found[address].append(place)
     return found
+
+
+def overlaps(unit: t.SourceUnit, *, in_bytes: bool) -> Iterator[tuple[t.Pos, str, str]]:
+    """Yield each address at %Q or %M that shares bits with an earlier one of a different size in systems where the sizes overlap.
+
+    The items are the place, the address, and the earlier address (`fieldtwin.plc.st.syntax.addresses.bits_of`).
+    """
+    places = [
+        (address_of(v.location), v.pos) for v in _located((*unit.globals, *(b for p in unit.pous for b in p.blocks)))
+    ]
+    refs = (node for node in nodes((unit.pous, _connections(unit))) if isinstance(node, t.Ref))
+    direct = sorted(
+        ((ref.name, ref.pos) for ref in refs if ref.name.startswith("%")),
+        key=lambda one: (one[1].path, one[1].line, one[1].column),
+    )
+    first: dict[tuple[str, int], str] = {}
+    seen: set[str] = {""}
+    for address, pos in (*places, *direct):
+        if address in seen or area_of(address) == "I":
+            continue
+        seen.add(address)
+        bits = [(area_of(address), bit) for bit in bits_of(address, in_bytes=in_bytes)]
+        other = next((first[bit] for bit in bits if bit in first), "")
+        if other:
+            yield pos, address, other
+        for bit in bits:
+            first.setdefault(bit, address)
 
 
 def _connections(unit: t.SourceUnit, program: str = "") -> tuple[t.Argument, ...]:

@@ -15,7 +15,8 @@ def parse_xml(
 
     With a `namespace_separator`, names begin with their namespace and this separator. Raises `FileInvalid`.
     """
-    parser = expat.ParserCreate(namespace_separator=namespace_separator)
+    # the text is decoded already, so the encoding that it declares, which may be unknown, does not count
+    parser = expat.ParserCreate("utf-8", namespace_separator)
     parser.buffer_text = False
 
     def doctype(*_: object) -> None:

@@ -241,6 +241,11 @@ def test_a_damaged_file_is_refused(text: str, message: str) -> None:
         assert not to_st(text).strip()
 
 
+def test_the_encoding_that_a_decoded_text_declares_does_not_count() -> None:
+    for name in ("utf-99", "ISO-8859-1", "UTF-16"):
+        assert to_st(MAIN.replace('encoding="utf-8"', f'encoding="{name}"')) == to_st(MAIN)
+
+
 @given(st.sampled_from([MAIN, MOTOR]), st.integers(0, len(MOTOR)), st.integers(0, 40), st.text(max_size=8))
 def test_a_file_with_random_damage_is_read_or_refused(whole: str, at: int, removed: int, inserted: str) -> None:
     text = whole[:at] + inserted + whole[at + removed :]

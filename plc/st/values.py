@@ -217,8 +217,9 @@ def with_members(made: Any, **members: Any) -> Any:
 # -- bits ---------------------------------------------------------------------------------------------------------------
 
 
-def set_bit(x: int, bit: int, on: bool) -> int:
-    return x | 1 << bit if on else x & ~(1 << bit)
+def set_part(x: int, first: int, bits: int, part: int) -> int:
+    """Return `x` with `part` in place of its `bits` bits from bit `first` on."""
+    return x & ~((1 << bits) - 1 << first) | part << first
 
 
 def shift_left(x: int, n: int, bits: int) -> int:

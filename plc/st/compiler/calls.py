@@ -14,7 +14,7 @@ from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
 from fieldtwin.plc.st.compiler.pointers import references
 from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Value, by_reference, default_value, wrapped
-from fieldtwin.plc.st.compiler.variables import bit, place, variable
+from fieldtwin.plc.st.compiler.variables import bit, part_of, place, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 _OF_ADDRESSES = frozenset({"BITADR", "INDEXOF", "__NEW", "__DELETE"})
@@ -161,8 +161,10 @@ class Calls(Expressions):
             return
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
             whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
-            bit(self, whole, ref.selectors[-1])
-            code = f"_v.set_bit({whole.code}, {ref.selectors[-1].number}, {self.coerced(value, ty.BOOL, pos)})"
+            part = ref.selectors[-1]
+            bit(self, whole, part)
+            given = self.coerced(value, part_of(part), pos)
+            code = f"_v.set_part({whole.code}, {part.number * part.size}, {part.size}, {given})"
             kind = ty.plain(whole.type)
             assert isinstance(kind, ty.Elementary)
             code = wrapped(code, kind)

@@ -20,7 +20,7 @@ from fieldtwin.plc.st.compiler.scope import (
     Symbol,
     Value,
 )
-from fieldtwin.plc.st.compiler.variables import lookup, variable
+from fieldtwin.plc.st.compiler.variables import lookup, part_of, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 80
@@ -160,7 +160,7 @@ class Expressions:
             if isinstance(selector, t.Deref):
                 kind = self.env.target(kind, selector.pos) if isinstance(kind, ty.Pointer) else None
             elif isinstance(selector, t.Bit):
-                kind = ty.BOOL
+                kind = part_of(selector)
             elif isinstance(selector, t.Index):
                 if isinstance(kind, ty.Pointer):
                     kind = self.env.target(kind, selector.pos)

@@ -8,6 +8,8 @@ from fieldtwin.plc.st.compiler.implicit import as_number
 from fieldtwin.plc.st.compiler.scope import Compiling, Symbol, Value
 from fieldtwin.plc.st.syntax import tree as t
 
+_BITS = ("BYTE", "WORD", "DWORD", "LWORD")
+
 
 def lookup(x: Compiling, ref: t.Ref) -> tuple[Symbol | None, tuple[t.Selector, ...]]:
     """Return the variable to which `ref` refers, and the selectors after its name, which may be qualified by a global list."""
@@ -179,10 +181,25 @@ def _moved(x: Compiling, value: Value, kind: ty.Pointer, selector: t.Index) -> V
 
 
 def bit(x: Compiling, value: Value, selector: t.Bit) -> Value:
-    """Compile a bit of an integer or of a bit string, such as ``word.3``."""
-    kind = ty.plain(value.type)
-    if not (isinstance(kind, ty.Elementary) and kind.kind in ("int", "bits")):
-        x.env.fail(selector.pos, "a bit of a value without bits", expected="an integer or a bit string", got=str(kind))
-    if selector.number >= kind.bits:
-        x.env.fail(selector.pos, f"{kind} has bits 0 to {kind.bits - 1}", got=str(selector.number))
-    return Value(f"bool({value.code} >> {selector.number} & 1)", ty.BOOL)
+    """Compile a bit of an integer or of a bit string, such as ``word.3``, or a part of a bit string, such as ``word.%B1``."""
+    kind = part_of(selector)
+    held = ty.plain(value.type)
+    if kind != ty.BOOL and not (isinstance(held, ty.Elementary) and held.kind == "bits"):
+        x.env.fail(
+            selector.pos, f"a {kind} of a value that is not a bit string", expected="a bit string", got=str(held)
+        )
+    if not (isinstance(held, ty.Elementary) and held.kind in ("int", "bits")):
+        x.env.fail(selector.pos, "a bit of a value without bits", expected="an integer or a bit string", got=str(held))
+    count = held.bits // selector.size if held.bits > selector.size else 0
+    if selector.number >= count:
+        parts = (
+            f"bits 0 to {held.bits - 1}" if kind == ty.BOOL else f"{kind}s 0 to {count - 1}" if count else f"no {kind}s"
+        )
+        x.env.fail(selector.pos, f"{held} has {parts}", got=str(selector.number))
+    shifted = f"{value.code} >> {selector.number * selector.size}"
+    return Value(f"bool({shifted} & 1)" if kind == ty.BOOL else f"({shifted} & {kind.high})", kind)
+
+
+def part_of(selector: t.Bit) -> ty.Elementary:
+    """Return the type of a part of a bit string."""
+    return {1: ty.BOOL, **{ty.ELEMENTARY[name].bits: ty.ELEMENTARY[name] for name in _BITS}}[selector.size]

@@ -314,8 +314,11 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Bit:
+    """A part of a bit string: the bit `number`, or with a `size` of 8, 16, 32 or 64 bits the BYTE, WORD, DWORD or LWORD `number`."""
+
     pos: Pos
     number: int
+    size: int = 1
 
 
 @dataclass(frozen=True, slots=True)

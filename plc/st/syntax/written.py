@@ -16,6 +16,7 @@ _LEVELS = (
 )
 """The binary operators, loosest first (IEC 61131-3:2013, table 71)."""
 _LEVEL = {op: level for level, ops in enumerate(_LEVELS) for op in ops}
+_LETTERS = {8: "B", 16: "W", 32: "D", 64: "L"}
 _UNARY = len(_LEVELS)
 
 
@@ -59,7 +60,7 @@ def _selector(selector: t.Selector) -> str:
     if isinstance(selector, t.Member):
         return f".{selector.name}"
     if isinstance(selector, t.Bit):
-        return f".{selector.number}"
+        return f".{selector.number}" if selector.size == 1 else f".%{_LETTERS[selector.size]}{selector.number}"
     return f"[{', '.join(map(text_of, selector.indices))}]"
 
 

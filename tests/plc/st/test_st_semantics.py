@@ -256,3 +256,52 @@ def test_values_at_the_edges(kind: str, expression: str, expected: object) -> No
 def test_a_missing_value_stops_the_task(expression: str, told: str) -> None:
     with pytest.raises(LogicError, match=told):
         value("INT", expression, "i : INT := 5; r : REAL := 1e30; r0 : REAL;")
+
+
+# -- partial access (IEC 61131-3:2013, 6.5.4.4 and table 17) ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("expression", "kind", "expected"),
+    [
+        ("l.%X60", "BOOL", True),
+        ("l.%B0", "BYTE", 0x88),
+        ("l.%B7", "BYTE", 0x11),
+        ("l.%W1", "WORD", 0x5566),
+        ("l.%D1", "DWORD", 0x11223344),
+        ("l.%b6", "BYTE", 0x22),
+        ("d.%B3", "BYTE", 0xAA),
+        ("w[1].%B1", "BYTE", 0x12),
+        ("l.%X3", "BOOL", True),
+    ],
+)
+def test_a_part_of_a_bit_string_is_counted_from_its_least_significant_end(
+    expression: str, kind: str, expected: int
+) -> None:
+    variables = "l : LWORD := 16#1122334455667788; d : DWORD := 16#AABBCCDD; w : ARRAY[0..1] OF WORD := [0, 16#1234];"
+    assert value(kind, expression, variables) == expected
+
+
+def test_an_assignment_to_a_part_keeps_the_rest() -> None:
+    found = run(
+        "l, m : LWORD := 16#1122334455667788; w : ARRAY[0..1] OF WORD := [0, 16#1234]; b : BYTE := 16#FF;",
+        "l.%B0 := 16#AB; l.%W3 := 0; l.%X16 := TRUE; m.%D1 := l.%D0; w[1].%B1 := b; b.%X7 := FALSE;",
+    )
+    assert (found["l"], found["m"]) == (0x00003344556777AB, 0x556777AB55667788)
+    assert (found["w"], found["b"]) == ([0, 0xFF34], 0x7F)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("b := w.%B2;", "WORD has BYTEs 0 to 1"),
+        ("b := b.%B0;", "BYTE has no BYTEs"),
+        ("x := w.%X16;", "WORD has bits 0 to 15"),
+        ("b := i.%B0;", "a bit string"),
+        ("w.%B0 := w;", "BYTE"),
+        ("b := w.%Q0;", "not Structured Text"),
+    ],
+)
+def test_a_part_that_does_not_exist_is_an_error(body: str, message: str) -> None:
+    with pytest.raises(FileInvalid, match=message):
+        run("w : WORD; b : BYTE; x : BOOL; i : INT;", body)

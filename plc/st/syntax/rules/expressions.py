@@ -11,6 +11,8 @@ from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of
 from fieldtwin.plc.st.syntax.rules.base import Bad, Rules, integer
 
+_SIZES = {"X": 1, "B": 8, "W": 16, "D": 32, "L": 64}
+
 
 @v_args(meta=True)
 class ExpressionRules(Rules):
@@ -50,7 +52,10 @@ class ExpressionRules(Rules):
         return t.Member(self._pos(meta), str(items[0]))
 
     def bit(self, meta: Meta, items: list[Any]) -> t.Bit:
-        return t.Bit(self._pos(meta), integer(items[0]))
+        (token,) = items
+        if token.type == "PARTIAL":
+            return t.Bit(self._pos(meta), int(token[2:]), _SIZES[token[1].upper()])
+        return t.Bit(self._pos(meta), integer(token))
 
     def index(self, meta: Meta, items: list[Any]) -> t.Index:
         return t.Index(self._pos(meta), tuple(items))

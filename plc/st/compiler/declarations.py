@@ -33,6 +33,7 @@ class Declarations:
         self._unit = unit
         self._types: dict[str, t.TypeDecl] = {}
         self._blocks = {p.name.lower(): p for p in unit.pous if p.kind in ("FUNCTION_BLOCK", "CLASS", "INTERFACE")}
+        self._enumerated: dict[t.Pos, dict[str, Symbol]] = {}
         self._open: list[str] = []
         self._pointed: list[t.NamedType] = []
         """Structures and blocks to which references refer, and which have to be resolved when no other type is open."""
@@ -63,9 +64,27 @@ class Declarations:
                         found = self.constant(v, f"v_{v.name.lower()}")
                         if found is not None:
                             self.scope[v.name.lower()] = found
+                self._enumerated[pou.pos] = self._values_of(pou)
+                self.scope.update(self._enumerated[pou.pos])
             yield
         finally:
             self.scope = before
+
+    def _values_of(self, pou: t.Pou) -> dict[str, Symbol]:
+        """Return the values of the enumerations without a name in the declarations of a POU; they are known in this POU only."""
+        found: dict[str, Symbol] = {}
+        for v in (v for block in pou.blocks for v in block.variables if isinstance(v.type, t.EnumType)):
+            enum = self.type_of(v.type)
+            for name, number in enum.values.items() if isinstance(enum, ty.Enum) else ():
+                value = Symbol(name, enum, repr(number), writable=False, constant=number)
+                if found.setdefault(name.lower(), value) != value:
+                    other, hint = found[name.lower()].type, "declare the enumerations in TYPE and write TYPE#VALUE"
+                    self.env.fail(v.pos, f"{name} is a value of {other} and of {enum}", hint=hint)
+        return found
+
+    def enumerated(self, pou: t.Pou) -> dict[str, Symbol]:
+        """Return the values of the enumerations without a name in the declarations of a POU, by their names in lower case."""
+        return self._enumerated.get(pou.pos, {})
 
     def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
         """Return a CONSTANT with its value; None if the value is not elementary, or too long to be written at each use."""
@@ -112,6 +131,9 @@ class Declarations:
             return self._array(spec)
         if isinstance(spec, t.PointerType):
             return self._pointer(spec)
+        if isinstance(spec, t.EnumType):
+            name = f"({', '.join(name for name, _ in spec.values)})"
+            return self._enum(t.EnumDecl(spec.pos, name, spec.values, None, spec.base))
         if isinstance(spec, t.SubrangeType):
             return self._subrange(spec)
         if isinstance(spec, t.StringType):
@@ -223,7 +245,10 @@ class Declarations:
             for field in declared.fields:
                 if field.name.lower() in fields:
                     self.env.fail(field.pos, f"{field.name} is declared twice")
-                fields[field.name.lower()] = (field.name, self.type_of(field.type))
+                kind = self.type_of(field.type)
+                if isinstance(field.type, t.EnumType) and isinstance(kind, ty.Enum):
+                    self.register(kind)
+                fields[field.name.lower()] = (field.name, kind)
             total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
             refers = any(ty.holds_interface(kind) for _, kind in fields.values())
             struct = ty.Struct(declared.name, fields, total, nested + 1, refers)
@@ -237,6 +262,18 @@ class Declarations:
         return kind
 
     def _declare_enum(self, declared: t.EnumDecl) -> None:
+        enum = self._enum(declared)
+        self.env.types[declared.name.lower()] = enum
+        self.register(enum)
+
+    def register(self, enum: ty.Enum) -> None:
+        """Make the values of an enumeration known in the whole unit."""
+        for name, value in enum.values.items():
+            found = self.env.enum_values.setdefault(name.lower(), [])
+            if (enum, value) not in found:
+                found.append((enum, value))
+
+    def _enum(self, declared: t.EnumDecl) -> ty.Enum:
         values: dict[str, int] = {}
         number = 0
         for name, stated in declared.values:
@@ -254,9 +291,7 @@ class Declarations:
             if declared.initial.name.lower() not in lower:
                 self.env.unknown(declared.pos, f"in {declared.name}, a value", declared.initial.name, list(values))
             enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()], base)
-        self.env.types[declared.name.lower()] = enum
-        for name, value in values.items():
-            self.env.enum_values.setdefault(name.lower(), []).append((enum, value))
+        return enum
 
     def _check_base(self, declared: t.EnumDecl, values: dict[str, int]) -> None:
         """Check that each value of an enumeration fits the type that is stated for them, an elementary type."""

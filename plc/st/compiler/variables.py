@@ -97,6 +97,9 @@ def _enum_value(x: Compiling, ref: t.Ref) -> Value:
             known = [s.name for s in x.env.lists[ref.name.lower()].values()]
             x.env.unknown(first.pos, f"in {ref.name}, a variable", first.name, known)
     found = x.env.enum_values.get(ref.name.lower(), [])
+    wanted = x.wanted
+    if isinstance(wanted, ty.Enum) and not ref.selectors:
+        found = [(wanted, n) for name, n in wanted.values.items() if name.lower() == ref.name.lower()] or found
     if not found or ref.selectors:
         known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
         x.env.unknown(ref.pos, "a variable", ref.name, known)

@@ -68,7 +68,16 @@ class PointerType:
     of: TypeSpec
 
 
-TypeSpec = NamedType | SubrangeType | StringType | MessagesType | ArrayType | PointerType
+@dataclass(frozen=True, slots=True)
+class EnumType:
+    """An enumeration without a name, in the declaration of a variable; as in `EnumDecl`."""
+
+    pos: Pos
+    values: tuple[tuple[str, int | None], ...]
+    base: NamedType | None = None
+
+
+TypeSpec = EnumType | NamedType | SubrangeType | StringType | MessagesType | ArrayType | PointerType
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +323,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Bit:
-    """A part of a bit string: the bit `number`, or with a `size` of 8, 16, 32 or 64 bits the BYTE, WORD, DWORD or LWORD `number`."""
+    """The part `number` of a bit string: a bit, or with a `size` of 8, 16, 32 or 64 bits a BYTE, WORD, DWORD or LWORD."""
 
     pos: Pos
     number: int

@@ -77,6 +77,8 @@ class Variables:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     symbol = self._global_symbol(v, block)
                     self._globals[key] = symbol
+                    if isinstance(v.type, t.EnumType) and isinstance(symbol.type, ty.Enum):
+                        self.declarations.register(symbol.type)
                     self.env.declare_global(symbol, block.list, only_qualified=block.only_qualified)
         if self._globals:
             first = self.unit.globals[0].pos
@@ -133,6 +135,10 @@ class Variables:
                     symbols[v.name.lower()] = symbol
                     if v.location:
                         symbols.setdefault(address_of(v.location).lower(), symbol)
+        for key, value in self.declarations.enumerated(pou).items():
+            if key in symbols:
+                self.env.fail(pou.pos, f"{value.name} is declared twice: as a variable and as a value of {value.type}")
+            symbols[key] = value
         own = (
             symbols[v.name.lower()].type
             for b in pou.blocks

@@ -61,6 +61,11 @@ class DeclarationRules(Rules):
         values = tuple(i for i in rest if isinstance(i, tuple) and i[0] != "initial")
         return t.EnumDecl(self._pos(name), str(name), values, initial_of(rest), bases[0] if bases else None)
 
+    def enum_type(self, meta: Meta, items: list[Any]) -> t.EnumType:
+        values = tuple(i for i in items if isinstance(i, tuple))
+        bases = [t.NamedType(self._pos(i), str(i)) for i in items if isinstance(i, Token)]
+        return t.EnumType(self._pos(meta), values, bases[0] if bases else None)
+
     def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
         return str(items[0]), items[1] if len(items) > 1 else None
 

@@ -35,7 +35,8 @@ def test_two_pous_may_use_one_name_for_different_values() -> None:
 
 
 def test_a_value_is_known_to_callers_where_a_parameter_demands_it() -> None:
-    before = """FUNCTION_BLOCK fb VAR_INPUT s : (idle, run); END_VAR VAR_OUTPUT on : BOOL; END_VAR on := s = run; END_FUNCTION_BLOCK"""
+    before = """FUNCTION_BLOCK fb VAR_INPUT s : (idle, run); END_VAR VAR_OUTPUT on : BOOL; END_VAR
+    on := s = run; END_FUNCTION_BLOCK"""
     found = run("f : fb; n : BOOL;", "f(s := run, on => n); f.s := idle;", before)
     assert (found["n"], found["f"].v_s) == (True, 0)
 

@@ -31,10 +31,10 @@ _READABLE = {
     "DURATION": "a duration", "DATE": "a date", "TIME_OF_DAY": "a time of day", "DATE_AND_TIME": "a date",
     "STRING_LITERAL": "a string", "WSTRING_LITERAL": "a string", "ENUM_REF": "a name", "VAR_KIND": "VAR", "SEMICOLON": ";",
     "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
-    "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address", "PARTIAL": "%X0",
+    "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
-    "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
+    "PARTIAL": "%X0", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
 }  # fmt: skip
 
 

@@ -35,11 +35,12 @@ class CycleCall:
     time than a task that sleeps until each run.
     """
 
-    __slots__ = ("args", "callback", "context", "cycle", "ended", "loop")
+    __slots__ = ("args", "callback", "context", "cycle", "ended", "loop", "period_ns")
 
     def __init__(self, loop: CycleLoop, cycle: Cycle, ended: asyncio.Future[None]) -> None:
         self.loop = loop
         self.cycle = cycle
+        self.period_ns = cycle.period_ns
         self.ended = ended
         self.callback: Callable[..., object] = self.run
         self.args: tuple[()] = ()
@@ -78,7 +79,7 @@ def skip_runs(timers: Timers, sequence: int) -> int:
     order in which the runs would have set them. Return the last number.
     """
     left: Timers = []
-    while timers and type(timers[0][2]) is CycleCall and (not left or _run_in_turn(left[0], timers[0])):
+    while timers and type(timers[0][2]) is CycleCall and (not left or _runs_in_turn(left[0], timers[0])):
         timer = heappop(timers)
         if not timer[2].ended.done():
             left.append(timer)
@@ -89,39 +90,48 @@ def skip_runs(timers: Timers, sequence: int) -> int:
             if not timer[2].cycle.repeats_until(until_ns):
                 break
             repeated.append(timer)
-        counts = _skip_to_last(repeated, until_ns) if len(repeated) == len(left) else [1] * len(repeated)
+        all_repeat = len(repeated) == len(left)
         left = left[len(repeated) :]
-        for (when_ns, order, call), count in zip(repeated, counts, strict=True):
+        for when_ns, order, call, count in _last_runs(repeated, until_ns) if all_repeat else _next_runs(repeated):
             if when_ns < until_ns:
                 call.cycle.skip(count, when_ns)
                 sequence += 1
-                when_ns, order = call.cycle.deadline_ns, sequence
-            heappush(timers, (when_ns, order, call))
+                heappush(timers, (call.cycle.deadline_ns, sequence, call))
+            else:
+                heappush(timers, (when_ns, order, call))
     for timer in left:
         heappush(timers, timer)
     return sequence
 
 
-def _run_in_turn(one: tuple[int, int, CycleCall], other: tuple[int, int, CycleCall]) -> bool:
+def _runs_in_turn(one: tuple[int, int, CycleCall], other: tuple[int, int, CycleCall]) -> bool:
     """Return whether two cycles have one period and the second runs within a period of the first one.
 
     A later run could be at the same instant as one of the first cycle, which then has a later sequence number than it has now.
     """
-    period_ns = one[2].cycle.period_ns
-    return period_ns == other[2].cycle.period_ns and other[0] - one[0] < period_ns
+    period_ns = one[2].period_ns
+    return period_ns == other[2].period_ns and other[0] - one[0] < period_ns
 
 
-def _skip_to_last(timers: Timers, until_ns: int) -> list[int]:
-    """Skip the runs of cycles before their last ones before `until_ns`, and replace `timers` by those of the last ones, in order.
-    Return how many runs of each are still to be skipped.
+def _next_runs(timers: Timers) -> list[tuple[int, int, CycleCall, int]]:
+    """Return the next run of each cycle: its timer, and 1."""
+    return [(*timer, 1) for timer in timers]
+
+
+def _last_runs(timers: Timers, until_ns: int) -> list[tuple[int, int, CycleCall, int]]:
+    """Skip the runs before the last ones before `until_ns`. Return the last ones in order: their timers, and the number of runs
+    of the cycle that are still to be skipped.
 
     The last run of a cycle is skipped after the earlier ones of the others, because it reads what they published. Nothing reads
     what the earlier runs of the first cycle publish, so they are skipped together with its last run.
     """
-    period_ns = timers[0][2].cycle.period_ns
-    earlier = {order: max(0, (until_ns - when_ns - 1) // period_ns) for when_ns, order, _ in timers}
-    timers[:] = sorted((when_ns + earlier[order] * period_ns, order, call) for when_ns, order, call in timers)
-    for when_ns, order, call in timers[1:]:
-        if earlier[order]:
-            call.cycle.skip(earlier[order], when_ns - period_ns)
-    return [earlier[timers[0][1]] + 1, *[1] * (len(timers) - 1)]
+    last = []
+    for when_ns, order, call in timers:
+        earlier = max(0, (until_ns - when_ns - 1) // call.period_ns)
+        last.append((when_ns + earlier * call.period_ns, order, call, earlier + 1))
+    last.sort()
+    for place, (when_ns, order, call, count) in enumerate(last):
+        if place and count > 1:
+            call.cycle.skip(count - 1, when_ns - call.period_ns)
+            last[place] = when_ns, order, call, 1
+    return last

@@ -296,7 +296,8 @@ class Gateway:
         for pump in self.pumps:
             if not pump.is_idle or pump.undelivered != before.get(pump.driver.outbox_tag):
                 return False
-        return all(self.log.pending(tag) == before.get(tag) for tag in self.config.log_tags)
+        tags = self.config.log_tags
+        return not tags or all(self.log.pending(tag) == before.get(tag) for tag in tags)
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count ticks that do not take place, see `Cycle`."""

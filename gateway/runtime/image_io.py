@@ -57,7 +57,8 @@ class ImageExchange:
         self._taken = [
             (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)
         ]
-        self._columns = _Columns(inputs.tags, tags, {at for at, _ in self._taken})
+        self._renewed = [at for at, _ in self._taken]
+        self._columns = _Columns(inputs.tags, tags, self._renewed)
         self.new_messages: Mapping[str, tuple[Message, ...]] = {}
         self.plc_counter = 0
         self.plc_stopped = False
@@ -108,10 +109,7 @@ class ImageExchange:
     def skip(self, count: int, last_ns: int) -> None:
         """Count exchanges that would have repeated the last one, and publish the last of them, which was at `last_ns`."""
         self._seen = self._hear()
-        times_ns = self._columns.times_ns
-        for at, _ in self._taken:
-            times_ns[at] = last_ns
-        self._writer.skip(count, last_ns, times_ns)
+        self._writer.skip(count, last_ns, self._renewed)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
         """Return whether values, qualities and reasons are the same as at the last call.

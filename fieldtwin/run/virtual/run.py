@@ -33,8 +33,6 @@ from fieldtwin.scenarios.bench import Bench
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 from fieldtwin.twin.prototype.group import SystemGroup, load_group, one_system
 
-TRACE_KEPT = 20_000
-"""How many of the latest events stay in memory. The hash and a trace file cover all events."""
 PIECE_S = 10.0
 """Virtual seconds between two progress reports, and between two checks."""
 MAX_ERRORS = 100
@@ -112,7 +110,7 @@ class VirtualRun:
         self.checks = {name: SystemCheck(m.system, placed.get(name, ())) for name, m in self.group.members.items()}
         self.elapsed_s = 0.0
         self.errors: list[str] = []
-        self.trace = Trace(TRACE_KEPT)
+        self.trace = Trace(0)  # nothing reads its events; the hash, the listeners and a trace file get all of them
         self._shared: dict[str, Any] = {}
         self._about: TraceAbout | None = None
         """The description of the trace, if there is one."""
@@ -142,7 +140,7 @@ class VirtualRun:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
             file = self.options.trace
-            self.trace = Trace(TRACE_KEPT, open_sink(file, self.options.most_trace_bytes) if file else None)
+            self.trace = Trace(0, open_sink(file, self.options.most_trace_bytes) if file else None)
             stack.callback(self.trace.close)
             if watch is not None:
                 watch(self.trace)

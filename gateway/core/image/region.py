@@ -60,6 +60,7 @@ class Heartbeat:
         """The counter of the publication in the memory."""
         self.t_ns = 0
         self.stamps = b""
+        """The packed times of the tags of the latest publication."""
 
 
 class _Region:
@@ -262,12 +263,17 @@ class RegionWriter(_Region):
         """Return whether a publication of the same values stays outside of the memory, so that `skip` can count it."""
         return self._heartbeat is not None and self._packed and not self._flags
 
-    def skip(self, count: int, last_ns: int, times_ns: Sequence[int] | None = None) -> None:
-        """Count `count` publications that repeat the values of the last one. The last of them was made at `last_ns`, with the
-        times `times_ns`; None: all of them are `last_ns`. `repeats` must be true.
+    def skip(self, count: int, last_ns: int, renewed: Sequence[int] | None = None) -> None:
+        """Count `count` publications that repeat the values of the last one. The last of them was made at `last_ns`, which is
+        also the time of the tags with the indexes `renewed`; None: of all tags. `repeats` must be true.
         """
         self.counter += count - 1
-        stamps = self._same_stamps(last_ns) if times_ns is None else self._stamps(times_ns)
+        stamps = self._same_stamps(last_ns)
+        if renewed is not None:
+            mixed = bytearray(self._heartbeat.stamps if self._heartbeat is not None else b"")
+            for index in renewed:
+                mixed[8 * index : 8 * index + 8] = stamps[:8]
+            stamps = bytes(mixed)
         self._repeat(stamps, last_ns, _UNFLAGGED)
 
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
@@ -275,6 +281,7 @@ class RegionWriter(_Region):
         self._store(self.counter + 1, stamps, now_ns, flags)
         if self._heartbeat is not None:
             self._heartbeat.counter = self._heartbeat.in_memory = self.counter
+            self._heartbeat.stamps = stamps
         return self.counter
 
     def _store(self, counter: int, stamps: bytes, now_ns: int, flags: int) -> None:

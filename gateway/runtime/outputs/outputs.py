@@ -227,10 +227,14 @@ class OutputWriter:
     @property
     def is_idle(self) -> bool:
         """Return whether `tick` does nothing, whatever the time is, until a command, a device or a value changes."""
-        return all(output.wanted is None or output.pending or self._rests(output) for output in self.outputs)
+        return all(map(self._rests, self.outputs))  # as a generator, it takes twice the time
 
     def _rests(self, output: Output) -> bool:
-        """Return whether the device holds the wanted value, and nothing that it reported since then has to be compared."""
+        """Return whether nothing is to be written, or the device holds the wanted value and nothing that it reported since then
+        has to be compared.
+        """
+        if output.wanted is None or output.pending:
+            return True
         if output.untouched or output.held != output.wanted:
             return False
         current = self._tags.held(output.tag)

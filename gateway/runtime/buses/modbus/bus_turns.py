@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import GroupReading, RegisterDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
@@ -102,11 +103,11 @@ class Turns:
         """Devices that answered a poll since this time are polled before the others; repetitions come last."""
 
     def next(
-        self, spaced_ns: Callable[[int], int], now_ns: int, seen_ns: int = 0, bus_timeout_s: float = 1.0
+        self, spaced_ns: Callable[[int], int], now_ns: int, latency: Histogram, bus_timeout_s: float = 1.0
     ) -> tuple[DeviceState | None, str, int]:
         """Return the next poll and its time: the most overdue poll that may start now, else the poll that may start first.
 
-        `spaced_ns` returns the end of a unit's pause; `seen_ns` is the longest recent latency. A device that is away has only its
+        `spaced_ns` returns the end of a unit's pause; `latency` holds the recent latencies. A device that is away has only its
         next probe (group ""), for which its `timeout_ns` is set. A group that is partly read is completed before another group of
         its device begins.
         """
@@ -134,7 +135,7 @@ class Turns:
                     best, found = key, (device, group)
         if away:
             free_ns = self._free_until_ns(best[0] if best is not None else None, now_ns)
-            probe = self._next_probe(away, now_ns, free_ns, seen_ns, bus_timeout_s)
+            probe = self._next_probe(away, now_ns, free_ns, latency.recent_longest_ns, bus_timeout_s)
             if best is None or probe[0] < (best[0], best[2]):
                 return probe[1], "", probe[0][0]
         return *found, best[0] if best is not None else now_ns + NS_PER_S

@@ -311,8 +311,7 @@ class ModbusBus:
                 if job is not None:
                     await self._run_job(job)
                     continue
-            seen_ns, timeout_s = self.latency.recent_longest_ns, self.config.timeout_s
-            device, group, at_ns = self._turns.next(client.units.spaced_ns, now_ns, seen_ns, timeout_s)
+            device, group, at_ns = self._turns.next(client.units.spaced_ns, now_ns, self.latency, self.config.timeout_s)
             due = at_ns <= now_ns
             if (
                 self.guests.size

@@ -246,6 +246,29 @@ def test_descriptions_survive_json_and_impossible_ones_are_refused() -> None:
         TagSpec("x", TagKind.INT, limits=(2, 1))
 
 
+@pytest.mark.parametrize("renewed", [[], [1], [0, 1], None])
+@pytest.mark.parametrize("repeated", [False, True])
+def test_skipped_publications_count_and_renew_only_the_named_times(renewed: list[int] | None, repeated: bool) -> None:
+    layout = ImageLayout((RegionLayout("r", (TagSpec("x", TagKind.REAL), TagSpec("y", TagKind.INT))),))
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    image = layout.attach(memory, private=True)
+    writer, reader = image.writer("r"), image.reader("r")
+    columns = [1.5, 2], bytes([Quality.GOOD] * 2), bytes([Reason.NONE] * 2)
+    writer.publish_mixed(*columns, [10, 20], 100)
+    before = reader.snapshot()
+    if repeated:  # the last publication is not in the memory
+        writer.publish_mixed(*columns, [11, 21], 101, same=True)
+    writer.skip(3, 400, renewed)
+    after = reader.snapshot()
+    assert (after.counter, after.t_ns) == (before.counter + repeated + 3, 400)
+    assert (after.values, after.qualities, after.reasons) == (before.values, before.qualities, before.reasons)
+    old = [11, 21] if repeated else [10, 20]
+    assert [after.time_ns(at) for at in (0, 1)] == [
+        400 if renewed is None or at in renewed else old[at] for at in (0, 1)
+    ]
+
+
 def test_flags_and_columns() -> None:
     image, _ = one_region(TagSpec("x", TagKind.REAL), TagSpec("y", TagKind.INT), message_tag("m", 4, 1))
     writer, reader = image.writer("r"), image.reader("r")

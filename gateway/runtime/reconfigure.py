@@ -52,6 +52,7 @@ class _Taking:
         gateway.let_trigger(driver)
         for tag, stale_ms in stale_limits(driver).items():
             gateway.tags.restate(tag, stale_ms)
+        gateway.alarms.look_again()
         if driver.profile != self._before[name]:
             self._understand(driver, self._before[name])
         gateway.outputs.restated(driver, self._sent[name])

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.conditions.expression import Expression
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.gateway.core.values import NEVER, Quality, Reason, TagValue
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.gateway.runtime.alarms.state_machine import (
     ACKNOWLEDGEABLE,
     NEVER_DUE_NS,
@@ -70,12 +70,19 @@ class AlarmList:
         self.last_event = 0
         """The number of the newest event; numbers begin with 1."""
         self.on_event: Callable[[AlarmEvent], None] | None = None
-        self._names = frozenset(name for config in configs for name in config.condition.names)
+        self._stored = dict.fromkeys((name for config in configs for name in config.condition.names), _content(NEVER))
+        """Value, quality and reason that were stored last of each tag in a condition."""
         if configs:
             tags.subscribe(self._put)
 
     def _put(self, name: str, value: TagValue) -> None:
-        self._dirty |= name in self._names
+        if name in self._stored and self._stored[name] != (now := _content(value)):
+            self._stored[name] = now
+            self._dirty = True
+
+    def look_again(self) -> None:
+        """Evaluate the conditions in the next cycle, because the age limits of tags have changed."""
+        self._dirty = True
 
     def __bool__(self) -> bool:
         return bool(self._alarms)
@@ -103,7 +110,7 @@ class AlarmList:
         A stale value can become good again without a notice, if the same sample is read again. It is then checked in each cycle.
         """
         earliest_ns = NEVER_DUE_NS
-        for name in self._names:
+        for name in self._stored:
             if name in self._tags and self._tags.held(name).quality is not _BAD:
                 earliest_ns = min(earliest_ns, self._tags.fresh_until_ns(name) + 1)
         return earliest_ns
@@ -281,6 +288,10 @@ class _Values:
         self.worst = max(self.worst, seen.quality)
         value = seen.value.hex() if isinstance(seen.value, bytes) else seen.value
         return self._words.get(name, _NO_WORDS).get(value, value) if isinstance(value, int) else value
+
+
+def _content(value: TagValue) -> tuple[Scalar | None, Quality, Reason]:
+    return value.value, value.quality, value.reason
 
 
 def _text(reason: Reason) -> str:

@@ -128,6 +128,7 @@ def test_each_change_is_reloadable_or_needs_a_restart(plant: Path, old: str, new
         ("tank", 'level:  {at: "holding:0"', 'level:  {at: "holding:3"', "7:12", "test/tank: tags.level.at"),
         ("tank", "scale: 0.1, unit", "unit", "7:3", "test/tank: tags.level.scale"),  # a whole number from now on
         ("tank", "  volume:", '  depth: {at: "holding:9"}\n  volume:', "9:3", "test/tank: tags.depth"),
+        ("plant", "remote: remote", "alarms: {a: {condition: tank.level > 1}}", "13:10", "alarms.a"),
         ("tank", "unit: m", "unit: cm", "7:41", "test/tank: tags.level.unit"),
     ],
 )

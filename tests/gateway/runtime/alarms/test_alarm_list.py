@@ -115,6 +115,16 @@ def test_the_same_sample_read_again_makes_a_stale_alarm_good(made: Made) -> None
     assert bench.now == ("active_unacknowledged", "good", "none")
 
 
+def test_a_shorter_age_limit_after_a_reload_counts_at_once(made: Made) -> None:
+    bench = made("tank.level > 5", stale_after_ms=600_000)
+    bench.put("tank.level", 9)
+    bench.tags.restate("tank.level", 1000)
+    bench.alarms.look_again()
+    bench.after(0)
+    bench.after(1.001)
+    assert bench.now == ("active_unacknowledged", "bad", "stale")
+
+
 def test_a_bad_value_on_which_the_result_does_not_depend_leaves_it_good(made: Made) -> None:
     bench = made("tank.level > 5 or tank.backup > 5")
     bench.put("tank.backup", 9)

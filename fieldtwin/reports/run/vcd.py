@@ -100,6 +100,9 @@ def _changes(events: Iterable[TraceEvent], system: System | None, machines: dict
             case TraceKind.ALARM:
                 scope, _, name = event.where.rpartition(".")
                 yield VcdChange(t_ns, scope, name, data.get("value"))
+                yield VcdChange(
+                    t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), quality=True
+                )
             case TraceKind.FAULT:
                 yield VcdChange(t_ns, "faults", f"{event.where}_{data.get('name', '')}", bool(data.get("on")))
             case TraceKind.STEP:

@@ -12,6 +12,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.studio.live.tag_history import Point
+from fieldtwin.studio.replay.alarms import alarms_at
 from fieldtwin.studio.replay.marks import faults_at, state_changes, step_at
 from fieldtwin.studio.replay.replay import Replay
 
@@ -32,6 +33,7 @@ def state_at(replay: Replay, t_ns: int) -> dict[str, Any]:
             "tags": tags,
             "devices": {name: _device(replay, name, tags) for name in replay.system.devices},
             "buses": {name: _bus(replay, name, t_ns) for name in replay.system.buses},
+            "alarms": alarms_at(replay.log.alarms, replay.system.alarms, t_ns),
         },
         "plc": _plc(replay, t_ns, tags),
         "transitions": {name: latest[-1]["t_ns"] for name, latest in changes.items() if latest},

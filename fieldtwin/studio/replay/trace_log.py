@@ -7,6 +7,7 @@ reading ends at an invalid line with an error that gives its number.
 from __future__ import annotations
 
 import os
+from bisect import insort
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.results.model import Verdict
 from fieldtwin.results.trace import TraceKind, decode_event
 from fieldtwin.studio.live.tag_history import Point
+from fieldtwin.studio.replay.alarms import AlarmChange, change_of
 from fieldtwin.studio.replay.series import Kind, Kinds, Series, encoded
 
 AT_ONCE_BYTES = 256 * 1024
@@ -28,7 +30,7 @@ MOST_VALUES = 10_000_000
 """Largest number of events of tags and variables: 180 MB."""
 MOST_NAMES = 20_000
 MOST_EVENTS = 50_000
-"""Largest number of fault events, and of step events of scenarios."""
+"""Largest number of fault events, of step events of scenarios, and of changes of alarms."""
 LATE_NS = 60 * NS_PER_S
 """An event may be older than the latest one by at most this much (ns), because events of several processes are not exactly in
 order."""
@@ -82,6 +84,9 @@ class TraceLog:
         self.states: dict[str, Series] = {}
         self.faults: list[FaultEvent] = []
         self.steps: list[StepEvent] = []
+        self.alarms: dict[str, list[AlarmChange]] = {}
+        """The changes of each alarm in order of time, by its name in expressions."""
+        self._alarm_events = 0
         self.last_ns = 0
         """The time of the latest event; the first one is at 0."""
         self.events = 0
@@ -185,11 +190,15 @@ class TraceLog:
         match kind:
             case TraceKind.TAG:
                 self._value(self.tags, where, t_ns, data, at)
-            case TraceKind.STATE | TraceKind.ALARM:
+            case TraceKind.STATE:
                 self._value(self.states, where, t_ns, data, at)
             case TraceKind.FAULT:
                 self._room(len(self.faults), MOST_EVENTS, "faults")
                 self.faults.append(FaultEvent(t_ns, where, bool(data.get("on")), data))
+            case TraceKind.ALARM:
+                self._room(self._alarm_events, MOST_EVENTS, "alarms")
+                self._alarm_events += 1
+                insort(self.alarms.setdefault(where, []), change_of(t_ns, data), key=lambda change: change.t_ns)
             case TraceKind.STEP:
                 self._room(len(self.steps), MOST_EVENTS, "steps")
                 self.steps.append(StepEvent(t_ns, where, str(data.get("text", "")), str(data.get("verdict", ""))))

@@ -26,7 +26,7 @@ const VIEWS = {
   bus: { title: "Bus", view: Bus, fill: true },
   plc: { title: "PLC", view: Plc },
   trends: { title: "Trends", view: Trends },
-  alarms: { title: "Alarms", view: Alarms, live: true, shown: (store) => store.about?.system.alarms.length > 0 },
+  alarms: { title: "Alarms", view: Alarms, shown: (store) => store.about?.system.alarms.length > 0 },
   faults: { title: "Faults", view: Faults, prototype: true },
   scenario: { title: "Scenario", view: Scenario, live: true },
   twin: { title: "Twin", view: Twin, live: true },

@@ -3,9 +3,9 @@
 
     benchmarks/st_program.py [--pairs 7] [--quick]
 
-The program has 100 stations with a timer, a CASE over a state, a counter, a filter of REAL and an alarm. The C program is made by
-the same generator: a structure for each block and plain statements, as a compiler such as matiec's writes them; matiec itself is in
-no package. cc compiles it with -O2. Both run the same scans, and the benchmark fails if their results differ. The time is CPU time
+The program has 100 stations with a timer, a CASE over a state, a counter, a filter of REAL and an alarm. The same generator makes
+the C program: a structure for each block and plain statements, as a compiler such as matiec writes them; no package has matiec
+itself. cc compiles it with -O2. Both run the same scans, and the benchmark fails if their results differ. The time is the CPU time
 of the process, without its start.
 """
 

@@ -5,7 +5,7 @@
 
 The program has 100 stations with a timer, a CASE over a state, a counter, a filter of REAL and an alarm. The same generator makes
 the C program: a structure for each block and plain statements, as a compiler such as matiec writes them; no package has matiec
-itself. cc compiles it with -O2. Both run the same scans, and the benchmark fails if their results differ. The time is the CPU time
+itself. cc compiles it with -O2. Both run the same scans; if their results differ, the benchmark fails. The time is the CPU time
 of the process, without its start.
 """
 

@@ -213,7 +213,7 @@ class _Columns:
 
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether `refresh` finds nothing new before `until_ns`."""
-        return not self._tags.has_changes and until_ns <= self._earliest_ns
+        return not self._tags.news and until_ns <= self._earliest_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
         """Set the number at position `at`, which the exchange itself provides. Its quality is good."""

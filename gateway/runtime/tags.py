@@ -57,7 +57,8 @@ class TagTable:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._held: dict[str, Held] = {}
-        self._news: dict[str, Held] = {}
+        self.news: dict[str, Held] = {}
+        """The tags that were stored since the last `take_changes`."""
         self._journal: deque[tuple[str, TagValue]] = deque(maxlen=JOURNAL)
         self._subscriptions: dict[object, OnPut] = {}
         self._subscribers: tuple[OnPut, ...] = ()
@@ -89,7 +90,7 @@ class TagTable:
         A value that is not refreshed for `stale_after_ms` becomes bad; None is for values that do not age (an identity).
         """
         for name in names:
-            held = self._news[name] = self._of(name)
+            held = self.news[name] = self._of(name)
             held.limit_ns = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
 
     def restate(self, name: str, stale_after_ms: int | None) -> None:
@@ -109,7 +110,7 @@ class TagTable:
     def amend(self, name: str, value: TagValue) -> None:
         """Replace a tag's value by a new interpretation of the same bytes. Its age stays; the change is reported like
         any other."""
-        held = self._news[name] = self._of(name)
+        held = self.news[name] = self._of(name)
         before, held.value = held.value, value
         if self._subscribers and value != before:
             for on_put in self._subscribers:
@@ -131,7 +132,7 @@ class TagTable:
         before = held.value
         held.value = value
         held.refreshed_ns = self._clock.monotonic_ns()
-        self._news[name] = held
+        self.news[name] = held
         if value.quality is not _GOOD:
             if value.quality is not before.quality:
                 for on_put in self._subscribers:
@@ -149,7 +150,7 @@ class TagTable:
             before = held.value
             if before.quality is not _BAD or before.reason is not reason:
                 held.value = replace(before, quality=_BAD, reason=reason)
-                self._news[name] = held
+                self.news[name] = held
                 for on_put in self._subscribers:
                     on_put(name, held.value)
 
@@ -176,16 +177,11 @@ class TagTable:
         held = self._held.get(name)
         return FOREVER_NS if held is None else held.fresh_until_ns
 
-    @property
-    def has_changes(self) -> bool:
-        """Return whether `take_changes` would return any tag."""
-        return bool(self._news)
-
     def take_changes(self) -> Collection[Held]:
         """Return the tags that were stored since the last call. Only one reader, which mirrors the table, may call this."""
-        if not self._news:
+        if not self.news:
             return ()
-        news, self._news = self._news, {}
+        news, self.news = self.news, {}
         return news.values()
 
     @property

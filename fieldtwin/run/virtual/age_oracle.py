@@ -68,20 +68,26 @@ class AgeOracle:
 
     def check(self, emulated: frozenset[str]) -> None:
         """Compare the values published since the last call with the devices' histories. Skip devices that are not `emulated`."""
-        judged: dict[str, bool] = {}
+        histories: dict[str, _Held | None] = {}
+        """The history of each tag that is checked; None for a tag of a device that is not emulated."""
+
+        def history(tag: str) -> _Held | None:
+            known = histories[tag] = self._held.setdefault(tag, _Held()) if tag.partition(".")[0] in emulated else None
+            return known
+
         for now_ns, tag, raw, value, source_ns in self._waiting:
-            if tag not in judged:
-                judged[tag] = tag.partition(".")[0] in emulated
-            if not judged[tag]:
+            held = histories[tag] if tag in histories else history(tag)
+            if held is None:
                 continue
             self.checked += 1
-            if not self._was_held(tag, raw, source_ns, now_ns):
+            if not held.was(raw, source_ns, now_ns):
                 age_s = (now_ns - source_ns) / NS_PER_S
                 self._refuse(
                     f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device never had this value"
                 )
         for now_ns, tag, raw, value, source_ns in self._still_good:
-            if tag.partition(".")[0] in emulated and not self._was_held(tag, raw, source_ns, now_ns):
+            held = histories[tag] if tag in histories else history(tag)
+            if held is not None and not held.was(raw, source_ns, now_ns):
                 limit_s = (now_ns - source_ns) / NS_PER_S
                 self._refuse(
                     f"{tag} was still good as {value!r} ({raw.hex()}): the device had no such value in the last {limit_s:.3f} s"
@@ -92,10 +98,6 @@ class AgeOracle:
             for held in self._held.values():
                 held.forget(oldest_ns)
         self._waiting.clear()
-
-    def _was_held(self, tag: str, raw: bytes, from_ns: int, to_ns: int) -> bool:
-        held = self._held.get(tag)
-        return held is not None and held.was(raw, from_ns, to_ns)
 
     def _refuse(self, text: str) -> None:
         self.wrong_count += 1

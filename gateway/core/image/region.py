@@ -375,7 +375,7 @@ class RegionReader(_Region):
         self.missed = {ring.spec.name: 0 for ring in shape.rings}
         self._seen = {ring.spec.name: 0 for ring in shape.rings}
         count = shape.count
-        self._latest = Snapshot(
+        self.latest = Snapshot(
             shape,
             0,
             0,
@@ -386,6 +386,7 @@ class RegionReader(_Region):
             bytes(shape.times.size),
             _NO_MESSAGES,
         )
+        """The result of the last `snapshot`; its counter is 0 before the first."""
         self._columns = b""
         """The packed columns of the latest snapshot."""
 
@@ -399,14 +400,9 @@ class RegionReader(_Region):
         return self._seen[tag]
 
     @property
-    def latest(self) -> Snapshot:
-        """Return the result of the last `snapshot` without reading again; its counter is 0 before the first."""
-        return self._latest
-
-    @property
     def repeats(self) -> bool:
         """Return whether the last snapshot has all values that were published since; only counter and times may be newer."""
-        return self._heartbeat is not None and bool(self._columns) and self._latest.counter >= self._heartbeat.in_memory
+        return self._heartbeat is not None and bool(self._columns) and self.latest.counter >= self._heartbeat.in_memory
 
     def snapshot(self) -> Snapshot:
         """Return the latest complete publication. Never waits: after at most `MAX_LOOKS` attempts, it returns the last
@@ -420,11 +416,11 @@ class RegionReader(_Region):
     def _from_memory(self) -> Snapshot:
         for _ in range(MAX_LOOKS):
             counter = self._words[0]
-            if counter == self._latest.counter:
+            if counter == self.latest.counter:
                 return self._again()
             body = self._slot(counter)
             if body is not None:
-                self._latest = snapshot = self._decode(body)
+                self.latest = snapshot = self._decode(body)
                 return snapshot
             self.retries += 1
         self.gave_up += 1
@@ -432,27 +428,27 @@ class RegionReader(_Region):
 
     def _beaten(self, beat: Heartbeat) -> Snapshot:
         """Return the publication of `beat`: the one in the memory with a new counter and new times."""
-        s = self._latest
+        s = self.latest
         if s.counter == beat.counter:
             return self._again()
         messages = _NO_MESSAGES
         if s.counter < beat.in_memory or not self._columns:
             s = self._from_memory()
             messages = s.messages
-        self._latest = Snapshot(
+        self.latest = Snapshot(
             s.shape, beat.counter, beat.t_ns, s.flags, s.values, s.qualities, s.reasons, beat.stamps, messages
         )
-        return self._latest
+        return self.latest
 
     def _again(self) -> Snapshot:
         """Return the last snapshot without its messages, which were returned before."""
-        s = self._latest
+        s = self.latest
         if s.messages:
-            s = self._latest = replace(s, messages=_NO_MESSAGES)
+            s = self.latest = replace(s, messages=_NO_MESSAGES)
         return s
 
     def _decode(self, body: bytes) -> Snapshot:
-        shape, latest = self.shape, self._latest
+        shape, latest = self.shape, self.latest
         counter, t_ns, flags = shape.head.unpack_from(body)
         named = RegionFlag(flags) if flags else _UNFLAGGED
         columns, stamps = body[shape.columns_at :], body[shape.times_at : shape.columns_at]

@@ -37,7 +37,7 @@ from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
-from fieldtwin.plc.st.runtime.references import REFERENCES
+from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
 
 WRITES = "st_writes"
 """The message input through which servers write variables: a JSON object with values by name (`StProgram.put`)."""
@@ -73,6 +73,7 @@ class StProgram(Program):
             elif v.role != "input" and _tag_kind(v.kind) is not None:
                 shown = self.st_shared if v.shared else self.st_outputs
                 shown.append((v.name, v.attribute, _to_tag(v.kind)))
+        self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
         self.st_show()
 
     def execute(self, scan: ScanInfo) -> None:
@@ -164,26 +165,28 @@ class StProgram(Program):
     # -- retained variables -----------------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
-        """Return every VAR RETAIN by name, as data for JSON, including those that are not tags."""
-        kept = (v for v in self.st_declared.variables if v.retain)
-        return {v.name: _dump(getattr(self.st_holder(v), v.attribute)) for v in kept}
+        """Return every VAR RETAIN by name, as data for JSON, including those that are not tags. Of other variables, return the
+        parts that are RETAIN in their function blocks.
+        """
+        return {v.name: self.st_kept(v) for v in self.st_retained}
+
+    def st_kept(self, v: ProgramVariable) -> Any:
+        """Return what is retained of a variable, as data for JSON; None for nothing."""
+        value = getattr(self.st_holder(v), v.attribute)
+        return dump(value) if v.retain else retained_part(value)
 
     def retain_layout(self) -> Any:
-        return [[v.name, _described(v.kind)] for v in self.st_declared.variables if v.retain]
+        return [[v.name, described(v.kind) if v.retain else "parts"] for v in self.st_retained]
 
     def retain_bytes(self) -> int:
-        return sum(
-            10 + len(v.name) + _most(v.kind, _dump(getattr(self.st_holder(v), v.attribute)))
-            for v in self.st_declared.variables
-            if v.retain
-        )
+        return sum(10 + len(v.name) + most_bytes(v.kind, self.st_kept(v)) for v in self.st_retained)
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Restore what `retained` returned: variables that are in `kept` take its values."""
-        for v in self.st_declared.variables:
-            if v.retain and v.name in kept:
+        for v in self.st_retained:
+            if v.name in kept:
                 holder = self.st_holder(v)
-                setattr(holder, v.attribute, _load(getattr(holder, v.attribute), kept[v.name]))
+                setattr(holder, v.attribute, load(getattr(holder, v.attribute), kept[v.name]))
         self.st_show()
 
 
@@ -337,75 +340,7 @@ def _from_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
     return values.real if kind == ty.REAL else None
 
 
-def _described(kind: ty.Type) -> Any:
-    """Return a description of a type by the names and elementary types of its values, as data for JSON."""
-    if isinstance(kind, ty.Array):
-        return [kind.ranges, _described(kind.of)]
-    if isinstance(kind, ty.Struct):
-        return [[name, _described(of)] for name, (_, of) in kind.fields.items()]
-    if isinstance(kind, ty.Block):
-        members = {**kind.inputs, **kind.outputs}
-        return [kind.name.lower(), [[name, _described(of)] for name, (_, of) in members.items()]]
-    if isinstance(kind, ty.Enum):
-        return [kind.name.lower(), sorted(kind.values.items())]
-    return str(kind)
-
-
-def _most(kind: ty.Type, now: Any) -> int:
-    """Return the largest size in bytes that a value can have as MessagePack. `now` is the present data of the value."""
-    if isinstance(kind, ty.String):
-        return 5 + 3 * kind.length
-    if isinstance(now, list):
-        of = kind.of if isinstance(kind, ty.Array) else kind
-        return 5 + len(now) * max((_most(of, item) for item in now[:1]), default=0)
-    if isinstance(now, dict):
-        fields = kind.fields if isinstance(kind, ty.Struct) else {}
-        inside = sum(5 + len(n) + _most(fields[n[2:]][1] if n[2:] in fields else ty.LINT, v) for n, v in now.items())
-        return 5 + inside + (256 * kind.elements if isinstance(kind, ty.Block) else 0)
-    return 9
-
-
 def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
     kind = ty.plain(kind)
     unsigned = isinstance(kind, ty.Elementary) and kind.bits == 64 and kind.low == 0 and kind.high > 0
     return (lambda x: values.signed(x, 64)) if unsigned else None
-
-
-def _dump(value: Any) -> Any:
-    """Return the plain data of a value: objects by their slots (`_own`), references as None."""
-    if isinstance(value, REFERENCES):
-        return None
-    if isinstance(value, list):
-        return [_dump(v) for v in value]
-    slots = getattr(value, "__slots__", None)
-    if slots is None or isinstance(value, str | int | float):
-        return value
-    return {name: _dump(getattr(value, name)) for name in _own(value)}
-
-
-def _own(value: Any) -> list[str]:
-    """Return the slots to be saved.
-
-    A timer's times, which have no meaning after a restart, and references of VAR_IN_OUTs are not saved."""
-    others = getattr(value, "in_outs", ())
-    return [name for name in value.__slots__ if name not in others and not (name[0] == "_" and name.endswith("_ns"))]
-
-
-def _load(into: Any, kept: Any) -> Any:
-    """Return `kept` in the form of `into`; raises `FileInvalid` if the forms differ. References stay as they are."""
-    if isinstance(into, REFERENCES):
-        return into
-    if isinstance(into, list) and isinstance(kept, list) and len(into) == len(kept):
-        return [_load(a, b) for a, b in zip(into, kept, strict=True)]
-    slots = getattr(into, "__slots__", None)
-    if slots is not None and isinstance(kept, dict):
-        for name in _own(into):
-            if name in kept:
-                setattr(into, name, _load(getattr(into, name), kept[name]))
-        return into
-    # an attribute of a block that had no value at first
-    if into is None and isinstance(kept, bool | int | float | str | None):
-        return kept
-    if type(into) is type(kept) or (isinstance(into, float) and isinstance(kept, int)):
-        return float(kept) if isinstance(into, float) else kept
-    raise FileInvalid("a retained value of another form", expected=type(into).__name__, got=type(kept).__name__)

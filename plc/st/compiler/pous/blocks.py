@@ -109,6 +109,8 @@ class Blocks(Bodies):
             self.out.line(f"__slots__ = {(*kept, *number)}")
             self.out.line(f"in_outs = {(*in_outs, *number)}")
             self.out.line(f"name = {pou.name!r}")
+            self.out.line(f"retain = {self._marked(pou, symbols, 'RETAIN', 'PERSISTENT')}")
+            self.out.line(f"non_retain = {self._marked(pou, symbols, 'NON_RETAIN')}")
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(
                     pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou))
@@ -124,6 +126,20 @@ class Blocks(Bodies):
                     self.variables.initialise(pou, symbols, ("VAR_TEMP",))
                     self.body_of(pou, symbols, pou.name.lower()).body(pou.body)
             self.write_actions(pou, symbols)
+
+    def _marked(self, pou: t.Pou, symbols: dict[str, Symbol], *words: str) -> tuple[str, ...]:
+        """Return the attributes of the variables in blocks with one of these qualifiers."""
+        found = []
+        for block in pou.blocks:
+            for v in block.variables if block.qualifiers & set(words) and "CONSTANT" not in block.qualifiers else ():
+                symbol = symbols.get(v.name.lower())
+                if symbol is None or not symbol.code.startswith("self."):
+                    continue
+                if "RETAIN" in words and (isinstance(symbol.type, ty.Pointer) or ty.holds_interface(symbol.type)):
+                    hint = "a restart creates new instances, so assign the reference again"
+                    self.env.collected(self.env.error(v.pos, f"{v.name}, a {symbol.type}, cannot be RETAIN", hint=hint))
+                found.append(symbol.code.removeprefix("self."))
+        return tuple(found)
 
     def _kept_temporaries(self, pou: t.Pou) -> tuple[str, ...]:
         """Return VAR_TEMP if the POU has actions: one may be called before the POU, so the variables have to exist."""

@@ -122,7 +122,7 @@ class Variables:
         symbols: dict[str, Symbol] = {}
         addressed = _addressed(pou)
         for block in pou.blocks:
-            if pou.kind != "PROGRAM":
+            if pou.kind not in ("PROGRAM", "FUNCTION_BLOCK", "CLASS") or block.kind == "VAR_TEMP":
                 self._no_retain(block, f"a variable of a {pou.kind}")
             for v in block.variables:
                 with self.env.declaring(v.name, self.env.faulty_here):
@@ -204,7 +204,7 @@ class Variables:
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
-            hint = "a PROGRAM's VAR RETAIN can, also a block in it, and global variables with addresses"
+            hint = "VAR RETAIN of a PROGRAM, FUNCTION_BLOCK or CLASS can, and global variables with addresses"
             self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
 
 

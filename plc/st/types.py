@@ -134,6 +134,17 @@ class Array:
 
 
 @dataclass(frozen=True, slots=True)
+class OpenArray:
+    """An array of variable length, a parameter whose limits are those of the argument (IEC 61131-3:2013, 6.5.3)."""
+
+    dimensions: int
+    of: Type
+
+    def __str__(self) -> str:
+        return f"ARRAY[{', '.join('*' * self.dimensions)}] OF {self.of}"
+
+
+@dataclass(frozen=True, slots=True)
 class Struct:
     """A structure. `fields` maps the name of each field, in lower case, to the name as declared and the type."""
 
@@ -253,8 +264,8 @@ class MessagesOut:
 
 
 Type = (
-    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | Pointer | Null | MessagesIn | MessagesOut
-    | Nothing | Interface
+    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | OpenArray | Struct | Block | Pointer | Null | MessagesIn
+    | MessagesOut | Nothing | Interface
 )  # fmt: skip
 
 

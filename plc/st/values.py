@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.plc.st.runtime.arrays import OpenArray, bound
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.moments import (
     date_of,
@@ -54,8 +55,10 @@ __all__ = [  # and all names that compiled code calls
     "Instance",
     "LogicError",
     "MemberReference",
+    "OpenArray",
     "Whole",
     "attempted",
+    "bound",
     "characters",
     "cut",
     "date_of",

@@ -113,6 +113,8 @@ class Calls(Expressions):
         for p in signature.inputs:
             expr, mark = _value_of(given.get(p.name.lower())), len(self.out.lines)
             if expr is None:
+                if isinstance(p.type, ty.OpenArray):
+                    self.env.fail(call.pos, f"{_into(p, signature)} needs an array")
                 codes.append(p.initial)
                 continue
             code = self.given(expr, p.type, expr.pos, _into(p, signature))
@@ -146,7 +148,18 @@ class Calls(Expressions):
         """Return the Python expression of the argument for an input of type `kind`."""
         if isinstance(kind, ty.Pointer) and kind.word == references.REFERENCE:
             return references.referring(self, expr, kind, pos)
+        if isinstance(kind, ty.OpenArray):
+            return f"{self._open_array(self.value(expr), kind, pos, what)}.copied()"
         return self.coerced(self.value(expr, kind), kind, pos, what)
+
+    def _open_array(self, value: Value, kind: ty.OpenArray, pos: t.Pos, what: str) -> str:
+        """Return the Python expression of an array as the argument for a parameter of variable length."""
+        source = value.type
+        if source == kind:
+            return value.code
+        if not (isinstance(source, ty.Array) and len(source.ranges) == kind.dimensions and source.of == kind.of):
+            self.env.fail(pos, what, expected=str(kind), got=str(source))
+        return f"_v.OpenArray({value.code}, {source.ranges})"
 
     def take(self, argument: t.Argument, value: Value) -> None:
         """Compile the output argument ``name => target``: write the assignment of `value` to the target."""
@@ -173,6 +186,8 @@ class Calls(Expressions):
             self.out.line(f"{whole.code} = {code}", pos)
             return
         target = self.writable(ref)
+        if isinstance(target.type, ty.OpenArray):
+            self.env.fail(ref.pos, f"{ref.name} is an array of variable length", expected="an assignment to an element")
         code = self.coerced(value, target.type, pos, f"assigned to {ref.name}")
         if isinstance(target.type, ty.Array):  # in place, because a VAR_IN_OUT may refer to it
             self.out.line(f"_v.fill({target.code}, {code})", pos)
@@ -249,6 +264,8 @@ class Calls(Expressions):
         if not isinstance(expr, t.Ref):
             self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
         target = self.writable(expr)
+        if isinstance(kind, ty.OpenArray):
+            return self._open_array(target, kind, expr.pos, f"VAR_IN_OUT {name} of {of}")
         extends = (
             isinstance(target.type, ty.Block) and isinstance(kind, ty.Block) and kind.name.lower() in target.type.bases
         )

@@ -124,11 +124,13 @@ class Declarations:
     # -- types ----------------------------------------------------------------------------------------------------------
 
     def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
-        """Return the type of a type specification. `role` is VAR_INPUT or VAR_OUTPUT if MESSAGES is allowed here."""
+        """Return the type of a type specification. `role` is the kind of the block of a variable or parameter. On it depends
+        whether MESSAGES and ARRAY[*] are allowed.
+        """
         if isinstance(spec, t.NamedType):
             return self.named(spec.name, spec.pos)
         if isinstance(spec, t.ArrayType):
-            return self._array(spec)
+            return self._open_array(spec, role) if spec.open else self._array(spec)
         if isinstance(spec, t.PointerType):
             return self._pointer(spec)
         if isinstance(spec, t.EnumType):
@@ -142,6 +144,12 @@ class Declarations:
                 self.env.fail(spec.pos, "the length of a string", expected=f"1 to {ty.MAX_STRING}", got=str(length))
             return ty.String(length, spec.wide)
         return self._messages(spec, role)
+
+    def _open_array(self, spec: t.ArrayType, role: str) -> ty.OpenArray:
+        if role not in ("VAR_IN_OUT", "VAR_INPUT"):
+            expected = "a VAR_IN_OUT, or a VAR_INPUT of a FUNCTION or METHOD"
+            self.env.fail(spec.pos, "an array of variable length (ARRAY[*])", expected=expected)
+        return ty.OpenArray(spec.open, self.type_of(spec.of))
 
     def _array(self, spec: t.ArrayType) -> ty.Array:
         if self._deep >= ty.MAX_NESTED:
@@ -325,7 +333,9 @@ class Declarations:
         with self.within(pou):
             for block in pou.blocks:
                 for v in block.variables if block.kind in (*members, "VAR") else ():
-                    kind = self.type_of(v.type)  # also finds a block that contains itself
+                    kind = self.type_of(
+                        v.type, block.kind if block.kind == "VAR_IN_OUT" else ""
+                    )  # also finds a block that contains itself
                     if block.kind != "VAR_IN_OUT":
                         held.append(kind)
                     if block.kind in members:

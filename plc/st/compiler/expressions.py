@@ -165,7 +165,7 @@ class Expressions:
                 if isinstance(kind, ty.Pointer):
                     kind = self.env.target(kind, selector.pos)
                 else:
-                    kind = kind.of if isinstance(kind, ty.Array) else None
+                    kind = kind.of if isinstance(kind, ty.Array | ty.OpenArray) else None
             else:
                 name = selector.name.lower()
                 members = kind.fields if isinstance(kind, ty.Struct) else {}

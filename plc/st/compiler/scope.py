@@ -173,7 +173,7 @@ def default_value(kind: ty.Type) -> str:
 def by_reference(kind: ty.Type) -> bool:
     """Return whether a VAR_IN_OUT of this type is passed as the object itself; other types need an object that refers
     to them."""
-    return isinstance(kind, ty.Array | ty.Struct | ty.Block)
+    return isinstance(kind, ty.Array | ty.OpenArray | ty.Struct | ty.Block)
 
 
 @dataclass

@@ -147,6 +147,8 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
     kind = value.type
     if isinstance(kind, ty.Pointer) and kind.word == "POINTER TO":
         return _moved(x, value, kind, selector)
+    if isinstance(kind, ty.OpenArray):
+        return _open_index(x, value, kind, selector)
     if not isinstance(kind, ty.Array):
         x.env.fail(selector.pos, "an index into a value that is not an array", got=str(kind))
     if len(selector.indices) != len(kind.ranges):
@@ -162,6 +164,17 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
             at = str(index.constant - low)
         else:
             at = f"_v.index({index.code}, {low}, {high})"
+        owner, code = code, f"{code}[{at}]"
+    return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})", value.is_input)
+
+
+def _open_index(x: Compiling, value: Value, kind: ty.OpenArray, selector: t.Index) -> Value:
+    """Compile an element of an array of variable length. Its limits are known at run time only."""
+    if len(selector.indices) != kind.dimensions:
+        x.env.fail(selector.pos, "indices", expected=f"{kind.dimensions} for {kind}", got=str(len(selector.indices)))
+    code, owner, at = f"{value.code}.items", "", ""
+    for n, expr in enumerate(selector.indices):
+        at = f"_v.index({_whole_number(x, expr).code}, *{value.code}.ranges[{n}])"
         owner, code = code, f"{code}[{at}]"
     return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})", value.is_input)
 

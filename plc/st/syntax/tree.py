@@ -54,9 +54,12 @@ class MessagesType:
 
 @dataclass(frozen=True, slots=True)
 class ArrayType:
+    """An array. `ranges` are the limits of each dimension; an array of variable length, ``ARRAY[*]``, has `open` dimensions."""
+
     pos: Pos
     ranges: tuple[tuple[Expr, Expr], ...]
     of: TypeSpec
+    open: int = 0
 
 
 @dataclass(frozen=True, slots=True)

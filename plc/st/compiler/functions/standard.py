@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fieldtwin.plc.st.compiler.functions.arrays import ARRAYS
 from fieldtwin.plc.st.compiler.functions.conversions import conversion
 from fieldtwin.plc.st.compiler.functions.library import ONE, Library, Standard
 from fieldtwin.plc.st.compiler.functions.numbers import NUMBERS
@@ -20,4 +21,4 @@ class _Functions(Library):
         return found
 
 
-FUNCTIONS = _Functions(NUMBERS, TIMES, STRINGS, SCAN, REFERENCES)
+FUNCTIONS = _Functions(NUMBERS, ARRAYS, TIMES, STRINGS, SCAN, REFERENCES)

@@ -22,7 +22,7 @@ class Functions:
         for block in pou.blocks:
             for v in block.variables:
                 if block.kind in found:
-                    kind = self.declarations.type_of(v.type)
+                    kind = self.declarations.type_of(v.type, block.kind if isinstance(v.type, t.ArrayType) else "")
                     if block.kind == "VAR_IN_OUT":
                         found[block.kind].append(Parameter(v.name, kind, ""))
                         continue

@@ -163,7 +163,7 @@ class Programs(Bodies):
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
         if role != "local" and isinstance(
-            kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface
+            kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface | ty.OpenArray
         ):
             self.env.fail(
                 v.pos,

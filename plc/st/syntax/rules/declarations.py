@@ -90,13 +90,21 @@ class DeclarationRules(Rules):
         return t.MessagesType(self._pos(meta), sizes[0], sizes[1])
 
     def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
-        return t.ArrayType(self._pos(meta), tuple(items[:-1]), items[-1])
+        ranges = tuple(item for item in items[:-1] if item is not None)
+        if ranges and len(ranges) < len(items) - 1:
+            raise Bad(
+                Token("ARRAY", "*", line=meta.line, column=meta.column), "an array with limits in some dimensions only"
+            )
+        return t.ArrayType(self._pos(meta), ranges, items[-1], 0 if ranges else len(items) - 1)
 
     def pointer_type(self, meta: Meta, items: list[Any]) -> t.PointerType:
         return t.PointerType(self._pos(meta), items[0].upper(), items[1])
 
     def range(self, meta: Meta, items: list[Any]) -> tuple[t.Expr, t.Expr]:
         return items[0], items[1]
+
+    def open_range(self, meta: Meta, items: list[Any]) -> None:
+        return None
 
     def bound(self, meta: Meta, items: list[Any]) -> t.Expr:
         return items[0]  # type: ignore[no-any-return]

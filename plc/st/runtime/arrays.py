@@ -1,0 +1,31 @@
+"""Arrays of variable length at run time: the array that a caller passes, with its limits (IEC 61131-3:2013, 6.5.3)."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from fieldtwin.plc.st.runtime.logic_error import LogicError
+
+Ranges = tuple[tuple[int, int], ...]
+"""The first and the last index of each dimension."""
+
+
+class OpenArray:
+    """An argument for a parameter of type ``ARRAY[*]``: the `items` of the caller's array, and its `ranges`."""
+
+    __slots__ = ("items", "ranges")
+
+    def __init__(self, items: list[Any], ranges: Ranges) -> None:
+        self.items, self.ranges = items, ranges
+
+    def copied(self) -> OpenArray:
+        """Return an array with copies of the items, for a parameter that is an input."""
+        return OpenArray(copy.deepcopy(self.items), self.ranges)
+
+
+def bound(ranges: Ranges, dimension: int, end: int) -> int:
+    """Return the first (`end` 0) or the last index (`end` 1) of a dimension, which counts from 1. Raises `LogicError`."""
+    if not 1 <= dimension <= len(ranges):
+        raise LogicError("a dimension that the array does not have", expected=f"1 to {len(ranges)}", got=str(dimension))
+    return ranges[dimension - 1][end]

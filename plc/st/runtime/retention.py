@@ -1,4 +1,4 @@
-"""What is retained of variables, as data for JSON, and its size (IEC 61131-3:2013, 6.5.6)."""
+"""The retained data of variables, as data for JSON, and its size (IEC 61131-3:2013, 6.5.6)."""
 
 from __future__ import annotations
 

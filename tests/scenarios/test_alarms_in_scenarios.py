@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
+from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import TraceEvent, TraceKind
+from fieldtwin.run.targets.scenario_targets import ScenarioTarget, run_scenario
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.language.form import load_scenario
 from tests.tank_plant import PLANT, write_plant
 
+SYSTEMS = Path(__file__).parents[2] / "profiles" / "systems"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "alarms"
 PUMP = """PROGRAM Pump
 VAR_INPUT level : INT; END_VAR
 VAR full : BOOL; END_VAR
@@ -133,6 +138,54 @@ def test_a_delay_ends_in_time_while_nothing_else_happens(tmp_path: Path) -> None
     run.run(watch=lambda trace: trace.listen(changes.append, TraceKind.ALARM))
     known, raised = changes
     assert (raised.data["value"], raised.t_ns - known.t_ns) == ("active_unacknowledged", 7_300_000_000)
+
+
+def test_the_summary_of_a_run_names_the_alarms_that_need_attention(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_plant(tmp_path, PLANT + ALARMS)
+    (tmp_path / "pump.st").write_text(PUMP)
+    prototype = tmp_path / "plant.prototype.yaml"
+    prototype.write_text(prototype.read_text().replace("level: 42", "level: 85"))
+    run = VirtualRun(VirtualOptions(str(tmp_path / "plant.yaml"), 10.0))
+    run.run()
+    summary = run.summary()
+    assert {name: alarm["state"] for name, alarm in summary["alarms"].items()} == {
+        "high": "active_unacknowledged", "full": "normal", "lost": "normal",
+    }  # fmt: skip
+    print_summary(summary)
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    assert [text for word, *rest in lines if word == "alarm" for text in rest] == [
+        "high: active unacknowledged, good: Level is high"
+    ]
+
+
+def test_alarms_of_a_system_in_a_network_have_its_name_before_them(tmp_path: Path) -> None:
+    for path in SYSTEMS.glob("ocean_*"):
+        shutil.copy(path, tmp_path)
+    shutil.copy(SYSTEMS / "adapt.st", tmp_path)
+    east = tmp_path / "ocean_east.yaml"
+    east.write_text(east.read_text() + 'alarms:\n  on: {condition: "current.sample_period_s >= 0"}\n')
+    steps = (
+        "  - wait: {until: \"east.alarm.on == 'active_unacknowledged'\", within: 30s}\n"
+        "  - acknowledge: east.alarm.on\n"
+        "  - expect: {tag: east.alarm.on, value: active_acknowledged, within: 1s, during: 3s}\n"
+    )
+    path = tmp_path / "x.scenario.yaml"
+    path.write_text(f"scenario: alarms\nsystem: ocean_network.yaml\nsteps:\n{steps}")
+    result = run_scenario(load_scenario(path), ScenarioTarget())
+    assert result.verdict is Verdict.PASSED, result.checks[-1]
+
+
+@pytest.mark.long
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("name", ["high", "lost"])
+def test_the_example_passes_in_real_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    shutil.copytree(EXAMPLE, tmp_path / "site")
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "r"))
+    result = run_scenario(load_scenario(tmp_path / "site" / f"{name}.scenario.yaml"), ScenarioTarget("local"))
+    assert result.verdict is Verdict.PASSED, result.checks[-1]
+    assert ("active_unacknowledged", "good", "") in states(result, "level_high" if name == "high" else "level_unknown")
 
 
 def test_an_acknowledgement_that_makes_no_sense_is_an_error(tmp_path: Path) -> None:

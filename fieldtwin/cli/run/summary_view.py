@@ -8,8 +8,10 @@ import msgspec
 from rich.markup import escape
 
 from fieldtwin.cli.plc.views import acts_text, without_texts
+from fieldtwin.cli.run.alarms_view import standing
 from fieldtwin.cli.run.troubles import READ_ONLY, forces_text
 from fieldtwin.console import stdout
+from fieldtwin.gateway.runtime.gateway_status import AlarmStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.twin.prototype.field_status import StruckStatus
 
@@ -51,6 +53,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         stdout.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
     for name, learnt in summary["learnt"].items():
         stdout.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
+    for name, alarm in standing(msgspec.convert(summary.get("alarms", {}), dict[str, AlarmStatus])).items():
+        text = f"{name}: {alarm.state.replace('_', ' ')}, {alarm.quality}{f': {alarm.text}' if alarm.text else ''}"
+        stdout.print(f"  [yellow]alarm[/yellow]          {escape(text)}", soft_wrap=True, highlight=False)
     for text in without_texts(summary["plc"].get("started_without", {})):
         stdout.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
     if acts := summary["plc"].get("acts"):

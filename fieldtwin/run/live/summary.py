@@ -118,6 +118,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "refused": msgspec.to_builtins(gateway.refusals.entries) if gateway is not None else [],
         "invariants": list(run.invariants),
         "outputs_safe": run.outputs_confirmed_safe,
+        **({"alarms": seen["alarms"]} if seen.get("alarms") else {}),
         "plc": {
             k: told[k]
             for k in (

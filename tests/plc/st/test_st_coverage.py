@@ -67,6 +67,14 @@ def test_a_transition_of_an_assignment_outside_of_the_case_counts_by_its_source(
     assert "Machine.state RUN -> FAULT" in names
 
 
+def test_a_transition_may_leave_a_range_of_numbers(tmp_path: Path) -> None:
+    source = """FUNCTION_BLOCK Machine VAR_OUTPUT n : INT := 3; END_VAR
+    CASE n OF 1..5: n := 7; 7: ; END_CASE
+    END_FUNCTION_BLOCK"""
+    found = covered(tmp_path, "TEST 'x' VAR m : Machine; END_VAR m(); END_TEST", source)
+    assert found.count(Kind.TRANSITION) == (1, 1)
+
+
 def test_transitions_of_a_chart_are_counted(tmp_path: Path) -> None:
     chart = """FUNCTION_BLOCK Chart
     VAR_INPUT go : BOOL; END_VAR

@@ -201,6 +201,18 @@ def test_steps_go_over_into_and_out_of_calls(editor: Editor, project: Path) -> N
     assert editor.ends() == 0
 
 
+def test_a_step_over_a_call_executes_the_whole_line(editor: Editor, project: Path) -> None:
+    editor.begin({project / "counter.test.st": [4]})  # a call with an argument: several instructions in one line
+    editor.wait("stopped")
+    seen = []
+    for _ in range(3):
+        editor.ask("next", threadId=1)
+        editor.wait("stopped")
+        seen.append(editor.place())
+    assert seen == [("counts", 5), ("counts", 6), ("counts", 7)]
+    assert editor.ends() == 0
+
+
 def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(editor: Editor, project: Path) -> None:
     editor.ask("initialize")
     editor.ask("launch")

@@ -46,8 +46,8 @@ class Tracer:
         self.stop_on_errors = True
         self._stopped = stopped
         self._commands: SimpleQueue[Resume] = SimpleQueue()
-        self._lines: list[int] = []
-        """For each frame of the source: the line that was executed last."""
+        self._frames = 0
+        """The number of frames of the source on the stack."""
         self._step: Resume | None = None
         self._depth = 0
         """The number of frames where the present step began."""
@@ -86,24 +86,22 @@ class Tracer:
         code = frame.f_code
         if code.co_filename not in self.files or not is_body(code):
             return None
-        self._lines.append(0)
+        self._frames += 1
         return self._line
 
     def _line(self, frame: FrameType, event: str, arg: Any) -> Callable[..., Any]:
         if event == "line":
             line = frame.f_lineno
-            if line != self._lines[-1]:
-                self._lines[-1] = line
-                # the line of the declaration counts calls only
-                reason = self._reason(frame.f_code.co_filename, line) if line != frame.f_code.co_firstlineno else ""
-                if reason:
-                    self._stop(frame, reason, "")
+            # the line of the declaration counts calls only
+            reason = self._reason(frame.f_code.co_filename, line) if line != frame.f_code.co_firstlineno else ""
+            if reason:
+                self._stop(frame, reason, "")
         elif event == "exception":
             if self.stop_on_errors and arg[1] is not self._error and isinstance(arg[1], Exception):
                 self._error = arg[1]
                 self._stop(frame, "exception", str(arg[1]))
         elif event == "return":
-            self._lines.pop()
+            self._frames -= 1
         return self._line
 
     def _reason(self, file: str, line: int) -> str:
@@ -114,8 +112,11 @@ class Tracer:
             return "pause"
         if line in self.breakpoints.get(file, ()):
             return "breakpoint"
-        depth = len(self._lines)
-        steps = {Resume.STEP_IN: True, Resume.NEXT: depth <= self._depth, Resume.STEP_OUT: depth < self._depth}
+        steps = {
+            Resume.STEP_IN: True,
+            Resume.NEXT: self._frames <= self._depth,
+            Resume.STEP_OUT: self._frames < self._depth,
+        }
         return "step" if self._step is not None and steps[self._step] else ""
 
     def _stop(self, frame: FrameType, reason: str, text: str) -> None:
@@ -131,7 +132,7 @@ class Tracer:
         if self._ending:
             raise SessionEnded
         self._step = how if how is not Resume.CONTINUE else None
-        self._depth = len(self._lines)
+        self._depth = self._frames
 
 
 def is_body(code: CodeType) -> bool:

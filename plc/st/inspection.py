@@ -164,7 +164,7 @@ def shown_value(kind: ty.Type, value: Any) -> Scalar | str:
         return next((word for word, number in kind.values.items() if number == value), str(value))
     if isinstance(kind, ty.Pointer):
         return "NULL" if value is None else "a reference"
-    if isinstance(kind, ty.String):
+    if isinstance(kind, ty.String) or ty.is_kind(kind, "char"):
         return f"'{value}'"
     if isinstance(kind, ty.Elementary) and kind.kind in _DATES:
         return _DATES[kind.kind](value)

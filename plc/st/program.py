@@ -323,7 +323,7 @@ def _tag_kind(kind: ty.Type) -> TagKind | None:
     if isinstance(kind, ty.Enum):
         return TagKind.INT
     kind = ty.plain(kind)
-    if not isinstance(kind, ty.Elementary):
+    if not isinstance(kind, ty.Elementary) or kind.kind == "char":
         return None
     return {"bool": TagKind.BOOL, "real": TagKind.REAL}.get(kind.kind, TagKind.INT)
 

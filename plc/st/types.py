@@ -2,8 +2,8 @@
 
 Representation at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to 32 bits,
 LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since 1970-01-01; strings
-as str (a STRING's characters are 0 to 255, one byte each); arrays as lists; structures and function blocks as objects. Source:
-IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions).
+as str (a CHAR is one character; those of a STRING are 0 to 255, one byte each); arrays as lists; structures and function blocks
+as objects. Source: IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_NESTED = 32
 
 @dataclass(frozen=True, slots=True)
 class Elementary:
-    """An elementary type. `kind` is int, bits, real, bool, duration, date, tod, dt; `low`..`high` for integers and bit
+    """An elementary type. `kind` is int, bits, real, bool, duration, date, tod, dt, char; `low`..`high` for integers and bit
     strings."""
 
     name: str
@@ -56,12 +56,14 @@ TIME = Elementary("TIME", "duration", 64, -(2**63), 2**63 - 1)
 LTIME = Elementary("LTIME", "duration", 64, -(2**63), 2**63 - 1)
 DATE = Elementary("DATE", "date", 64, -(2**63), 2**63 - 1)
 TOD = Elementary("TIME_OF_DAY", "tod", 64, -(2**63), 2**63 - 1)
+CHAR = Elementary("CHAR", "char", 8)
+WCHAR = Elementary("WCHAR", "char", 16)
 DT = Elementary("DATE_AND_TIME", "dt", 64, -(2**63), 2**63 - 1)
 
 ELEMENTARY: dict[str, Elementary] = _integers() | {
     "BOOL": BOOL, "REAL": REAL, "LREAL": LREAL, "TIME": TIME, "LTIME": LTIME, "DATE": DATE, "LDATE": DATE,
     "TOD": TOD, "TIME_OF_DAY": TOD, "LTOD": TOD, "LTIME_OF_DAY": TOD, "DT": DT, "DATE_AND_TIME": DT, "LDT": DT,
-    "LDATE_AND_TIME": DT,
+    "LDATE_AND_TIME": DT, "CHAR": CHAR, "WCHAR": WCHAR,
 }  # fmt: skip
 INT, DINT, LINT, ULINT = (ELEMENTARY[name] for name in ("INT", "DINT", "LINT", "ULINT"))
 
@@ -315,6 +317,8 @@ def fits(source: Type, target: Type) -> bool:
         return _widens(source, sink)
     if isinstance(source, Null) and isinstance(sink, Pointer):
         return True
+    if isinstance(source, Elementary) and source.kind == "char" and isinstance(sink, String):
+        return sink.wide == (source == WCHAR)
     if isinstance(source, String) and isinstance(sink, String):
         return source.wide == sink.wide
     if isinstance(sink, Interface) and isinstance(source, Block | Interface | Null):
@@ -337,6 +341,8 @@ def _widens(source: Elementary, target: Elementary) -> bool:
     if source.kind == target.kind:
         if source.kind == "int":
             return target.low <= source.low and source.high <= target.high
+        if source.kind == "char":
+            return source == target
         return source.bits <= target.bits
     if source.kind == "int" and target.kind == "real":
         return source.bits <= (16 if target.bits == 32 else 32)

@@ -60,6 +60,8 @@ class Expressions:
         if isinstance(value.type, ty.Pointer) or isinstance(target, ty.Pointer):
             return references.coerced(self, value, target, pos, what)
         source = ty.plain(value.type)
+        if ty.is_kind(target, "char") and _is_character(value, wide=target == ty.WCHAR):
+            return value.code
         accepted = None if ty.fits(value.type, target) else converted(self, value, target, pos)
         if accepted is not None:
             return accepted
@@ -249,6 +251,11 @@ class Expressions:
     def take(self, argument: t.Argument, value: Value) -> None:
         """Compile the output argument ``name => target``."""
         raise NotImplementedError
+
+
+def _is_character(value: Value, *, wide: bool) -> bool:
+    """Return whether a value is a string literal with one character, which is also a CHAR or WCHAR."""
+    return isinstance(value.type, ty.String) and value.type.wide == wide and len(value.constant or "") == 1
 
 
 def _open(code: str) -> int:

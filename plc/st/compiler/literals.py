@@ -64,7 +64,20 @@ def _constant(kind: str, text: str) -> Constant:
         return _duration(text)
     if kind in ("STRING_LITERAL", "WSTRING_LITERAL"):
         return _string(text, wide=kind.startswith("W"))
+    if kind == "TYPED_TEXT":
+        return _typed_text(text)
     return _moment(kind, text)
+
+
+def _typed_text(text: str) -> Constant:
+    """Return a literal such as ``CHAR#'A'`` or ``STRING#'OK'`` (table 7)."""
+    name, _, quoted = text.partition("#")
+    found = _string(quoted, wide=quoted.startswith('"'))
+    if name.upper() in ("STRING", "WSTRING"):
+        return found
+    if len(found.value) != 1:
+        raise Malformed(f"a {name.upper()} is one character")
+    return Constant(found.value, ty.ELEMENTARY[name.upper()])
 
 
 def _based(text: str) -> Constant:

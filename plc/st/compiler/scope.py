@@ -145,6 +145,8 @@ def simple_default(kind: ty.Type) -> str | None:
     if isinstance(kind, ty.Subrange):
         return str(min(max(0, kind.low), kind.high))
     if isinstance(kind, ty.Elementary):
+        if kind.kind == "char":
+            return repr("\0")
         return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
     if isinstance(kind, ty.String):
         return "''"

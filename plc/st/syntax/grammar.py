@@ -34,7 +34,7 @@ _READABLE = {
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
-    "PARTIAL": "%X0", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
+    "PARTIAL": "%X0", "TYPED_TEXT": "a string", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
 }  # fmt: skip
 
 

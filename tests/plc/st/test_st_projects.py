@@ -124,10 +124,10 @@ def test_an_error_in_a_long_file_is_found_in_time_that_grows_with_its_length() -
 def test_a_name_with_an_error_is_reported_once(tmp_path: Path) -> None:
     file = tmp_path / "p.st"
     file.write_text(
-        "PROGRAM p VAR a : Nowhere; END_VAR\na := 1; a := 2; b := 1; b := a; END_PROGRAM\nPROGRAM q b := 1; END_PROGRAM"
+        "PROGRAM p VAR a : Qqqqq; END_VAR\na := 1; a := 2; b := 1; b := a; END_PROGRAM\nPROGRAM q b := 1; END_PROGRAM"
     )
     assert errors_of(file) == [
-        ":1:19: a type 'Nowhere' is not declared",
+        ":1:19: a type 'Qqqqq' is not declared",
         ":2:17: a variable 'b' is not declared",
         ":3:11: a variable 'b' is not declared",
     ]

@@ -69,6 +69,9 @@ def _of_string(code: str, target: ty.Type) -> str | None:
     if isinstance(target, ty.String):
         return code if target.wide else f"{code}.encode('latin-1', 'replace').decode('latin-1')"
     assert isinstance(target, ty.Elementary)
+    if target.kind == "char":
+        first = f"({code}[:1] or {chr(39)}\\0{chr(39)})"
+        return first if target == ty.WCHAR else f"{first}.encode('latin-1', 'replace').decode('latin-1')"
     if target.kind in ("int", "bits"):
         return f"_v.number_of({code}, {target.low}, {target.high})"
     if target.kind == "real":
@@ -79,6 +82,8 @@ def _of_string(code: str, target: ty.Type) -> str | None:
 def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | None:
     if not isinstance(kind, ty.Elementary):
         return None
+    if kind.kind == "char" or (isinstance(target, ty.Elementary) and target.kind == "char"):
+        return _of_character(code, kind, target)
     if isinstance(target, ty.String):
         return _text(code, kind)
     assert isinstance(target, ty.Elementary)
@@ -94,6 +99,18 @@ def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | Non
     if kind.kind == "dt" and target.kind in ("date", "tod"):
         return f"({code} // {ty.DAY_NS} * {ty.DAY_NS})" if target.kind == "date" else f"({code} % {ty.DAY_NS})"
     return code if kind.kind == target.kind or (kind.kind == "date" and target.kind == "dt") else None
+
+
+def _of_character(code: str, kind: ty.Elementary, target: ty.Type) -> str | None:
+    """Write the conversion of a CHAR or WCHAR, or to one. A bit string holds the code of the character (tables 25 and 26)."""
+    if isinstance(target, ty.String):
+        return code if target.wide == (kind == ty.WCHAR) else None
+    assert isinstance(target, ty.Elementary)
+    if kind.kind == target.kind:
+        return code if target.bits >= kind.bits else f"{code}.encode('latin-1', 'replace').decode('latin-1')"
+    if kind.kind == "char" and target.kind == "bits" and target.bits >= kind.bits:
+        return f"ord({code})"
+    return f"chr({code} & {2**target.bits - 1})" if kind.kind == "bits" else None
 
 
 def _of_date(code: str, kind: ty.Type, target: ty.Type) -> str | None:

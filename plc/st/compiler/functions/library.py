@@ -84,6 +84,8 @@ def number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
 def string(x: Compiling, expr: t.Expr) -> tuple[str, ty.String]:
     """Compile an argument that is a string. Raises `FileInvalid`."""
     value = x.value(expr)
+    if ty.is_kind(value.type, "char"):
+        return value.code, ty.String(1, value.type == ty.WCHAR)
     if not isinstance(value.type, ty.String):
         x.env.fail(expr.pos, "an argument", expected="a string", got=str(value.type))
     return value.code, value.type

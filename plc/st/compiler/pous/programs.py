@@ -162,9 +162,8 @@ class Programs(Bodies):
             yield ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
-        if role != "local" and isinstance(
-            kind, ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface | ty.OpenArray
-        ):
+        parts = ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface | ty.OpenArray
+        if role != "local" and (isinstance(kind, parts) or ty.is_kind(kind, "char")):
             self.env.fail(
                 v.pos,
                 f"{v.name} cannot be bound to a tag",

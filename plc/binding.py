@@ -88,6 +88,16 @@ def load_program(
         made = _python_class(source, rest, python_path)
     else:
         made = partial(_text_class(source, python_path, dialect, libraries, takes_writes=takes_writes), together)
+    return _created(source, made)
+
+
+def created_again(source: str, program: Program, together: dict[Any, Any]) -> Program:
+    """Return a new instance of a program without reading its files. `source` and `together`: see `load_program`."""
+    made = type(program)
+    return _created(source, partial(made, together) if made.source_files else made)
+
+
+def _created(source: str, made: Callable[[], Program]) -> Program:
     try:
         return made()
     except FieldtwinError:
@@ -139,8 +149,12 @@ def _text_class(
     from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
-    places = tuple(_found(library, folders) for library in libraries)
-    return load_source(*found, dialect_of(dialect), places, takes_writes=takes_writes)
+    return load_source(*found, dialect_of(dialect), library_places(libraries, folders), takes_writes=takes_writes)
+
+
+def library_places(libraries: Sequence[str], folders: Sequence[str]) -> tuple[Path, ...]:
+    """Return the files or folders of libraries."""
+    return tuple(_found(library, folders) for library in libraries)
 
 
 def image_for(

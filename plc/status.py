@@ -61,6 +61,13 @@ class StopsStatus(msgspec.Struct, frozen=True, kw_only=True):
     last: str = ""
 
 
+class ChangesStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The replacements of programs while they ran: their number, and what the last one did."""
+
+    count: int = 0
+    last: list[str] = []
+
+
 class RetainStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The kind of the last start, and the number of times that retained values were saved."""
 
@@ -86,6 +93,7 @@ class PlcStatus(ScanStatus, frozen=True, kw_only=True):
     """By program: the inputs that were missing when it started, with the reason."""
     restarts: int = 0
     stops: StopsStatus = StopsStatus()
+    changes: ChangesStatus = ChangesStatus()
     stepping: int = 0
     """The number of steps that a paused PLC still has to execute."""
     restart_in_ms: float | None = None

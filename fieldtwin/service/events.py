@@ -42,6 +42,7 @@ def changes(before: RunState | None, now: RunState) -> list[ServiceEvent]:
         *_devices(_devices_of(before), _devices_of(now)),
         *_plc(before.plc if before else None, now.plc),
         *_reloaded(before.gateway if before else None, now.gateway),
+        *_replaced(before.plc if before else None, now.plc),
         *_thread(before.thread if before else None, now.thread),
         *_refused(before.gateway if before else None, now.gateway),
         *_dropped(before.gateway if before else None, now.gateway),
@@ -115,6 +116,14 @@ def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[S
         return []
     text = "reloaded: " + "; ".join(now.config.changed)
     return [ServiceEvent(Priority.NOTICE, "reloaded", text, {"hash": now.config.hash})]
+
+
+def _replaced(before: PlcStatus | None, now: PlcStatus | None) -> list[ServiceEvent]:
+    """Return the event of programs that were replaced while they ran."""
+    if before is None or now is None or before.changes.count == now.changes.count:
+        return []
+    count = len(now.changes.last)
+    return [ServiceEvent(Priority.NOTICE, "reloaded", "reloaded: " + "; ".join(now.changes.last), {"count": count})]
 
 
 def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> list[ServiceEvent]:

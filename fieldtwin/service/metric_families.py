@@ -151,6 +151,7 @@ PLC_STATE = _gauge(
 )
 PLC_PROGRAMS_WAITING = _gauge("plc_programs_waiting", "Programs that wait for their inputs and have not started.")
 PLC_RESTARTS = _counter("plc_restarts", "Restarts of the PLC's program after a failure.")
+PLC_CHANGES = _counter("plc_changes", "Times that programs were replaced while they ran.")
 PLC_FORCES = _gauge("plc_forces", "Variables that are forced.")
 PLC_EVENTS = _counter("plc_events", "Counters of the PLC's process image and messages, by event.", "event")
 THREAD_DROPPED = _counter("thread_dropped", "Events that the digital thread's log lost.")

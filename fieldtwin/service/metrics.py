@@ -251,6 +251,7 @@ def _plc(page: Page, plc: PlcStatus) -> None:
             states.add(int(status.state == state), task=task, state=state)
     page.family(metric.PLC_PROGRAMS_WAITING).add(len(plc.waiting))
     page.family(metric.PLC_RESTARTS).add(plc.restarts)
+    page.family(metric.PLC_CHANGES).add(plc.changes.count)
     page.family(metric.PLC_FORCES).add(len(plc.forces))
     counted = page.family(metric.PLC_EVENTS)
     for event, count in plc.counters.items():

@@ -215,6 +215,10 @@ class Scan:
             settling.disturbed()
         return settling.settled
 
+    def programs_changed(self) -> None:
+        """Execute the logic of the next scan in any case, because programs of this task were replaced."""
+        self._settling.disturbed()
+
     def repeats_until(self, until_ns: int) -> bool:
         """Return whether every scan before `until_ns` would skip the logic, and publish what the last scan did, see
         `fieldtwin.gateway.core.concurrency.cycle.Cycle`.

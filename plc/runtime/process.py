@@ -14,11 +14,17 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
     origin    {"tag": ..., "value": ...}: the program and the line of its source that set the tag to this value
     limits    {"tags": {name: [low, high] or null}}: limits in place of those in the image's layout, after a reload
     restart   create the programs again: {"cold": true} without retained variables
-    sources   the programs whose files changed since the PLC read them
-    about     of each program: variables, states with transitions, and the text of its source; this changes at a restart only
+    prepare_change
+              compile the programs in Structured Text whose files changed since the PLC read them, and answer with what their
+              replacement would do; {"back": true}: with the programs before the last replacement
+    apply_change
+              {"number": ...}: replace the programs as prepared, between two scans, all or none (fieldtwin.plc.runtime.online)
+    about     of each program: variables, states with transitions, and the text of its source; this changes only when programs
+              are replaced or restarted
     stop      set the outputs to their safe values, then end the process
 
-The actions of users (force to restart) are recorded before they are carried out; each of these commands takes "by".
+The actions of users (force to restart, and apply_change) are recorded before they are carried out; each of these commands takes
+"by".
 
 SIGTERM and SIGINT act like stop. The process ends within a second, with its outputs region flagged stopped. When a task stopped
 by itself for good (a program that raised an error, an input that tripped, restarts used up), the process keeps running with its
@@ -44,9 +50,9 @@ from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.plc.runtime.acts import Acts
 from fieldtwin.plc.runtime.config import PlcConfig
+from fieldtwin.plc.runtime.online.changes import OnlineChanges
 from fieldtwin.plc.runtime.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from fieldtwin.plc.runtime.runner import TaskRunner
-from fieldtwin.plc.runtime.sources import changed
 from fieldtwin.plc.runtime.tag_view import TagView
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 
@@ -62,6 +68,7 @@ class PlcProcess:
         self._runner = TaskRunner(config, image, monotonic_ns, self._alarm)
         self._view = TagView(image, self._runner)
         self._acts = Acts(config.audit_path)
+        self._changing = OnlineChanges(self._runner, self._note)
         self._loop = asyncio.new_event_loop()
         self._server = ControlServer(
             {
@@ -78,7 +85,8 @@ class PlcProcess:
                 "origin": self._origin,
                 "limits": self._limits,
                 "restart": self._restart,
-                "sources": self._sources,
+                "prepare_change": self._changing.prepare,
+                "apply_change": self._changing.apply,
                 "about": self._about,
             }
         )
@@ -138,6 +146,7 @@ class PlcProcess:
             realtime=self._realtime.status(),
             acts=dict(self._acts.counts),
             programs={p.name: type(p.program).__name__ for p in runner.programs},
+            changes=self._changing.status,
             duration_buckets=first.duration.buckets_us() if with_buckets else [],
             lateness_buckets=first.lateness.buckets_us() if with_buckets else [],
         )
@@ -224,9 +233,6 @@ class PlcProcess:
         self._runner.limit({str(tag): tuple(limits) if limits else None for tag, limits in tags.items()})
         return {"limited": len(tags)}
 
-    async def _sources(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {"changed": [source.describe() for source in changed(self._runner.sources)]}
-
     async def _about(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"programs": describe_programs(self._runner.programs, self._runner.sources)}
 
@@ -234,6 +240,7 @@ class PlcProcess:
         cold = args.get("cold") is True
         self._note("restart", args, cold=cold)
         self._runner.restart(cold=cold)
+        self._changing.forget()
         self._loop.call_soon(self._loop.stop)  # a wait that began while no task ran is too long now
         return {"start": self._runner.retained.start}
 

@@ -11,7 +11,7 @@ Like a `CyclicTask`, the runner provides `deadline_ns` and `run_once`. It cannot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, Usag
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
-from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.binding import BoundProgram, created_again
 from fieldtwin.plc.cycle.forces import Forces, checked
 from fieldtwin.plc.cycle.publishing import OutputImage, TagChange
 from fieldtwin.plc.cycle.scan import Scan
@@ -103,27 +103,40 @@ class TaskRunner:
         self._ran: TaskEntry | None = None
         self._stepped = 0
         self._ended: StopReason | None = None
-        self._assemble(self._made(), cold=config.cold)
+        self._between: Callable[[], None] | None = None
+        self._assemble(self._loaded(), cold=config.cold)
+        self.sources = self._read_sources()
 
     # -- assembly -----------------------------------------------------------------------------------------------------
 
-    def _made(self) -> list[BoundProgram]:
-        """Create new instances of the programs. Also raises `FileInvalid` if they no longer fit the process image."""
+    def _loaded(self) -> list[BoundProgram]:
+        """Read the programs and create instances. Raises `FileInvalid` if they cannot run with the process image."""
         # created with the programs, so that global variables also begin with their initial values
         together: dict[Any, Any] = {}
         programs = [p.bind(self.config.python_path, together) for p in self.config.programs]
-        for new, old in zip(programs, self.programs, strict=False):
-            if _interface(new) != _interface(old):
-                raise FileInvalid(
-                    f"program {new.name} has different variables from the running one",
-                    hint="stop the system and run it",
-                )
-        return programs
+        readers, before = self.readers(), self.programs
+        return (
+            [_fitted(new, old, readers, together) for new, old in zip(programs, before, strict=True)]
+            if before
+            else programs
+        )
+
+    def _created_again(self) -> list[BoundProgram]:
+        """Create new instances of the programs that ran, without reading their files. Raises `FileInvalid`."""
+        together: dict[Any, Any] = {}
+        return [
+            replace(bound, program=created_again(p.source, bound.program, together))
+            for bound, p in zip(self.programs, self.config.programs, strict=True)
+        ]
+
+    def readers(self) -> dict[str, str]:
+        """Return what uses variables of programs, by tag: other programs, and the tasks that they trigger."""
+        found = {b.tag: f"program {bound.name}" for bound in self.programs for b in bound.inputs.values()}
+        return found | {spec.single: f"task {spec.name}" for spec in self.config.tasks if spec.single}
 
     def _assemble(self, programs: list[BoundProgram], cold: bool) -> None:
         config = self.config
         self.programs = programs
-        self.sources = sources(programs, self.sources, modules=self._modules)
         path = Path(config.retain_path) if config.retain_path else None
         self.retained = Retained(self.programs, path, cold=cold)
         self.outputs = OutputImage(self._image, self.programs, self.forces)
@@ -203,8 +216,28 @@ class TaskRunner:
             return self.entries[0].task.deadline_ns
         return min(entry.task.deadline_ns for entry in self.entries)
 
+    def between_scans(self, action: Callable[[], None]) -> None:
+        """Carry out `action` once, after the next scan, when most of the time until the following one is left.
+
+        It must not raise an error. It is not called if the PLC ends before.
+        """
+        self._between = action
+
     def run_once(self) -> None:
         """Execute the scan or the restart that is due first."""
+        self._run_due()
+        if self._between is not None:
+            action, self._between = self._between, None
+            action()
+
+    def programs_changed(self, read: Sequence[ProgramSource]) -> None:
+        """Continue with programs that were replaced in place. `read` are their files."""
+        names = {source.program for source in read}
+        self.sources = [*read, *(source for source in self.sources if source.program not in names)]
+        for entry in self.entries:
+            entry.scan.programs_changed()
+
+    def _run_due(self) -> None:
         if self._ended is not None or not self._began:
             raise Bug("a scan of a PLC that does not run")
         now_ns = self._now_ns()
@@ -249,6 +282,7 @@ class TaskRunner:
         """Return whether every scan before `until_ns` would only repeat the last one, see `Cycle`."""
         return (
             len(self.entries) == 1
+            and self._between is None
             and self._stopped is None
             and not self.starts.waiting
             and not self._in_a_row
@@ -302,18 +336,24 @@ class TaskRunner:
 
     def _restart_by_itself(self, stopped: TaskEntry) -> None:
         try:
-            self.restart()
+            self._restart(self._created_again(), cold=False)
         except FieldtwinError as e:  # the programs cannot be created, so the PLC stays stopped and reports why
             stopped.task.error = e
             self._ended, self._restart_ns = StopReason.FAILED, _NEVER_NS
 
     def restart(self, *, cold: bool = False) -> None:
-        """Create new instances of the programs, with retained variables unless `cold`, and start. Forces and a pause remain in
-        effect.
+        """Read the programs again and start them, with retained variables unless `cold`. Forces and a pause remain in effect.
 
         Raises `FileInvalid`, without any change, if the programs cannot be created (their files may have been edited).
         """
-        programs, paused = self._made(), self.paused
+        self._restart(self._loaded(), cold=cold)
+        self.sources = self._read_sources()
+
+    def _read_sources(self) -> list[ProgramSource]:
+        return sources(self.programs, self.sources, modules=self._modules)
+
+    def _restart(self, programs: list[BoundProgram], *, cold: bool) -> None:
+        paused = self.paused
         for entry in self.entries:
             entry.task.stop()
         self.retained.close()
@@ -538,6 +578,17 @@ def _inside(spec: TagSpec, value: Scalar) -> None:
         )
 
 
-def _interface(bound: BoundProgram) -> list[tuple[str, str, str, int, int]]:
-    """Return the properties of a program on which the process image depends."""
-    return [(v.name, v.role.value, v.kind.value, v.max_bytes, v.depth) for v in bound.program.variables.values()]
+def _fitted(new: BoundProgram, old: BoundProgram, readers: Mapping[str, str], together: dict[Any, Any]) -> BoundProgram:
+    """Return `new` with the interface of `old`, which it replaces. Raises `FileInvalid` if the image does not allow it."""
+    if new.program.variables == old.program.variables:
+        return new
+    if not new.program.source_files:
+        raise FileInvalid(
+            f"program {new.name} has different variables from the running one", hint="stop the system and run it"
+        )
+    from fieldtwin.plc.runtime.interface import fitted  # load the compiler only for programs that need it
+
+    made, reasons = fitted(type(new.program), old, readers)  # type: ignore[arg-type]
+    if reasons:
+        raise FileInvalid(f"program {new.name}: {'; '.join(reasons)}", hint="stop the system and run it again")
+    return replace(new, program=made(together))

@@ -1,8 +1,8 @@
 """The files of a PLC's programs, and which of them changed since the PLC read them.
 
-Structured Text is read again at each restart of the programs; a Python module only when the process starts. The modules that
-were imported from the folder of a program's file, or from a folder in it, count as files of the program. This module does not
-interpret programs.
+Structured Text is read again at each change and each restart that a user requests; a Python module only when the process
+starts. The modules that were imported from the folder of a program's file, or from a folder in it, count as files of the
+program. This module does not interpret programs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from sysconfig import get_paths
-from typing import Any
 
 from fieldtwin.plc.binding import BoundProgram
 
@@ -27,12 +26,7 @@ class ProgramSource:
     path: str
     digest: str
     compiled: bool
-    """Whether it is Structured Text, which a restart of the programs reads again."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return the program, its file, and the command that loads the present file, as data for JSON."""
-        cure = "fieldtwin plc restart" if self.compiled else "stop the system and run it again"
-        return {"program": self.program, "path": self.path, "cure": cure}
+    """Whether it is Structured Text, which can be read again while the PLC runs."""
 
     def holds(self, content: bytes) -> bool:
         """Return whether `content` is the content of the file that the PLC read."""
@@ -50,13 +44,13 @@ def sources(
     found = []
     for bound in programs:
         made = type(bound.program)
-        found += [ProgramSource(bound.name, file, _digest(file), True) for file in made.source_files]
+        found += [ProgramSource(bound.name, file, digest_of(file), True) for file in made.source_files]
         if made.source_files:
             continue
         path = getattr(sys.modules.get(made.__module__), "__file__", None) or ""
-        found.append(ProgramSource(bound.name, path, imported.get(path) or _digest(path), False))
+        found.append(ProgramSource(bound.name, path, imported.get(path) or digest_of(path), False))
         if modules and path:
-            found += [ProgramSource(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
+            found += [ProgramSource(bound.name, p, imported.get(p) or digest_of(p), False) for p in _beside(path)]
     return found
 
 
@@ -83,10 +77,11 @@ def _folder(path: str) -> str:
 
 def changed(known: Sequence[ProgramSource]) -> list[ProgramSource]:
     """Return the sources whose file has a different content now, or cannot be read any more."""
-    return [source for source in known if source.digest and _digest(source.path) != source.digest]
+    return [source for source in known if source.digest and digest_of(source.path) != source.digest]
 
 
-def _digest(path: str) -> str:
+def digest_of(path: str) -> str:
+    """Return the SHA-256 of a file in hex; empty if it cannot be read."""
     try:
         return sha256(Path(path).read_bytes()).hexdigest() if path else ""
     except OSError:

@@ -83,10 +83,15 @@ class TagView:
                 }
                 rows.append({**row, "side": "input", "seen": seen})
             if spec := self._specs[OUTPUTS].get(name):
-                row = _row(
-                    runner.as_limited(spec), snapshot.value(name), runner.forces.outputs.get(name), now_ns, utc_ns
-                )
-                rows.append({**row, "side": "output", "seen": {}})
+                value = snapshot.value(name)
+                # after an online change, a variable of another type may have the name of a tag that no longer has a value
+                replaced = self._internal(name) if value.value is None else None
+                row = replaced or {
+                    **_row(runner.as_limited(spec), value, runner.forces.outputs.get(name), now_ns, utc_ns),
+                    "side": "output",
+                    "seen": {},
+                }
+                rows.append(row)
             if not row:
                 row = self._internal(name) or {}
                 if not row:

@@ -9,7 +9,7 @@ their two's complement.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,24 +53,27 @@ class StProgram(Program):
     st_decisions: DecisionReader
     st_instance: str = ""
     """The program of a configuration whose connections are used, if it has any."""
+    st_internal: frozenset[str] = frozenset()
+    """The variables that could be tags, but have none in the process image of the running PLC."""
 
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
-        inputs = [v for v in self.st_declared.variables if v.role == "input"]
+        self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
+        """The variables that have tags, or can have them, by name."""
+        inputs = [v for v in self.st_variables.values() if v.role == "input"]
         self.st_inputs = [_Input(v) for v in inputs if not v.shared]
         self.st_shared_inputs = [_Input(v) for v in inputs if v.shared]
         """The inputs that are global variables with an address."""
-        self.st_variables = {v.name: v for v in self.st_declared.variables}
         self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         self.st_shared: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         """The outputs and locals that are global variables with an address."""
         for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
                 setattr(self.st_body, v.attribute, self.__dict__[v.name])
-            elif v.role != "input" and _tag_kind(v.kind) is not None:
+            elif v.role != "input" and _tag_kind(v.kind) is not None and v.name in self.st_variables:
                 shown = self.st_shared if v.shared else self.st_outputs
                 shown.append((v.name, v.attribute, _to_tag(v.kind)))
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
@@ -162,6 +165,29 @@ class StProgram(Program):
     def internal(self, path: str) -> InternalVariable | None:
         return self.st_inspection.find(self.st_body, path)
 
+    # -- online change ----------------------------------------------------------------------------------------------------
+
+    def st_become(self, new: StProgram) -> None:
+        """Become `new`, the same program in a new version, which must not be used any more.
+
+        The object and its dictionary stay the same, because the scan and the output image refer to them. Inputs and mailboxes
+        stay as well.
+        """
+        own = self.__dict__
+        kept = {
+            name: own[name] for name, v in new.variables.items() if v.role is Role.INPUT or v.kind is TagKind.MESSAGE
+        }
+        if "_lookup" in own:
+            kept["_lookup"] = own["_lookup"]
+        for v in new.st_declared.variables:
+            if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
+                setattr(new.st_body, v.attribute, own[v.name])
+        fresh = {**new.__dict__, **kept}
+        self.__class__ = type(new)
+        own.clear()
+        own.update(fresh)
+        self.st_show()
+
     # -- retained variables -----------------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
@@ -220,11 +246,18 @@ def _too_deep(error: RecursionError) -> values.LogicError:
     return found.with_traceback(error.__traceback__)
 
 
-def program_class(unit: CompiledUnit, name: str = "", *, takes_writes: bool = False) -> type[StProgram]:
+def program_class(
+    unit: CompiledUnit,
+    name: str = "",
+    decisions: Mapping[tuple[str, int, str], Any] | None = None,
+    *,
+    takes_writes: bool = False,
+) -> type[StProgram]:
     """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`.
 
     `name` may also be that of a program of a configuration, which states the PROGRAM. With `takes_writes` the program has a
-    message input whose messages set its variables, each before the next scan.
+    message input whose messages set its variables, each before the next scan. `decisions` are those of the unit, if they are
+    known already; the `source` of the unit is not used then.
     """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
     names = [*(p.name for p in unit.programs), *missing]
@@ -247,48 +280,81 @@ def program_class(unit: CompiledUnit, name: str = "", *, takes_writes: bool = Fa
         message = f"which program of the configuration is meant, because they connect the variables of {found.name}"
         raise FileInvalid(message, path=unit.path, expected=", ".join(connecting), hint=hint)
     connected = instance.connected if instance is not None else frozenset()
-    files = tuple(sorted(unit.files, key=lambda file: (file != found.path, file)))
+    tags = {v.name: made for v in found.variables if (made := _tag_of(v, connected)) is not None}
+    if takes_writes:
+        tags = {WRITES: message_input(), **tags}
+    reader = DecisionReader(
+        Inspection(unit, [(v.name, v.kind) for v in found.variables]),
+        decisions_of(unit.source) if decisions is None else decisions,
+        frozenset(v.name.lower() for v in found.variables if v.role == "input"),
+    )
+    named = instance.name if instance is not None and connected else ""
+    return _class_of(unit, found, reader, tags, frozenset(), named)
+
+
+def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:
+    """Return the class of the same program with exactly the variables of `interface`, which have tags in the process image.
+
+    A variable of `interface` that the source does not declare with the same kind of value has no value, and a variable of the
+    source that is not in `interface` is an internal one.
+    """
+    own = made.variables
+    internal = made.st_internal | {name for name, v in own.items() if not _replaces(v, interface.get(name))}
+    tags = {name: v if name in internal or name not in own else own[name] for name, v in interface.items()}
+    return _class_of(made.st_unit, made.st_declared, made.st_decisions, tags, internal, made.st_instance)
+
+
+def _replaces(new: Variable, old: Variable | None) -> bool:
+    """Return whether the place of `old` in the process image can hold `new`."""
+    return old is not None and old.kind is new.kind and (old.role is Role.INPUT) is (new.role is Role.INPUT)
+
+
+def _class_of(
+    unit: CompiledUnit,
+    found: CompiledProgram,
+    decisions: DecisionReader,
+    tags: Mapping[str, Variable],
+    internal: frozenset[str],
+    instance: str,
+) -> type[StProgram]:
+    """Return the class of program `found` with the variables `tags`. Those in `internal` could be tags as well."""
+    hidden = [v for v in found.variables if (_tag_kind(v.kind) is None or v.name in internal) and not v.shared]
     body: dict[str, Any] = {
         "st_unit": unit,
         "st_declared": found,
-        "st_instance": instance.name if instance is not None and connected else "",
-        "st_inspection": Inspection(
-            unit, [(v.name, v.kind) for v in found.variables if _tag_kind(v.kind) is None and not v.shared]
-        ),
-        "st_decisions": DecisionReader(
-            Inspection(unit, [(v.name, v.kind) for v in found.variables]),
-            decisions_of(unit.source),
-            frozenset(v.name.lower() for v in found.variables if v.role == "input"),
-        ),
+        "st_instance": instance,
+        "st_inspection": Inspection(unit, [(v.name, v.kind) for v in hidden]),
+        "st_decisions": decisions,
+        "st_internal": internal,
         "source_path": found.path,
-        "source_files": files,
+        "source_files": tuple(sorted(unit.files, key=lambda file: (file != found.path, file))),
         "source_warnings": tuple(map(str, unit.warnings)),
         "__module__": __name__,
+        **tags,
     }
-    if takes_writes:
-        body[WRITES] = message_input()
-    for v in found.variables:
-        kind = _tag_kind(v.kind)
-        if isinstance(v.kind, ty.MessagesIn):
-            body[v.name] = message_input()
-        elif isinstance(v.kind, ty.MessagesOut):
-            body[v.name] = message_output(v.kind.max_bytes, v.kind.depth)
-        elif kind is not None:
-            unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
-            words = tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else ()
-            limits = (float(v.kind.low), float(v.kind.high)) if isinstance(v.kind, ty.Subrange) else None
-            body[v.name] = Variable(
-                v.name,
-                _ROLES[v.role],
-                kind,
-                unit=unit_of,
-                retain=v.retain,
-                limits=limits,
-                words=words,
-                address=v.location,
-                needs_tag=not (v.optional or v.name.lower() in connected),
-            )
     return type(found.name, (StProgram,), body)
+
+
+def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:
+    """Return a variable as it is declared to the PLC; None if it cannot be a tag. `connected`: those that need no tag."""
+    if isinstance(v.kind, ty.MessagesIn):
+        return message_input()  # type: ignore[no-any-return]
+    if isinstance(v.kind, ty.MessagesOut):
+        return message_output(v.kind.max_bytes, v.kind.depth)  # type: ignore[no-any-return]
+    kind = _tag_kind(v.kind)
+    if kind is None:
+        return None
+    return Variable(
+        v.name,
+        _ROLES[v.role],
+        kind,
+        unit="ns" if ty.is_kind(v.kind, "duration") else "",
+        retain=v.retain,
+        limits=(float(v.kind.low), float(v.kind.high)) if isinstance(v.kind, ty.Subrange) else None,
+        words=tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else (),
+        address=v.location,
+        needs_tag=not (v.optional or v.name.lower() in connected),
+    )
 
 
 def instance_of(unit: CompiledUnit, name: str = "") -> CompiledInstance | None:

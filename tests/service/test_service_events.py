@@ -15,6 +15,7 @@ from msgspec import structs
 from statuses import changed
 from test_service_metrics import busy_gateway, plc_status, seen
 
+from fieldtwin.plc.status import ChangesStatus
 from fieldtwin.service.events import Priority, ServiceEvent, changes
 from fieldtwin.service.journal import EventLog, datagram
 from fieldtwin.service.notify import Notifier
@@ -61,6 +62,16 @@ def test_a_change_is_reported_once() -> None:
     assert told[4].priority is Priority.ERROR
     assert told[5].message == "reloaded: devices.ctd0.poll.values.every_ms: 500 -> 250"
     assert changes(after, after) == []
+
+
+def test_programs_that_were_replaced_are_an_event() -> None:
+    before, after = quiet(), quiet()
+    assert after.plc is not None
+    replaced = structs.replace(after.plc, changes=ChangesStatus(count=1, last=["plc.programs.pump: new: n"]))
+    [told] = changes(before, replace(after, plc=replaced))
+    assert (told.name, told.priority, told.fields) == ("reloaded", Priority.NOTICE, {"count": 1})
+    assert told.message == "reloaded: plc.programs.pump: new: n"
+    assert changes(replace(after, plc=replaced), replace(after, plc=replaced)) == []
 
 
 def test_a_process_that_ended_is_an_error() -> None:

@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
 from fieldtwin.gateway.core.histogram import RESPONSE_MS, response_times
 from fieldtwin.gateway.runtime.buses.bus import latency_status
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
-from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
+from fieldtwin.plc.status import ChangesStatus, PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
 from fieldtwin.service.metric_families import ALL
 from fieldtwin.service.metrics import MOST_DEVICES, OLDEST_STATUS_S, RunState, families
@@ -97,7 +97,9 @@ def plc_status() -> PlcStatus:
     task: dict[str, Any] = {**PLAIN_TASK, "scans": 442, "missed_periods": 1, "overruns": 2}
     forces: dict[str, dict[str, Any]] = {"a": {"value": 1}}
     tasks = {"main": TaskStatus(**task)}
-    return PlcStatus(**task, tasks=tasks, restarts=3, forces=forces, counters={"messages_missed": 2})
+    return PlcStatus(
+        **task, tasks=tasks, restarts=3, changes=ChangesStatus(count=2), forces=forces, counters={"messages_missed": 2}
+    )
 
 
 def seen(**changed: Any) -> RunState:
@@ -147,6 +149,7 @@ def test_metrics_for_maintainers_exist() -> None:
     assert value(got, "plc_overruns_total", task="main") == 2
     assert value(got, "plc_lateness_seconds", task="main", quantile="0.99") == pytest.approx(20e-6)
     assert value(got, "plc_restarts_total") == 3
+    assert value(got, "plc_changes_total") == 2
 
 
 SERIES = """
@@ -176,6 +179,7 @@ fieldtwin_mailbox_queued gauge device
 fieldtwin_outputs_pending gauge
 fieldtwin_outputs_safe gauge
 fieldtwin_plc_alive gauge
+fieldtwin_plc_changes_total counter
 fieldtwin_plc_events_total counter event
 fieldtwin_plc_forces gauge
 fieldtwin_plc_lateness_seconds summary quantile,task

@@ -48,6 +48,8 @@ GATEWAY_LOST_MS = 1000
 MIN_STUCK_MS = 200
 IDLE_CYCLE_MS = 100
 """The cycle of a PLC without programs, which only publishes its heartbeat."""
+PLC_CONFIG = "plc.json"
+"""The file in the run directory that holds the configuration of the PLC process."""
 
 
 def fastest_ms(system: System) -> int:
@@ -314,6 +316,15 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         cold=cold,
         outputs_first=system.plc.outputs_at == "start",
     )
+
+
+def layout_in(run_dir: Path, system: System) -> ImageLayout:
+    """Return the layout of the process image in `run_dir`, as the PLC's configuration there states it.
+
+    It is not computed from the programs' files, which may have other variables by now. `system` is used if there is no PLC.
+    """
+    config = run_dir / PLC_CONFIG
+    return PlcConfig.load(config).image_layout() if config.exists() else image_layout(system)
 
 
 def make_image(layout: ImageLayout, path: Path) -> None:

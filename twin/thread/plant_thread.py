@@ -42,7 +42,7 @@ from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.command_gate import CommandGate
 from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
-from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
+from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, layout_in, plc_lost_ms
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.end import ThreadEnd
@@ -187,7 +187,7 @@ class PlantThread:
         c, clock = self._config, self._clock
         [system] = read_resolved(c.resolved)
         assert isinstance(system, System)
-        layout = image_layout(system)
+        layout = layout_in(Path(c.run_dir), system)
         async with AsyncExitStack() as stack:
             store = await open_knowledge(c.store)
             stack.push_async_callback(store.aclose)

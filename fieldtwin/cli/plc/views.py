@@ -194,7 +194,8 @@ def print_status(status: PlcStatus) -> None:
             *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
         )  # fmt: skip
     _print_table(table)
-    stdout.print(f"restarts: {status.restarts}; {status.retain.start}", markup=False)
+    replaced = f"; programs replaced while they ran: {status.changes.count}" if status.changes.count else ""
+    stdout.print(f"restarts: {status.restarts}; {status.retain.start}{replaced}", markup=False)
     realtime = status.realtime or RealtimeStatus()
     stdout.print("granted: " + (", ".join(realtime.granted) or "nothing"), markup=False, soft_wrap=True)
     if realtime.refused:

@@ -1,4 +1,4 @@
-"""`fieldtwin reload`: a running instance reads its files again between two polls."""
+"""`fieldtwin reload`: a running instance reads its files again between two polls, and its programs between two scans."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ NEEDS_RESTART = 1
 @click.command("reload")
 @click.argument("instance", required=False, default="")
 @click.option("--check", is_flag=True, help="Only show the changes, and whether they could be applied.")
+@click.option("--back", is_flag=True, help="Let the programs run again that the last reload replaced.")
 @json_option
-def command(instance: str, check: bool, as_json: bool) -> int:
-    """Let a running INSTANCE read its system file and profiles again; the default is the only running instance.
+def command(instance: str, check: bool, back: bool, as_json: bool) -> int:
+    """Let a running INSTANCE read its files again; the default is the only running instance.
 
     Periods, timeouts, retries, pauses, limits, scaling, safe values and the set of writable tags change between two polls,
-    without a lost or repeated poll. Ports, addresses, devices and programs need a restart: the command names these changes,
-    applies none, and exits with code 1. The same applies to a program's file (.st, .xml, .py) that changed since the PLC read
-    it. An invalid file changes nothing (exit code 3).
+    without a lost or repeated poll. Programs in Structured Text whose files changed are replaced between two scans: variables
+    and timers whose declarations are unchanged keep their values.
+
+    Ports, addresses, devices, bindings of programs, and programs in Python need a restart: the command names these changes,
+    applies none, and exits with code 1. An invalid file changes nothing (exit code 3).
     """
     from fieldtwin.console import show_warnings
     from fieldtwin.gateway.core.control import RemoteError
     from fieldtwin.run.processes.reloading import reload_instance
 
     try:
-        done = asyncio.run(reload_instance(instance, _who(), check=check))
+        done = asyncio.run(reload_instance(instance, _who(), check=check, back=back))
     except RemoteError as e:
         raise _NotReloaded(f"nothing was changed: {e.message}", e.remote_exit_code) from e
     show_warnings(done.warnings)

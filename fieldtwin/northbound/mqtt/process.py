@@ -31,7 +31,7 @@ from fieldtwin.northbound.status_report import report_status
 from fieldtwin.northbound.utc_times import UtcTimes
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
-from fieldtwin.twin.plant.physical import attached, image_layout
+from fieldtwin.twin.plant.physical import attached, layout_in
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.servers.serving_mqtt import MqttServeConfig
 from fieldtwin.twin.site.system import System
@@ -69,7 +69,7 @@ class MqttProcess:
 
     async def run(self) -> int:
         stop = stop_signal()
-        with attached(image_layout(self._system), self._run_dir / "image") as image:
+        with attached(layout_in(self._run_dir, self._system), self._run_dir / "image") as image:
             async with Nursery() as nursery:
                 running = [
                     nursery.start(

@@ -25,7 +25,7 @@ from fieldtwin.northbound.samples import TextSamples
 from fieldtwin.northbound.status_report import report_status
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.plant.child_main import child_main
-from fieldtwin.twin.plant.physical import attached, image_layout
+from fieldtwin.twin.plant.physical import attached, layout_in
 from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.servers.serving_opcua import OpcuaServeConfig
 from fieldtwin.twin.site.system import System
@@ -58,7 +58,7 @@ class OpcuaProcess:
 
     async def run(self) -> int:
         stop = stop_signal()
-        with attached(image_layout(self._system), self._image) as image:
+        with attached(layout_in(self._run_dir, self._system), self._image) as image:
             async with Nursery() as nursery:
                 nursery.start(
                     report_status(self._run_dir, self._config.name, self._server.status, self._clock), "status reports"

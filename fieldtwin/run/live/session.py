@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -53,7 +54,7 @@ from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.thread_return import ThreadReturn
 from fieldtwin.run.processes.topside import TopsideController, script
 from fieldtwin.twin.plant.instance import Instance, capture_path
-from fieldtwin.twin.plant.physical import PhysicalTwin
+from fieldtwin.twin.plant.physical import PLC_CONFIG, PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
@@ -215,7 +216,7 @@ class RunSession(AsyncResource):
         if self.options.prototype:
             await self._start_field(run_dir)
             await self._lay_cables(run_dir)
-        config = run_dir / "plc.json"
+        config = run_dir / PLC_CONFIG
         config.write_bytes(plc.to_json())
         await self._start_child("plc", "fieldtwin.plc", config)
         self._resolved = write_resolved(self.instance.path(SYSTEM_FILE), self.system)
@@ -495,15 +496,17 @@ class RunSession(AsyncResource):
             pass  # the next query reports a lost process
 
     async def reload(self, by: str) -> Reloaded:
-        """Make the gateway read its files again (`fieldtwin.run.processes.reloading`); no poll is lost."""
+        """Make gateway and PLC read their files again (`fieldtwin.run.processes.reloading`); no poll and no scan is lost."""
         if "gateway" not in self._clients:
             raise Unreachable("the gateway has ended")
-        # a separate connection is used, because statuses are queried meanwhile
-        own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))
-        try:
-            return await reload(own, self._clients.get("plc"), by)
-        finally:
-            await own.aclose()
+        async with AsyncExitStack() as stack:
+            # separate connections are used, because statuses are queried meanwhile
+            own = {}
+            for name in ("gateway", "plc"):
+                if name in self._clients:
+                    own[name] = await ControlClient.connect_unix(self.instance.path(f"{name}.sock"))
+                    stack.push_async_callback(own[name].aclose)
+            return await reload(own["gateway"], own.get("plc"), by)
 
     # -- stopping -------------------------------------------------------------------------------------------------------
 

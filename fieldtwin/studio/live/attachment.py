@@ -110,8 +110,8 @@ class Attachment:
         """Number of reloads of the gateway's files when `_present` last took over the names of values."""
         self._gateway_began_ns = 0
         """The start time of the gateway process whose changes are read."""
-        self._described: tuple[int, int] | None = None
-        """Process ID and restarts of the PLC that `programs` describes."""
+        self._described: tuple[int, int, int] | None = None
+        """Process ID, restarts, and replacements of programs of the PLC that `programs` describes."""
         self._image = ProcessImage(found.dir)
         self._buckets_ns = 0
         """Time at which the distribution of scan times was last read."""
@@ -210,9 +210,10 @@ class Attachment:
     async def read_plc(self, buckets: bool = True) -> WholePlcStatus:
         """Query the PLC's brief status, and return it with the present values; `buckets`: also the scan time distribution."""
         brief = await self.plc_channel.ask("get", PlcStatus, brief=True, buckets=buckets)
-        if self._described != (brief.pid, brief.restarts):  # a restart reads Structured Text again
+        version = brief.pid, brief.restarts, brief.changes.count  # Structured Text is read again at each of them
+        if self._described != version:
             self.programs = await self._read_programs()
-            self._described = (brief.pid, brief.restarts)
+            self._described = version
         return whole_plc_status(self._image, brief, self.programs, self.secrets, self.now_ns())
 
     async def read_internal_variables(self) -> dict[str, Any]:

@@ -22,6 +22,8 @@ from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 _TIMED = ("L", "D", "SD", "DS", "SL")
 _QUALIFIERS = ("N", "R", "S", "P", "P0", "P1", *_TIMED)
 _HIDDEN = "hidden_"
+STEP = "0step"
+"""The name of the function block of a step."""
 _BLOCKS = """
 FUNCTION_BLOCK hidden_chart VAR_INPUT hidden_started : BOOL; END_VAR END_FUNCTION_BLOCK
 FUNCTION_BLOCK hidden_step
@@ -108,7 +110,7 @@ class _Translation:
             for one in step.associations:
                 self._controls.setdefault(one.action.lower(), []).append((step, one))
         at = self._pou.pos
-        variables = [_declared(step.pos, step.name, "0step") for step in self._chart.steps]
+        variables = [_declared(step.pos, step.name, STEP) for step in self._chart.steps]
         variables += [_declared(at, _control(name), "0action_control") for name in self._controls]
         variables.append(_declared(at, "0chart", "0chart"))
         block = t.VarBlock(at, "VAR", frozenset(), tuple(variables))

@@ -27,7 +27,7 @@ from fieldtwin.plc.st.compiler.pous.hierarchy import KINDS, Hierarchy
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, Programs
 from fieldtwin.plc.st.compiler.pous.recursion import refuse_recursion
 from fieldtwin.plc.st.compiler.pous.source_lines import SourceLines
-from fieldtwin.plc.st.compiler.pous.variables import Variables
+from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable, Variables
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.edges import without_edges
@@ -50,6 +50,8 @@ class CompiledUnit:
     programs: tuple[CompiledProgram, ...]
     blocks: Mapping[str, tuple[tuple[str, ty.Type], ...]]
     """By the name of a FUNCTION_BLOCK or CLASS in lower case: its variables that keep their values, with their types."""
+    globals: Mapping[str, GlobalVariable]
+    """The global variables that keep their values, by list and name in lower case."""
     kinds: tuple[str, ...]
     """The kind of each declaration: program, function, function block, class, interface, type or global variable."""
     warnings: tuple[StWarning, ...] = ()
@@ -147,6 +149,7 @@ class _Unit:
             text,
             tuple(programs),
             self.blocks.kept,
+            self.variables.kept_globals(),
             kinds,
             warnings,
             missing,

@@ -36,6 +36,11 @@ class Symbol:
     refused: str = ""
     """Why the variable is not visible in the scope; empty for one that is."""
 
+    @property
+    def is_constant(self) -> bool:
+        """Return whether it is declared CONSTANT, whether or not its value is written at each use."""
+        return self.constant is not None or not (self.writable or self.is_input)
+
 
 @dataclass(frozen=True, slots=True)
 class Value:

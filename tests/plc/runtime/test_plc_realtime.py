@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import sys
 import time
 
 import pytest
@@ -14,6 +15,7 @@ from fieldtwin.plc.runtime.realtime import (
     GUARD_NS,
     LEAD_NS,
     VirtualStuckAlarm,
+    after_the_scans,
     lead,
     monotonic_ns,
     run_task,
@@ -130,3 +132,10 @@ def test_the_timer_of_a_run_in_virtual_time_ends_a_scan_without_an_end() -> None
             _loop_forever()
     finally:
         guard.close()
+
+
+def test_a_thread_next_to_the_scans_gives_up_the_interpreters_lock_early() -> None:
+    before = sys.getswitchinterval()
+    with after_the_scans():
+        assert sys.getswitchinterval() < before / 10
+    assert sys.getswitchinterval() == before

@@ -103,7 +103,9 @@ class Blocks(Bodies):
         kind = self.declarations.named(pou.name, pou.pos)
         number = ("number",) if isinstance(kind, ty.Block) and kind.interfaces else ()
         self.kept[pou.name.lower()] = tuple(
-            (s.name, s.type) for s, attribute in zip(held, kept, strict=True) if attribute not in in_outs
+            (s.name, s.type)
+            for s, attribute in zip(held, kept, strict=True)
+            if attribute not in in_outs and not s.is_constant
         )
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
             self.out.line(f"__slots__ = {(*kept, *number)}")

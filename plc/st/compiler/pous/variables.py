@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
@@ -15,6 +15,15 @@ from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 from fieldtwin.plc.st.syntax.walk import nodes
+
+
+@dataclass(frozen=True, slots=True)
+class GlobalVariable:
+    """A global variable: its value is the `attribute` of the object with the global variables."""
+
+    name: str
+    attribute: str
+    kind: ty.Type
 
 
 class Variables:
@@ -112,6 +121,14 @@ class Variables:
             for v in block.variables
         ]
         self.write_initials([(v, symbol) for v, symbol in found if symbol is not None], {})
+
+    def kept_globals(self) -> dict[str, GlobalVariable]:
+        """Return the global variables that keep their values, by list and name in lower case, such as ``valves.open``."""
+        return {
+            ".".join(filter(None, key)): GlobalVariable(symbol.name, symbol.code.rpartition(".")[2], symbol.type)
+            for key, symbol in self._globals.items()
+            if not symbol.is_constant
+        }
 
     # -- variables of POUs ------------------------------------------------------------------------------------------------
 

@@ -126,6 +126,6 @@ def _references(root: Any, local: frozenset[str]) -> Iterator[str]:
         if isinstance(node, t.NamedType | t.SubrangeType) or (
             isinstance(node, t.Ref) and node.name.lower() not in local
         ):
-            yield node.name.lower()
+            yield node.name.rpartition(".")[2].lower()
         elif isinstance(node, t.Literal) and node.kind == "ENUM_REF":
             yield node.text.partition("#")[0].lower()

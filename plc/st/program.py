@@ -32,6 +32,7 @@ from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
+from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
@@ -59,7 +60,7 @@ class StProgram(Program):
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
         self.st_resource = Resource.of(self.st_unit, together)
-        self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
+        self.st_body: Any = self.st_resource.space[f"P_{identifier(self.st_declared.name)}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""

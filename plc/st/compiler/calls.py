@@ -13,7 +13,15 @@ from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
 from fieldtwin.plc.st.compiler.pointers import references
-from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Value, by_reference, default_value, wrapped
+from fieldtwin.plc.st.compiler.scope import (
+    Parameter,
+    Signature,
+    Value,
+    by_reference,
+    default_value,
+    identifier,
+    wrapped,
+)
 from fieldtwin.plc.st.compiler.variables import bit, part_of, place, variable
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -125,7 +133,7 @@ class Calls(Expressions):
             expr = _value_of(given.get(p.name.lower()))
             codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
         arguments = ", ".join(codes)
-        code = f"f_{signature.name.lower()}({arguments})" if method is None else method.called(arguments)
+        code = f"f_{identifier(signature.name)}({arguments})" if method is None else method.called(arguments)
         outputs = [a for a in call.arguments if a.target is not None]
         more = bool(signature.outputs)
         if not outputs and all(by_reference(p.type) for p in signature.in_outs):
@@ -235,7 +243,7 @@ class Calls(Expressions):
         if to != of:
             if not (isinstance(to, ty.Block) and isinstance(of, ty.Block)) or to.standard or of.standard:
                 self.env.fail(s.pos, "types differ", expected=str(kinds[0]), got=str(kinds[1]))
-            code = f"_v.attempted({code}, B_{to.name.lower()})"
+            code = f"_v.attempted({code}, B_{identifier(to.name)})"
         self.out.line(f"{target.code} = {code}", s.pos)
 
     def writable(self, ref: t.Ref) -> Value:

@@ -31,6 +31,7 @@ from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable, Variables
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.edges import without_edges
+from fieldtwin.plc.st.namespaces import with_full_names
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_all
 
@@ -95,7 +96,7 @@ class _Unit:
         for warning in unit.warnings:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
-        unit = with_configured(unit)
+        unit = with_configured(with_full_names(unit))
         self.unit = without_edges(without_charts(without_addresses(unit)))
         self.unit = with_inherited(without_instance_variables(self.unit, dialect))
         if not dialect.vendor:

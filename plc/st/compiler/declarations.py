@@ -11,7 +11,7 @@ from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value, identifier
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_REPEATED = 100
@@ -427,7 +427,7 @@ class Declarations:
 
     def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
         out, names = self.out, [f"m_{name}" for name in struct.fields]
-        with out.block(f"class S_{struct.name.lower()}:", declared.pos):
+        with out.block(f"class S_{identifier(struct.name)}:", declared.pos):
             out.line(f"__slots__ = ({', '.join(map(repr, names))},)")
             with out.block("def __init__(self):"):
                 for field in declared.fields:
@@ -436,7 +436,7 @@ class Declarations:
                         f"self.m_{field.name.lower()} = {self.initial(kind, field.initial, field.type)}", field.pos
                     )
             with out.block("def copy(self):"):
-                out.line(f"new = S_{struct.name.lower()}.__new__(S_{struct.name.lower()})")
+                out.line(f"new = S_{identifier(struct.name)}.__new__(S_{identifier(struct.name)})")
                 for name, (_, kind) in zip(names, struct.fields.values(), strict=True):
                     code = f"self.{name}"
                     if isinstance(kind, ty.Array):

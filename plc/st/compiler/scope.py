@@ -145,6 +145,11 @@ class Class:
         return self.methods.get(attribute_of(kind, name))
 
 
+def identifier(name: str) -> str:
+    """Return a name as a part of Python names; a full name has a middle dot between its parts, which Python allows."""
+    return name.lower().replace(".", "\u00b7")
+
+
 def simple_default(kind: ty.Type) -> str | None:
     """Return the initial value of a type without parts as Python code; None for other types."""
     if isinstance(kind, ty.Subrange):
@@ -166,9 +171,9 @@ def default_value(kind: ty.Type) -> str:
     if simple is not None:
         return simple
     if isinstance(kind, ty.Struct):
-        return f"S_{kind.name.lower()}()"
+        return f"S_{identifier(kind.name)}()"
     if isinstance(kind, ty.Block):
-        return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{kind.name.lower()}()"
+        return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{identifier(kind.name)}()"
     if isinstance(kind, ty.Array):
         code = default_value(kind.of)
         for low, high in reversed(kind.ranges):

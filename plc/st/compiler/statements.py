@@ -12,7 +12,7 @@ from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.classes.members import SUPER, is_own, note, selected
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.implicit import meeting
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, default_value, wrapped
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, default_value, identifier, wrapped
 from fieldtwin.plc.st.compiler.variables import variable
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -146,7 +146,7 @@ class Statements(Calls):
             expected = f"{call.ref.name} in the body of a FUNCTION_BLOCK that extends a FUNCTION_BLOCK"
             self.env.fail(call.pos, f"{call.ref.name}()", expected=expected)
         note(self, base.key, call.pos)
-        self.out.line(f"B_{base.key}.execute(self, now_ns)", call.pos)
+        self.out.line(f"B_{identifier(base.key)}.execute(self, now_ns)", call.pos)
 
     def _is_action(self, pou: str, actions: frozenset[str], name: str) -> bool:
         return name in actions or f"{pou}.{name}" in self.env.missing

@@ -19,7 +19,6 @@ MAX_EXPECTED = 8
 _UNSUPPORTED = {
     word: construct
     for construct, words in {
-        "namespaces": "NAMESPACE END_NAMESPACE USING",
         "labels and jumps": "JMP",
     }.items()
     for word in words.split()
@@ -34,6 +33,7 @@ _READABLE = {
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
+    "USING": "USING",
     "PARTIAL": "%X0", "TYPED_TEXT": "a string", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
 }  # fmt: skip
 

@@ -28,6 +28,8 @@ _ENDS = re.compile(
 )
 """The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped. Methods after a POU belong to it."""
 
+_NAMESPACE = re.compile(r"\bEND_NAMESPACE\b", re.IGNORECASE)
+
 _DECLARED = re.compile(
     r"\b(?:FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE)\s+(?:(?:PUBLIC|INTERNAL|ABSTRACT|FINAL)\s+)*([A-Za-z_]\w*)",
     re.IGNORECASE,
@@ -117,6 +119,9 @@ def parse_parts(
 def _parts(text: str) -> Iterator[tuple[str, int, int]]:
     """Return each POU and TYPE block of a text without comments, the lines before it, and the columns before it in its line."""
     begin = line = line_begin = 0
+    if _NAMESPACE.search(text):  # its POUs cannot be parsed without it
+        yield text, 0, 0
+        return
     for found in _ENDS.finditer(text):
         end = found.end()
         if found["end"] is None and end < len(text):

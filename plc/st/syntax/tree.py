@@ -110,10 +110,19 @@ class VarDecl:
 
 
 @dataclass(frozen=True, slots=True)
+class Within:
+    """Where a declaration stands: its namespace, such as ``Plant.Drives``, and the namespaces after USING."""
+
+    namespace: str = ""
+    using: tuple[NamedType, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class StructDecl:
     pos: Pos
     name: str
     fields: tuple[VarDecl, ...]
+    within: Within = Within()
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +134,7 @@ class EnumDecl:
     values: tuple[tuple[str, int | None], ...]
     initial: Init | None
     base: NamedType | None = None
+    within: Within = Within()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +143,7 @@ class AliasDecl:
     name: str
     type: TypeSpec
     initial: Init | None
+    within: Within = Within()
 
 
 TypeDecl = StructDecl | EnumDecl | AliasDecl
@@ -226,6 +237,7 @@ class Pou:
     extends: tuple[NamedType, ...] = ()
     implements: tuple[NamedType, ...] = ()
     modifiers: frozenset[str] = frozenset()
+    within: Within = Within()
 
 
 METHODS = ("METHOD", "GET", "SET")
@@ -240,6 +252,7 @@ class Test:
     name: str
     blocks: tuple[VarBlock, ...]
     body: tuple[Statement, ...]
+    within: Within = Within()
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,7 +161,6 @@ def test_a_folder_without_sources_or_with_too_many_is_refused(tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("text", "construct"),
     [
-        ("NAMESPACE n END_NAMESPACE", "namespaces"),
         (
             "PROGRAM p VAR a : DINT; END_VAR a := BITADR(a); END_PROGRAM",
             "addresses as numbers and memory of a controller",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.scope import Class, Compiling, Method, Symbol, Value
+from fieldtwin.plc.st.compiler.scope import Class, Compiling, Method, Symbol, Value, identifier
 from fieldtwin.plc.st.syntax import tree as t
 
 THIS = ("this", "this^")
@@ -168,7 +168,7 @@ def _of_own(x: Compiling, ref: t.Ref, member: t.Member, kind: str) -> Selected |
         x.env.fail(member.pos, f"{ref.name}.{member.name}: {method} is ABSTRACT and has no statements")
     check_access(x, method, member.pos)
     note(x, method.key, ref.pos)
-    return Selected(method, f"B_{method.owner.lower()}.{method.attribute}", "self")
+    return Selected(method, f"B_{identifier(method.owner)}.{method.attribute}", "self")
 
 
 def check_access(x: Compiling, method: Method, pos: t.Pos) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import Symbol, by_reference
+from fieldtwin.plc.st.compiler.scope import Symbol, by_reference, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -59,10 +59,10 @@ class Bodies:
                 self.functions.write_body(declared, method.signature, body, method.attribute, "self")
         for method in own.methods.values():
             if method.owner != pou.name and not method.abstract:
-                self.out.line(f"{method.attribute} = B_{method.owner.lower()}.{method.attribute}", pou.pos)
+                self.out.line(f"{method.attribute} = B_{identifier(method.owner)}.{method.attribute}", pou.pos)
         for action, declaring in own.actions.items():
             if declaring != own.key:
-                self.out.line(f"a_{action} = B_{declaring}.a_{action}", pou.pos)
+                self.out.line(f"a_{action} = B_{identifier(declaring)}.a_{action}", pou.pos)
 
     @staticmethod
     def _without_call(pou: t.Pou, symbols: dict[str, Symbol]) -> dict[str, Symbol]:
@@ -107,7 +107,7 @@ class Blocks(Bodies):
             for s, attribute in zip(held, kept, strict=True)
             if attribute not in in_outs and not s.is_constant
         )
-        with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
+        with self.out.block(f"class B_{identifier(pou.name)}:", pou.pos):
             self.out.line(f"__slots__ = {(*kept, *number)}")
             self.out.line(f"in_outs = {(*in_outs, *number)}")
             self.out.line(f"name = {pou.name!r}")

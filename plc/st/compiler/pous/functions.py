@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol
+from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -42,14 +42,14 @@ class Functions:
         key = pou.name.lower()
         symbols = self.env.symbols[key] = self.variables.symbols_of(pou, "")
         body = Statements(self.env, symbols, self.out, key)
-        self.write_body(pou, signature, body, f"f_{key}", "")
+        self.write_body(pou, signature, body, f"f_{identifier(pou.name)}", "")
 
     def write_body(self, pou: t.Pou, signature: Signature, body: Statements, name: str, instance: str) -> None:
         """Write the Python function `name` of a FUNCTION or method. `instance` is the name of its first argument, if it has one.
 
         `body` compiles its statements; its symbols are the variables of the POU, and those of its owner.
         """
-        key, symbols = pou.name.lower(), body.symbols
+        key, symbols = pou.name.rpartition(".")[2].lower(), body.symbols
         own = {v.name.lower() for block in pou.blocks for v in block.variables}
         result = "None" if pou.returns is None else f"v_{key}"
         if pou.returns is not None and key in own:

@@ -11,7 +11,7 @@ from fieldtwin.plc.st.compiler.configurations.located import offered
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import Symbol, Value
+from fieldtwin.plc.st.compiler.scope import Symbol, Value, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
@@ -96,8 +96,8 @@ class Programs(Bodies):
         assigned = frozenset(v.attribute for v in variables if v.role != "input")
         variables += self._offered(pou, {v.name.lower() for v in variables})
         self.shared_outputs.update(v.attribute for v in variables if v.shared and v.role != "input")
-        self.outputs[f"P_{pou.name.lower()}"] = assigned
-        with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
+        self.outputs[f"P_{identifier(pou.name)}"] = assigned
+        with self.out.block(f"class P_{identifier(pou.name)}:", pou.pos):
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
             with self.out.block("def execute(self):"):

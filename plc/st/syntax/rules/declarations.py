@@ -77,7 +77,7 @@ class DeclarationRules(Rules):
         return t.AliasDecl(self._pos(items[0]), str(items[0]), spec_of(items), initial_of(items))
 
     def named_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
-        return t.NamedType(self._pos(meta), str(items[0]))
+        return t.NamedType(self._pos(meta), ".".join(items))
 
     def subrange_type(self, meta: Meta, items: list[Any]) -> t.SubrangeType:
         return t.SubrangeType(self._pos(meta), str(items[0]), items[1], items[2])

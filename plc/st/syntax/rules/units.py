@@ -49,11 +49,25 @@ class UnitRules(Rules):
     """The methods of the transformer for the declarations of a file: POUs, configurations."""
 
     def start(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
+        unit = self._unit(items)
+        using = tuple(name for item in items if isinstance(item, _Bases) for name in item.names)
+        return placed(unit, "", using) if using else unit
+
+    def namespace(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
+        name = next(i for i in items if isinstance(i, t.NamedType))
+        using = tuple(name for item in items if isinstance(item, _Bases) for name in item.names)
+        return placed(self._unit(items), name.name, using)
+
+    def using(self, meta: Meta, items: list[Any]) -> _Bases:
+        return _Bases("USING", tuple(items[1:]))
+
+    def _unit(self, items: list[Any]) -> t.SourceUnit:
+        inner = [i for i in items if isinstance(i, t.SourceUnit)]
         types = tuple(one for item in items if isinstance(item, list) for one in item)
         return t.SourceUnit(
-            types,
+            (*types, *(one for unit in inner for one in unit.types)),
             tuple(each for each in _flat(items) if isinstance(each, t.VarBlock)),
-            tuple(_with_members(items)),
+            (*_with_members(items), *(one for unit in inner for one in unit.pous)),
             instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
             tests=tuple(i for i in items if isinstance(i, t.Test)),
             tasks=tuple(each for each in _flat(items) if isinstance(each, t.Task)),
@@ -145,9 +159,10 @@ class UnitRules(Rules):
         actions = tuple(i for i in parts if isinstance(i, t.Action))
         methods = _methods(parts)
         bases = {i.word: i.names for i in rest if isinstance(i, _Bases)}
+        using = tuple(name for i in rest if isinstance(i, _Bases) and i.word == "USING" for name in i.names)
         return t.Pou(
             self._pos(name), kind, str(name), returns, blocks, body, actions, chart_of(parts), methods,
-            bases.get("EXTENDS", ()), bases.get("IMPLEMENTS", ()), modifiers,
+            bases.get("EXTENDS", ()), bases.get("IMPLEMENTS", ()), modifiers, t.Within("", using),
         )  # fmt: skip
 
     def program(self, meta: Meta, items: list[Any]) -> t.Pou:
@@ -166,10 +181,7 @@ class UnitRules(Rules):
         return self._pou("INTERFACE", items)
 
     def pou_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
-        return t.NamedType(self._pos(meta), str(items[0]))
-
-    def base_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
-        return t.NamedType(self._pos(items[0]), ".".join(map(str, items)))
+        return t.NamedType(self._pos(meta), ".".join(items))
 
     def extends(self, meta: Meta, items: list[Any]) -> _Bases:
         return _Bases("EXTENDS", tuple(items))
@@ -211,10 +223,22 @@ _Accessor = tuple[str, frozenset[str], tuple[t.VarBlock, ...], tuple[t.Statement
 
 @dataclass(frozen=True, slots=True)
 class _Bases:
-    """The names after EXTENDS or IMPLEMENTS."""
+    """The names after EXTENDS, IMPLEMENTS or USING."""
 
     word: str
     names: tuple[t.NamedType, ...]
+
+
+def placed(unit: t.SourceUnit, namespace: str, using: tuple[t.NamedType, ...]) -> t.SourceUnit:
+    """Return `unit` with its declarations in a namespace, or in one below it, and with the names after its USING."""
+
+    def of(one: Any) -> Any:
+        parts = [part for part in (namespace, one.within.namespace) if part]
+        return replace(one, within=t.Within(".".join(parts), (*one.within.using, *using)))
+
+    return replace(
+        unit, types=tuple(map(of, unit.types)), pous=tuple(map(of, unit.pous)), tests=tuple(map(of, unit.tests))
+    )
 
 
 def _take(items: list[Any], kind: str) -> list[str]:

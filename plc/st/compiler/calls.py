@@ -243,7 +243,7 @@ class Calls(Expressions):
         if to != of:
             if not (isinstance(to, ty.Block) and isinstance(of, ty.Block)) or to.standard or of.standard:
                 self.env.fail(s.pos, "types differ", expected=str(kinds[0]), got=str(kinds[1]))
-            code = f"_v.attempted({code}, B_{identifier(to.name)})"
+            code = f"_v.attempted({code}, {to.name.lower()!r})"
         self.out.line(f"{target.code} = {code}", s.pos)
 
     def writable(self, ref: t.Ref) -> Value:

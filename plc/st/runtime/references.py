@@ -263,6 +263,9 @@ def whole(array: Any, size: int) -> Any:
     return array
 
 
-def attempted(reference: Reference | None, block: type) -> Reference | None:
-    """Return `reference` if it refers to a `block`, otherwise NULL (the assignment attempt ``?=``)."""
-    return reference if reference is not None and isinstance(reference.v, block) else None
+def attempted(reference: Reference | None, block: str) -> Reference | None:
+    """Return `reference` if it refers to a `block`, or to one that extends it, otherwise NULL (the assignment attempt ``?=``).
+
+    `block` is a name in lower case.
+    """
+    return reference if reference is not None and block in reference.v.kinds else None

@@ -41,7 +41,8 @@ FUNCTION_BLOCK Own EXTENDS Base METHOD PROTECTED OVERRIDE More : INT VAR b : Bli
   Read := SUPER.Read(by, ok => ok); END_METHOD n := n + 1; END_FUNCTION_BLOCK
 NAMESPACE Lib.Inner USING Lib; TYPE Kind : (one, two); END_TYPE FUNCTION pick : Kind pick := Kind#two; END_FUNCTION
   END_NAMESPACE NAMESPACE Lib TYPE Gain : INT := 3; END_TYPE END_NAMESPACE
-PROGRAM p USING Lib.Inner; VAR k : Kind; g : Lib.Gain; o : Own; reader : Reader; END_VAR VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT out : REAL; END_VAR
+PROGRAM p USING Lib.Inner; VAR k : Kind; g : Lib.Gain; o : Own; reader : Reader; END_VAR
+VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT out : REAL; END_VAR
 VAR b : ARRAY[1..2] OF Blink; m : Mode := busy; l : Level; s : STRING[9] := 'a$'b'; pt : Point; i, j : INT; w : WORD; END_VAR
 VAR RETAIN kept : DINT := -5; END_VAR
 b[1](on := go); i := twice(n := i, was => j, p := pt);
@@ -51,7 +52,8 @@ WHILE twice(n := j, p := pt) < 20 DO j := j + 1; END_WHILE;
 REPEAT j := j - 1; UNTIL j <= 0 END_REPEAT;
 s := CONCAT(LEFT(s, 2), MID(s, 1, 2), INT_TO_STRING(i)); w.3 := go; w := SHL(w, 1) OR 16#F0;
 out := REAL#2.5 ** 2 / 3 + SQRT(2.0) * SEL(go, 1.0, 2.0); kept := TRUNC(out) + LEN(s);
-k := pick(); k := Lib.Inner.pick(); g := g + 1; reader := o; o(); o.m := reader.Read(by := i) + o.Read(); IF reader <> NULL THEN reader := NULL; END_IF;
+k := pick(); k := Lib.Inner.pick(); g := g + 1; reader := o; o();
+ o.m := reader.Read(by := i) + o.Read(); IF reader <> NULL THEN reader := NULL; END_IF;
 IF IS_GOOD(go) AND_THEN b[1].q OR_ELSE FIRST_SCAN() THEN RETURN; END_IF;
 END_PROGRAM
 """

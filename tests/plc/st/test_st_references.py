@@ -202,3 +202,17 @@ def test_a_reference_is_shown_without_its_place() -> None:
     scan(made)
     shown = {name: made.internal(name) for name in ("r", "q")}
     assert [found.value for found in shown.values() if found is not None] == ["a reference", "NULL"]
+
+
+def test_an_assignment_attempt_accepts_a_block_that_extends_the_target() -> None:
+    before = """FUNCTION_BLOCK a VAR x : INT; END_VAR ; END_FUNCTION_BLOCK
+    FUNCTION_BLOCK b EXTENDS a END_FUNCTION_BLOCK
+    FUNCTION_BLOCK c EXTENDS b END_FUNCTION_BLOCK"""
+    found = run(
+        "i : a; k : c; r : REF_TO a; s : REF_TO b; b1, b2 : BOOL;",
+        "r := REF(k); s ?= r; b1 := s <> NULL; r := REF(i); s ?= r; b2 := s = NULL;",
+        before,
+    )
+    assert (found["b1"], found["b2"]) == (True, True)
+    with pytest.raises(FileInvalid, match="expected REF_TO b; got REF_TO a"):
+        run("i : a; s : REF_TO b;", "s := REF(i);", before)

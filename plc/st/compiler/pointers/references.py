@@ -86,7 +86,7 @@ def coerced(x: Compiling, value: Value, target: ty.Type, pos: t.Pos, what: str =
 def _converted(x: Compiling, code: str, source: ty.Pointer, target: ty.Pointer, pos: t.Pos) -> str:
     """Return a pointer as one to the same type, to the elements of an array, or to the bytes of a string."""
     held, wanted = source.of, target.of
-    if held == wanted:
+    if held == wanted or _extends(x, source, target, pos):
         return code
     if (
         target.word != REF_TO
@@ -110,6 +110,14 @@ def _converted(x: Compiling, code: str, source: ty.Pointer, target: ty.Pointer, 
         pos, f"the memory of a {held} as a {wanted} is not supported", expected=str(target), got=str(source),
         hint="use a conversion function, or a pointer to the type of the variable",
     )  # fmt: skip
+
+
+def _extends(x: Compiling, source: ty.Pointer, target: ty.Pointer, pos: t.Pos) -> bool:
+    """Return whether a pointer refers to a block that extends the one to which `target` refers."""
+    if not (isinstance(source.of, ty.Named) and isinstance(target.of, ty.Named)):
+        return False
+    derived, base = x.env.target(source, pos), x.env.target(target, pos)
+    return isinstance(derived, ty.Block) and isinstance(base, ty.Block) and base.name.lower() in derived.bases
 
 
 def _row(array: ty.Array) -> ty.Type | ty.Named | None:

@@ -113,6 +113,8 @@ class Blocks(Bodies):
             self.out.line(f"name = {pou.name!r}")
             self.out.line(f"retain = {self._marked(pou, symbols, 'RETAIN', 'PERSISTENT')}")
             self.out.line(f"non_retain = {self._marked(pou, symbols, 'NON_RETAIN')}")
+            if isinstance(kind, ty.Block):
+                self.out.line(f"kinds = {(pou.name.lower(), *sorted(kind.bases))}")
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(
                     pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou))

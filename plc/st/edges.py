@@ -83,6 +83,11 @@ def _called(variable: t.VarDecl) -> t.CallStatement:
 
 def _reading(node: Any, edges: dict[str, t.VarDecl]) -> Any:
     """Return a part of the tree that reads Q of the block in place of an input. Targets of assignments are not replaced."""
+    if isinstance(node, t.Ref) and node.name.lower().removesuffix("^") == "this" and node.selectors:
+        first, *others = node.selectors
+        if isinstance(first, t.Member) and first.name.lower() in edges:
+            members = (t.Member(first.pos, _trigger(first.name)), t.Member(first.pos, "Q"))
+            return t.Ref(node.pos, node.name, (*members, *_reading(tuple(others), edges)))
     if isinstance(node, t.Ref) and node.name.lower() in edges:
         return t.Ref(node.pos, _trigger(node.name), (t.Member(node.pos, "Q"), *_reading(node.selectors, edges)))
     return with_parts(node, lambda part: _reading(part, edges), but="target")

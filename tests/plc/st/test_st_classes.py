@@ -235,6 +235,21 @@ def test_a_method_may_declare_en_and_eno() -> None:
     assert (got["n"], got["m"], got["even"], got["odd"], got["off"]) == (7, 0, True, False, False)
 
 
+def test_a_method_reads_the_edge_of_an_input() -> None:
+    text = """
+        FUNCTION_BLOCK Button
+          VAR_INPUT pressed : BOOL R_EDGE; END_VAR
+          METHOD PUBLIC Seen : BOOL Seen := pressed; END_METHOD
+          METHOD PUBLIC Raw : BOOL Raw := THIS.pressed; END_METHOD
+        END_FUNCTION_BLOCK"""
+    got = run(
+        "b : Button; seen : ARRAY[1..4] OF BOOL;",
+        "b(TRUE); seen[1] := b.Seen(); seen[2] := b.Raw(); b(TRUE); seen[3] := b.Seen(); seen[4] := b.Raw();",
+        text,
+    )
+    assert got["seen"] == [True, True, False, False]
+
+
 # -- in a running program -----------------------------------------------------------------------------------------------
 
 

@@ -77,6 +77,15 @@ def test_two_namespaces_may_declare_the_same_names_and_variables_hide_them() -> 
     assert (got["a"], got["b"]) == (17, 5)
 
 
+def test_a_method_hides_a_function_of_its_namespace() -> None:
+    text = """NAMESPACE Lib
+        FUNCTION Value : INT Value := 1; END_FUNCTION
+        CLASS Own METHOD Value : INT Value := 2; END_METHOD METHOD PUBLIC Read : INT Read := Value(); END_METHOD END_CLASS
+        CLASS Other METHOD PUBLIC Read : INT Read := Value(); END_METHOD END_CLASS
+        END_NAMESPACE"""
+    assert run("o : Lib.Own; p : Lib.Other; n : INT;", "n := 10 * o.Read() + p.Read();", text)["n"] == 21
+
+
 def test_a_namespace_may_be_distributed_over_files(tmp_path: Path) -> None:
     (tmp_path / "a.st").write_text("NAMESPACE Lib CLASS Base VAR PUBLIC n : INT := 3; END_VAR END_CLASS END_NAMESPACE")
     (tmp_path / "b.st").write_text("NAMESPACE Lib CLASS Derived EXTENDS Base END_CLASS END_NAMESPACE")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
-from fieldtwin.plc.st.compiler.classes.members import Selected, class_of, note, selected
+from fieldtwin.plc.st.compiler.classes.members import Selected, class_of, method_of, note, selected
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.expressions import Expressions
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
@@ -34,8 +34,8 @@ class Calls(Expressions):
 
     def call(self, call: t.Call) -> Value:
         name = call.ref.name.lower()
-        method = selected(self, call.ref, "METHOD")
-        signature = method.method.signature if method is not None else self.env.functions.get(name)
+        method = method_of(self, call.ref, "METHOD")
+        signature = method.signature if method is not None else self.env.functions.get(name)
         inner, en, eno = split_control(self.env, call, signature.names() if signature is not None else ())
         if en is not None or eno is not None:
             return self._controlled_call(inner, en, eno)
@@ -43,7 +43,7 @@ class Calls(Expressions):
             if self.only_constants:
                 self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
             if method is not None:
-                return self._user_function(call, signature, method)
+                return self._user_function(call, signature, selected(self, call.ref, "METHOD"))
             note(self, name, call.pos)
             return self._user_function(call, signature)
         if not call.ref.selectors:
@@ -208,16 +208,15 @@ class Calls(Expressions):
         """Write the call of SET if `ref` is a property; return False if it is not."""
         if not ref.selectors and ref.name.lower() in self.symbols:
             return False
-        setter = selected(self, ref, "SET")
+        getter = method_of(self, ref, "GET")
+        setter = selected(self, ref, "SET") if method_of(self, ref, "SET") is not None else None
         if setter is not None:
             kind = setter.method.signature.inputs[0].type
             code = self.coerced(value, kind, pos, f"assigned to {ref.name}")
             self.out.line(setter.called(code), pos)
-            return True
-        getter = selected(self, ref, "GET")
-        if getter is not None:
-            self.env.fail(ref.pos, f"property {getter.method.owner}.{getter.method.signature.name} has no SET")
-        return False
+        elif getter is not None:
+            self.env.fail(ref.pos, f"property {getter.owner}.{getter.signature.name} has no SET")
+        return setter is not None
 
     def refer(self, s: t.Refer) -> None:
         """Write ``reference REF= variable``."""

@@ -9,7 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.classes.members import SUPER, is_own, note, selected
+from fieldtwin.plc.st.compiler.classes.members import SUPER, is_own, method_of, note
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.implicit import meeting
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, Value, default_value, identifier, wrapped
@@ -116,7 +116,7 @@ class Statements(Calls):
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call
         name = call.ref.name.lower()
-        if selected(self, call.ref, "METHOD") is not None:
+        if method_of(self, call.ref, "METHOD") is not None:
             self.out.line(self.value(call).code, s.pos)
             return
         if name in SUPER and not call.ref.selectors and is_own(self, call.ref):

@@ -203,6 +203,20 @@ def test_calls_with_outputs_inside_an_expression_keep_their_order() -> None:
     assert got["c"].v_value == 2
 
 
+@pytest.mark.parametrize(
+    "statement",
+    ["c[Next(calls := n)].Reset(5);", "r := c[Next(calls := n)].Up();", "r := c[Next(calls := n)].Up(EN := TRUE);"],
+)
+def test_the_instance_of_a_call_is_selected_once(statement: str) -> None:
+    got = run(
+        "c : ARRAY[1..9] OF Counter; n, r : INT;",
+        statement,
+        f"{COUNTER} FUNCTION Next : INT VAR_IN_OUT calls : INT; END_VAR calls := calls + 1; Next := calls; END_FUNCTION",
+    )
+    assert got["n"] == 1
+    assert [one.v_value for one in got["c"]] == [max(got["r"], 5 * ("Reset" in statement)), *[0] * 8]
+
+
 def test_arguments_of_a_call_are_evaluated_from_left_to_right() -> None:
     got = run(
         "c : Counter; n : INT; full : BOOL;",

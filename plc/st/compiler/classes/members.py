@@ -59,10 +59,25 @@ def class_of(x: Compiling, kind: ty.Type | None) -> Class | None:
     return x.env.classes.get(kind.name.lower()) if isinstance(kind, ty.Block | ty.Interface) else None
 
 
-def selected(x: Compiling, ref: t.Ref, kind: str) -> Selected | None:
-    """Return the method, GET or SET (`kind`) that `ref` selects; None if it selects something else.
+def method_of(x: Compiling, ref: t.Ref, kind: str) -> Method | None:
+    """Return the method, GET or SET (`kind`) that `ref` selects, without compiling it; None if it selects something else."""
+    if not ref.selectors:
+        return x.own.of(kind, ref.name) if x.own is not None else None
+    *before, last = ref.selectors
+    if not isinstance(last, t.Member):
+        return None
+    if not before and is_own(x, ref):
+        assert x.own is not None
+        return (x.own if ref.name.lower() in THIS else x.own.ancestors[0]).of(kind, last.name)
+    of = class_of(x, x.type_of(replace(ref, selectors=tuple(before))))
+    return of.of(kind, last.name) if of is not None else None
 
-    Raises `FileInvalid` if it is not accessible. The call is added to those that may not be recursive.
+
+def selected(x: Compiling, ref: t.Ref, kind: str) -> Selected | None:
+    """Compile the method, GET or SET (`kind`) that `ref` selects; return None if it selects something else.
+
+    Lines of code that select the instance are written, so this is done once for each call. The call is added to those that must
+    not be recursive. Raises `FileInvalid` if the method is not accessible.
     """
     if not ref.selectors:
         method = x.own.of(kind, ref.name) if x.own is not None else None

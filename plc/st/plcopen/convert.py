@@ -2,8 +2,8 @@
 
 Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
 the user's file. Bodies in FBD and LD become statements of the tree (`networks`), and bodies in SFC become charts (`charts`).
-A POU, an action or a type with a part that is not supported is left out and listed in `Export.missing`. Drawings, task
-configurations and vendors' additions are ignored.
+A POU, an action or a type with a part that is not supported is left out and listed in `Export.missing`. Drawings and vendors'
+additions are ignored.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.plcopen.charts import read_chart
+from fieldtwin.plc.st.plcopen.configurations import configuration_text
 from fieldtwin.plc.st.plcopen.elements import Element, project_of
 from fieldtwin.plc.st.plcopen.networks import Drawn, drawn
 from fieldtwin.plc.st.plcopen.nodes import Unsupported
@@ -75,6 +76,12 @@ class _Converter:
                 self._pou(pou)
         for block in self.project.every("globalVars"):
             self._variables(block)
+        programs = {
+            pou.attributes.get("name", "").lower() for pou in self.project.every("pou") if _kind(pou) == "PROGRAM"
+        }
+        for configuration in self.project.every("configuration"):
+            self.last = configuration.line
+            self._put(configuration.line, configuration_text(configuration, programs))
         lines: list[list[str]] = [[] for _ in range(self.count + 2)]
         for line, text in self.pieces:
             lines[min(line, len(lines) - 1)].append(text)

@@ -88,6 +88,11 @@ _MEANINGS = {
         "CODESYS and TwinCAT they share bits, so the program would behave differently there.",
         "Use addresses that do not overlap, or bits of one variable: `word.3`.",
     ),
+    "ST110": (
+        "The system file binds variables of BOOL, numbers, times and enumerations to tags. A STRING or an array in VAR_INPUT or "
+        "VAR_OUTPUT of a PROGRAM keeps its initial value, or what the program assigns, unless a CONFIGURATION connects it.",
+        "Connect it in a CONFIGURATION, use a variable for each element, or MESSAGES for texts.",
+    ),
 }
 
 ST_WARNINGS = tuple(

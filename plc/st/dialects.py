@@ -38,6 +38,7 @@ FINDINGS = {
     "ST107": "statement that is never executed",
     "ST108": "global variable that programs of several tasks write",
     "ST109": "addresses that overlap in other systems",
+    "ST110": "input or output of a PROGRAM that cannot be a tag",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

@@ -64,7 +64,7 @@ class StProgram(Program):
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""
-        inputs = [v for v in self.st_variables.values() if v.role == "input"]
+        inputs = [v for v in self.st_variables.values() if v.role == "input" and _tag_kind(v.kind) is not None]
         self.st_inputs = [_Input(v) for v in inputs if not v.shared]
         self.st_shared_inputs = [_Input(v) for v in inputs if v.shared]
         """The inputs that are global variables with an address."""

@@ -229,6 +229,13 @@ def _all_bodies(about: _About) -> Iterator[Sequence[t.Statement]]:
             yield one.body
 
 
+def _no_tags(about: _About) -> Iterator[Finding]:
+    for block in about.pou.blocks if about.pou.kind == "PROGRAM" else ():
+        for v in block.variables if block.kind in ("VAR_INPUT", "VAR_OUTPUT") else ():
+            if isinstance(v.type, t.StringType | t.ArrayType):
+                yield "ST110", v.pos, f"{v.name} cannot be a tag, so only a CONFIGURATION can connect it"
+
+
 _RULES: tuple[Callable[[_About], Iterator[Finding]], ...] = (
     _unused,
     _equal_reals,
@@ -237,4 +244,5 @@ _RULES: tuple[Callable[[_About], Iterator[Finding]], ...] = (
     _conditional_calls,
     _divisions,
     _unreachable,
+    _no_tags,
 )

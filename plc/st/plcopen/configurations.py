@@ -62,7 +62,7 @@ def _duration(text: str) -> str:
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element; "" if it is no name of Structured Text."""
+    """Return the name of an element; "" if it is not a valid name."""
     name = element.attributes.get("name", "")
     return name if name.isidentifier() and _is_reference(name) else ""
 

@@ -9,7 +9,9 @@ from st_bench import program
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.st.findings.find import findings
 from fieldtwin.plc.st.program import StProgram, instance_of
+from fieldtwin.plc.st.syntax.parse import parse_all
 
 MAIN = """PROGRAM Main
 VAR_INPUT x : INT; on : BOOL; END_VAR
@@ -142,3 +144,67 @@ def test_var_config_gives_an_address_and_an_initial_value() -> None:
 def test_mistakes_in_configurations_are_refused(old: str, new: str, said: str) -> None:
     with pytest.raises(FileInvalid, match=said):
         program(TWO.replace(old, new, 1), "a")
+
+
+COMPOUND = """TYPE Point : STRUCT x, y : INT; END_STRUCT; END_TYPE
+PROGRAM Main
+VAR_INPUT name : STRING := 'none'; levels : ARRAY[1..3] OF INT; at : Point; END_VAR
+VAR_OUTPUT text : STRING; sums : ARRAY[1..2] OF INT; END_VAR
+VAR_IN_OUT total : INT; box : Point; END_VAR
+VAR length, first : INT; END_VAR
+  length := LEN(name); first := levels[1] + at.x; text := CONCAT(name, '!'); sums[2] := first;
+  total := total + 1; box.y := box.y + total;
+END_PROGRAM
+"""
+
+
+def test_a_program_has_strings_arrays_structures_and_in_outs() -> None:
+    one: Any = program(COMPOUND)
+    assert set(one.variables) == {"total", "length", "first"}
+    scan(one)
+    scan(one, 2)
+    assert (one.length, one.first, one.total) == (4, 0, 2)
+    assert one.internal("text").value == "'none!'"
+    assert one.internal("box.y").value == 3
+
+
+def test_a_configuration_connects_strings_arrays_structures_and_in_outs() -> None:
+    text = (
+        COMPOUND
+        + """CONFIGURATION c
+VAR_GLOBAL n : STRING := 'pump'; l : ARRAY[1..3] OF INT := [5, 6, 7]; p : Point := (x := 2); out : STRING; s : ARRAY[1..2] OF INT;
+  count : INT := 10; b : Point; END_VAR
+PROGRAM a : Main(name := n, levels := l, at := p, total := count, box := b, text => out, sums => s);
+END_CONFIGURATION"""
+    )
+    (one,) = made(text, "a")
+    scan(one)
+    shared = one.st_resource.globals
+    assert (one.length, one.first, one.total) == (4, 7, 11)
+    assert (shared.v_out, shared.v_s, shared.v_count, shared.v_b.m_y) == ("pump!", [0, 7], 11, 11)
+    shared.v_count, shared.v_l[0] = 20, 50
+    scan(one, 2)
+    assert (one.total, shared.v_count, shared.v_b.m_y, shared.v_s) == (21, 21, 32, [0, 52])
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("total := 5", "total of a; expected a variable for a VAR_IN_OUT"),
+        ("total := fixed", "fixed cannot be assigned to"),
+        ("total => count", "Main has no output 'total'"),
+    ],
+)
+def test_an_in_out_needs_a_variable(argument: str, said: str) -> None:
+    text = (
+        COMPOUND
+        + f"""CONFIGURATION c
+VAR_GLOBAL count : INT; END_VAR VAR_GLOBAL CONSTANT fixed : INT := 1; END_VAR PROGRAM a : Main({argument}); END_CONFIGURATION"""
+    )
+    with pytest.raises(FileInvalid, match=said):
+        program(text)
+
+
+def test_inputs_and_outputs_that_are_no_tags_are_a_finding() -> None:
+    found = [one.message.split()[0] for one in findings(parse_all(COMPOUND, "p.st")) if one.id == "ST110"]
+    assert found == ["name", "levels", "text", "sums"]

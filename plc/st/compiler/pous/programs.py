@@ -19,6 +19,10 @@ from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 _API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
 
 
+COMPOUND = (ty.String, ty.Array, ty.Struct)
+"""The types of inputs and outputs of a PROGRAM that cannot be tags. Only a CONFIGURATION can connect them."""
+_BLOCKS = {"VAR_INPUT": "input", "VAR_OUTPUT": "output", "VAR_IN_OUT": "local", "VAR": "local"}
+"""The role of the variables in each block. A VAR_IN_OUT is a variable of the program, which a CONFIGURATION may connect."""
 _ROLES = {"I": "input", "Q": "output", "M": "local"}
 
 
@@ -67,11 +71,7 @@ class Programs(Bodies):
         self.note_parts(pou, symbols)
         variables = []
         for block in pou.blocks:
-            role = {"VAR_INPUT": "input", "VAR_OUTPUT": "output", "VAR": "local"}.get(block.kind)
-            if block.kind == "VAR_IN_OUT":
-                self.env.fail(
-                    block.pos, "a PROGRAM has no VAR_IN_OUT", hint="VAR_INPUT and VAR_OUTPUT are bound to tags"
-                )
+            role = _BLOCKS.get(block.kind)
             retain = bool(block.qualifiers & {"RETAIN", "PERSISTENT"})
             for v in block.variables if role else ():
                 if "CONSTANT" not in block.qualifiers and v.name.lower() in symbols:
@@ -99,10 +99,10 @@ class Programs(Bodies):
         self.outputs[f"P_{identifier(pou.name)}"] = assigned
         with self.out.block(f"class P_{identifier(pou.name)}:", pou.pos):
             with self.out.block("def __init__(self):"):
-                self.variables.initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
+                self.variables.initialise(pou, symbols, tuple(_BLOCKS))
             with self.out.block("def execute(self):"):
                 self.variables.initialise(pou, symbols, ("VAR_TEMP",))
-                inputs = frozenset(v.name for v in variables if v.role == "input")
+                inputs = frozenset(v.name for v in variables if v.role == "input" and not isinstance(v.kind, COMPOUND))
                 body = self.body_of(pou, symbols, pou.name.lower())
                 body.program_inputs = set(inputs)
                 body.body(pou.body)
@@ -121,20 +121,38 @@ class Programs(Bodies):
             with self.out.block(f"def {connection(instance.name, into=into)}(self):", instance.pos):
                 for argument in valid:
                     symbol = symbols.get(argument.name.lower())
-                    if symbol is None or (argument.value is not None) is not into:
+                    if symbol is None:
                         continue
                     with self.env.errors.collect():
-                        if argument.value is not None:
-                            value = body.value(argument.value, symbol.type)
-                            code = body.coerced(value, symbol.type, argument.pos, f"{argument.name} of {instance.name}")
-                            self.out.line(f"{symbol.code} = {code}", argument.pos)
-                        else:
-                            body.take(argument, Value(symbol.code, symbol.type))
+                        self._write_connection(argument, body, symbol, instance, into=into)
+
+    def _write_connection(
+        self, argument: t.Argument, body: Statements, symbol: Symbol, instance: t.Instance, *, into: bool
+    ) -> None:
+        """Write one copy before (`into`) or after the scan. A VAR_IN_OUT is copied both times."""
+        if argument.value is None:
+            if not into:
+                body.take(argument, Value(symbol.code, symbol.type))
+        elif into:
+            value = body.value(argument.value, symbol.type)
+            code = body.coerced(value, symbol.type, argument.pos, f"{argument.name} of {instance.name}")
+            if isinstance(symbol.type, ty.Array | ty.Struct):
+                function = "fill" if isinstance(symbol.type, ty.Array) else "put"
+                self.out.line(f"_v.{function}({symbol.code}, {code})", argument.pos)
+            else:
+                self.out.line(f"{symbol.code} = {code}", argument.pos)
+        elif not symbol.is_input:
+            if not isinstance(argument.value, t.Ref):
+                self.env.fail(
+                    argument.pos, f"{argument.name} of {instance.name}", expected="a variable for a VAR_IN_OUT"
+                )
+            body.assign(argument.value, Value(symbol.code, symbol.type), argument.pos)
 
     def _is_connection(self, argument: t.Argument, pou: t.Pou) -> bool:
         """Return whether an argument of a program is an input with a valueor an output with a target; add an error if not."""
-        kind, what = ("VAR_INPUT", "input") if argument.value is not None else ("VAR_OUTPUT", "output")
-        known = [v.name for b in pou.blocks if b.kind == kind for v in b.variables if not v.location]
+        is_input = argument.value is not None
+        kinds, what = (("VAR_INPUT", "VAR_IN_OUT"), "input") if is_input else (("VAR_OUTPUT",), "output")
+        known = [v.name for b in pou.blocks if b.kind in kinds for v in b.variables if not v.location]
         if argument.name.lower() in {name.lower() for name in known}:
             return True
         message, expected = (
@@ -162,8 +180,10 @@ class Programs(Bodies):
             yield ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
-        parts = ty.String | ty.Array | ty.Struct | ty.Block | ty.Pointer | ty.Interface | ty.OpenArray
-        if role != "local" and (isinstance(kind, parts) or ty.is_kind(kind, "char")):
+        if (role == "local" or (isinstance(kind, COMPOUND) and not v.location)) and not isinstance(kind, ty.OpenArray):
+            return
+        parts = (*COMPOUND, ty.Block, ty.Pointer, ty.Interface, ty.OpenArray)
+        if isinstance(kind, parts) or ty.is_kind(kind, "char"):
             self.env.fail(
                 v.pos,
                 f"{v.name} cannot be bound to a tag",

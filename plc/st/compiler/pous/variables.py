@@ -146,7 +146,7 @@ class Variables:
                     if v.name.lower() in symbols:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
-                    symbol = self._variable(v, block, before)
+                    symbol = self._variable(v, block, before, of_program=pou.kind == "PROGRAM")
                     if "." not in symbol.code and v.name.lower() in addressed and not by_reference(symbol.type):
                         symbol = replace(symbol, code=f"{symbol.code}.v", reference=symbol.code)
                     symbols[v.name.lower()] = symbol
@@ -166,14 +166,14 @@ class Variables:
         self.declarations.bounded(pou.pos, own)
         return symbols
 
-    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str) -> Symbol:
+    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str, *, of_program: bool) -> Symbol:
         if block.kind == "VAR_EXTERNAL":
             return self._external(v)
         code = f"{prefix}v_{v.name.lower()}"
         symbol = self._symbol(v, block, code)
         if {INHERITED, "PRIVATE"} <= block.qualifiers:
             return replace(symbol, refused=f"{v.name} is PRIVATE in the POU that declares it")
-        if block.kind == "VAR_IN_OUT" and not by_reference(symbol.type):
+        if block.kind == "VAR_IN_OUT" and not of_program and not by_reference(symbol.type):
             return replace(symbol, code=f"{code}.v", reference=code)
         return symbol
 

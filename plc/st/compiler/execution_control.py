@@ -55,8 +55,14 @@ def split_control(
     """Return `call` without the arguments EN and ENO, the value of EN, and the argument ENO; None for one that is not given.
 
     `declared`: the parameters of what is called, in lower case. An EN or ENO that it declares is an ordinary argument.
-    Raises `FileInvalid` for one that is given twice.
+    Raises `FileInvalid` for one that is given twice, and for an empty argument in a dialect that has none.
     """
+    if call.empty is not None and not env.dialect.vendor:
+        env.fail(
+            call.empty,
+            f"an empty argument of {call.ref.name}",
+            expected="a value or a variable (or leave the argument out)",
+        )
     en: t.Expr | None = None
     eno: t.Argument | None = None
     rest: list[t.Argument] = []

@@ -57,6 +57,10 @@ class Statements(Calls):
     # -- assignment and calls -----------------------------------------------------------------------------------------
 
     def _assign(self, s: t.Assign) -> None:
+        if s.word and not self.env.dialect.vendor:
+            self.env.fail(
+                s.pos, f"{s.word} is not in this dialect", expected=f"IF condition THEN {s.target.name} := ..."
+            )
         self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
     def _refer(self, s: t.Refer) -> None:

@@ -31,7 +31,7 @@ _READABLE = {
     "STRING_LITERAL": "a string", "WSTRING_LITERAL": "a string", "ENUM_REF": "a name", "VAR_KIND": "VAR", "SEMICOLON": ";",
     "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
-    "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
+    "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT", "SET_ASSIGN": "S=",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
     "USING": "USING",
     "PARTIAL": "%X0", "TYPED_TEXT": "a string", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",

@@ -385,9 +385,13 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class Call:
+    """A call. `empty` is the place of the first argument without a value or variable (``f(IN := )``), which CODESYS allows;
+    `arguments` has only the others."""
+
     pos: Pos
     ref: Ref
     arguments: tuple[Argument, ...] = ()
+    empty: Pos | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,9 +417,14 @@ Init = Literal | Ref | Call | Binary | Unary | InitArray | InitStruct
 
 @dataclass(frozen=True, slots=True)
 class Assign:
+    """``target := value``. `word` is ``S=`` or ``R=`` in the statement that CODESYS writes with it, whose condition is
+    around the assignment; else "".
+    """
+
     pos: Pos
     target: Ref
     value: Expr
+    word: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,8 @@ from fieldtwin.plc.st.syntax.xml_text import parse_xml
 
 _ROOT = re.compile(r"\s*(<\?xml[^>]*\?>)?\s*<TcPlcObject\b")
 _KIND = re.compile(
-    r"(?:\s|\(\*.*?\*\)|//[^\n]*|\{[^}]*\})*(FUNCTION_BLOCK|FUNCTION|PROGRAM|INTERFACE)\b", re.DOTALL | re.IGNORECASE
+    r"(?:\s|\(\*(?:[^*]|\*(?!\)))*\*\)|//[^\n]*(?![^\n])|\{[^}]*\})*(FUNCTION_BLOCK|FUNCTION|PROGRAM|INTERFACE)\b",
+    re.DOTALL | re.IGNORECASE,
 )
 """The first word of a declaration; comments and pragmas are skipped."""
 _OBJECTS = ("POU", "Itf", "DUT", "GVL")

@@ -221,3 +221,52 @@ def test_many_warnings_of_one_id_hide_no_other_and_say_that_there_are_more() -> 
     assert [w.id for w in found] == [*["ST002"] * MAX_WARNINGS, "ST001"]
     assert found[-2].message.endswith("further warnings ST002 are not listed")
     assert "further" not in found[-3].message
+
+
+LAMP = """FUNCTION_BLOCK Blink
+VAR_INPUT on : BOOL; n : INT := 4; END_VAR
+VAR_OUTPUT lit : BOOL; count : INT; END_VAR
+  lit := on; count := count + n;
+END_FUNCTION_BLOCK
+PROGRAM p VAR b : Blink; s, r, i : INT; x, y : BOOL; END_VAR
+"""
+
+
+def last_of(body: str, dialect: str, scans: int = 1) -> dict[str, Any]:
+    made = program_class(compile_text(f"{LAMP}{body}\nEND_PROGRAM", "p.st", DIALECTS[dialect]))()
+    for _ in range(scans):
+        scan(made)
+    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
+
+
+EMPTY_OR_LATCHED = [
+    # The help of CODESYS, "Assignment Operator S=": a TRUE operand sets the variable, which then keeps its value.
+    ("x S= i < 1; i := i + 1;", "x", True),
+    ("x := TRUE; x R= i > 5;", "x", True),
+    ("x := i = 0; x R= i = 2; i := i + 1;", "x", False),
+    # An empty argument of a block leaves its input at the value of the last call, or at its initial value.
+    ("b(on := TRUE, n := , lit => x, count => );  s := b.count;", "s", 12),
+    ("b(on := TRUE, lit => x,); s := b.count;", "s", 12),
+    ("b(on := , n := 1); s := b.count; x := b.lit;", "s", 3),
+]
+
+
+@pytest.mark.parametrize(("body", "name", "expected"), EMPTY_OR_LATCHED)
+def test_vendors_calls_have_empty_arguments_and_statements_set_and_reset(body: str, name: str, expected: Any) -> None:
+    for dialect in ("codesys", "twincat"):
+        assert last_of(body, dialect, scans=3)[name] == expected
+    for dialect in ("standard", "matiec"):
+        with pytest.raises(FileInvalid, match=r"an empty argument of b|[SR]= is not in this dialect"):
+            last_of(body, dialect)
+
+
+def test_variables_may_have_the_names_s_and_r() -> None:
+    assert last_of("s := 3; r := 4; IF r = 4 AND s= 3 THEN i := s; END_IF", "codesys")["i"] == 3
+
+
+def test_a_semicolon_may_follow_the_result_of_a_function() -> None:
+    twice = "FUNCTION Twice : INT; VAR_INPUT n : INT; END_VAR Twice := 2 * n; END_FUNCTION\n"
+    text = f"{twice}PROGRAM p VAR r : INT; END_VAR\nr := Twice(4); END_PROGRAM"
+    made = program_class(compile_text(text, "p.st", DIALECTS["twincat"]))()
+    scan(made)
+    assert vars(made.st_body)["v_r"] == 8

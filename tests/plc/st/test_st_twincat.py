@@ -259,3 +259,12 @@ def test_a_file_with_random_damage_is_read_or_refused(whole: str, at: int, remov
 def test_a_file_of_twincat_is_known_by_its_root() -> None:
     assert is_twincat("\ufeff" + MAIN)
     assert not is_twincat("<project/>")
+
+
+def test_a_comment_with_the_word_function_is_not_the_kind_of_an_object(tmp_path: Path) -> None:
+    path = tmp_path / "Version.TcGVL"
+    path.write_text(f"""{HEAD}<GVL Name="Version" Id="{{5}}"><Declaration><![CDATA[{{attribute 'linkalways'}}
+// This FUNCTION has been made (* by a tool *)
+(* of a FUNCTION *) VAR_GLOBAL CONSTANT major : INT := 3; END_VAR
+]]></Declaration></GVL></TcPlcObject>""")
+    assert "END_FUNCTION" not in to_st(path.read_text())

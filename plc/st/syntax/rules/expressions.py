@@ -25,7 +25,15 @@ class ExpressionRules(Rules):
         return t.Unary(self._pos(meta), items[0].upper(), items[1])
 
     def call(self, meta: Meta, items: list[Any]) -> t.Call:
-        return t.Call(self._pos(meta), items[0], tuple(items[1:]))
+        ref, *given = items
+        empty = next((each for each in given if isinstance(each, t.Pos)), None)
+        arguments = tuple(each for each in given if not isinstance(each, t.Pos))
+        return t.Call(self._pos(meta), ref, arguments, empty)
+
+    def left_out(self, meta: Meta, items: list[Any]) -> t.Pos:
+        return self._pos(meta)
+
+    left_comma = left_out
 
     def operator(self, meta: Meta, items: list[Any]) -> t.Ref:
         return t.Ref(self._pos(meta), str(items[0]))

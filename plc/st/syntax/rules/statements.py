@@ -33,6 +33,12 @@ class StatementRules(Rules):
     def refer(self, meta: Meta, items: list[Any]) -> t.Refer:
         return t.Refer(self._pos(meta), items[0], items[1])
 
+    def latch(self, meta: Meta, items: list[Any]) -> t.If:
+        target, word, condition = items
+        constant = t.Literal(self._pos(word), *(["TRUE"] * 2 if word[0] in "Ss" else ["FALSE"] * 2))
+        assign = t.Assign(self._pos(meta), target, constant, word.upper())
+        return t.If(self._pos(meta), ((condition, (assign,)),), ())
+
     def attempt(self, meta: Meta, items: list[Any]) -> t.Attempt:
         return t.Attempt(self._pos(meta), items[0], items[1])
 

@@ -25,6 +25,7 @@ from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.installation import install_hint
 from fieldtwin.northbound.process_config import require_packages
+from fieldtwin.plc.st.model_checking.solver import require_solver
 from fieldtwin.run.fmu_export.packing import ExportOptions, export_fmu
 from fieldtwin.run.places.clusters import place_named
 from fieldtwin.run.processes import event_loop as loops
@@ -90,6 +91,10 @@ def use_cluster(folder: Path) -> None:
     place_named("dask://127.0.0.1:8786", None)
 
 
+def use_prove(folder: Path) -> None:
+    require_solver()
+
+
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "aiomqtt": ("mqtt", use_mqtt, "fieldtwin.twin.thread.mqtt.session"),
     "asyncua": ("opcua", use_opcua, ""),
@@ -101,11 +106,12 @@ USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "pythonfmu": ("fmi", use_fmi_export, ""),
     "pyarrow": ("parquet", use_parquet, ""),
     "mcap": ("mcap", use_mcap, ""),
+    "z3": ("prove", use_prove, ""),
     "cantools": ("dbc", use_dbc, ""),
     "basyx": ("aas", use_aas, ""),
 }
 
-DISTRIBUTIONS = {"basyx": "basyx-python-sdk"}
+DISTRIBUTIONS = {"basyx": "basyx-python-sdk", "z3": "z3-solver"}
 """The distribution of each package whose name differs."""
 
 

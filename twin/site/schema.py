@@ -182,6 +182,18 @@ class ProgramForm(SiteModel):
     start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[Name, InputForm] = Field(default={})
     outputs: dict[Name, TagName] = Field(default={})
+    invariants: dict[str, str] = Field(
+        default={},
+        max_length=64,
+        description="of a source in Structured Text, for `plc prove`: by name an expression over its variables that is TRUE "
+        "after every scan",
+    )
+    assumptions: dict[str, str] = Field(
+        default={},
+        max_length=64,
+        description="for `plc prove`: by name an expression over its variables that is TRUE before every scan, such as a limit "
+        "of an input",
+    )
 
 
 class TaskForm(SiteModel):

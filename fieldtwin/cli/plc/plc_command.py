@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import click
 import msgspec
 
-from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import NegativeNumbers, json_option
-from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.plc.check_command import check
 from fieldtwin.cli.plc.debug_command import debug
 from fieldtwin.cli.plc.diagram_command import diagram
-from fieldtwin.cli.plc.sources import agreed_system, source_file
-from fieldtwin.cli.template_question import TemplateSearchOptions
+from fieldtwin.cli.plc.prove_command import prove
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
@@ -60,6 +56,7 @@ def command() -> None:
 command.add_command(check)
 command.add_command(debug)
 command.add_command(diagram)
+command.add_command(prove)
 
 
 def _emit(value: Any) -> int:
@@ -249,63 +246,3 @@ def why(tag: str, instance: str, as_json: bool) -> int:
         return _emit(answer["changes"])
     print_why(tag, answer["changes"], answer["waits_for"])
     return 0
-
-
-@command.command("prove")
-@click.argument("system")
-@click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a proof.")
-@click.option("--max-states", type=click.IntRange(1), default=200_000, show_default=True)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Write a counterexample to this file, as a scenario.",
-)
-@group("Options", sources=TemplateSearchOptions)
-@json_option
-def prove(
-    system: str,
-    program: str,
-    max_states: int,
-    output: Path | None,
-    sources: TemplateSearchOptions,
-    as_json: bool,
-) -> int:
-    """Check all reachable states of a program of SYSTEM against its invariants.
-
-    The search is breadth-first over states, inputs, qualities and timer phases, as defined by the PROOF in the module next to
-    the program (the program's module name with the suffix _proof). Exit code 1 with a shortest counterexample, or if a bound
-    was reached before all states were visited.
-    """
-    from fieldtwin.cli.plc.views import print_proof
-    from fieldtwin.plc.prove import prove as look
-    from fieldtwin.run.processes.plc_client import chosen, proof_of
-    from fieldtwin.scenarios.language.counterexample import scenario
-
-    if source_file(system, None, ()) is not None:
-        raise UsageError(
-            f"{system} is no system", expected="a system with a Python program that has a PROOF next to it"
-        )
-    loaded = agreed_system(system, sources)
-    name, proof = chosen(loaded, program, proof_of, "a proof")
-    result = look(proof, max_states)
-    text = scenario(loaded, name, proof, result) if result.broken else ""
-    if output is not None and text:
-        write_text(output, text)
-    if as_json:
-        _emit(
-            {
-                "program": name,
-                "proved": result.proved,
-                "states": result.states,
-                "transitions": result.transitions,
-                "depth": result.depth,
-                "invariants": list(proof.invariants),
-                "broken": result.broken,
-                "reason": result.reason,
-                "way": [given.describe() for given in result.way],
-            }
-        )
-    else:
-        print_proof(name, proof, result, text)
-    return 0 if result.proved else 1

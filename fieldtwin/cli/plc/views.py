@@ -12,11 +12,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.console import stderr, stdout
+from fieldtwin.console import stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.plc.prove import Proof, SearchResult
 from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE, matches
 from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
 from fieldtwin.run.processes.plc_client import running_instances
@@ -133,7 +132,7 @@ def _quality(row: Row) -> str:
 
 
 def print_tags(rows: list[Row]) -> None:
-    _print_table(tag_table(rows))
+    print_table(tag_table(rows))
 
 
 def _width() -> int:
@@ -141,7 +140,7 @@ def _width() -> int:
     return stdout.width if stdout.is_terminal else IN_A_PIPE
 
 
-def _print_table(table: Table) -> None:
+def print_table(table: Table) -> None:
     console = stdout if stdout.is_terminal else Console(file=stdout.file, width=IN_A_PIPE, highlight=False, emoji=False)
     console.print(table)
 
@@ -193,7 +192,7 @@ def print_status(status: PlcStatus) -> None:
             name, every, str(task.scans), str(task.missed_periods), str(task.overruns),
             *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
         )  # fmt: skip
-    _print_table(table)
+    print_table(table)
     replaced = f"; programs replaced while they ran: {status.changes.count}" if status.changes.count else ""
     stdout.print(f"restarts: {status.restarts}; {status.retain.start}{replaced}", markup=False)
     realtime = status.realtime or RealtimeStatus()
@@ -282,21 +281,6 @@ def _print_decision(place: str, decided: Mapping[str, Any]) -> None:
         stdout.print(f"        {said} {one['text']}  (line {one['line']})", markup=False, soft_wrap=True)
     for name, value in decided.get("variables", {}).items():
         stdout.print(f"        {name} is {value} after the scan", markup=False, soft_wrap=True)
-
-
-def print_proof(name: str, proof: Proof, result: SearchResult, text: str) -> None:
-    seen = f"{result.states} states, {result.transitions} scans, {result.depth} deep"
-    if result.proved:
-        stdout.print(f"{name}: proved for {seen}", markup=False)
-        for invariant in proof.invariants:
-            stdout.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
-    elif result.broken:
-        stdout.print(f"{name}: violated after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
-        stdout.print(text, markup=False, highlight=False, soft_wrap=True, end="")
-    else:
-        stdout.print(f"{name}: no violation in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
-        if result.bounded:
-            stderr.print("raise --max-states")
 
 
 def _us(us: float) -> str:

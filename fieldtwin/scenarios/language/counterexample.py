@@ -9,7 +9,7 @@ appear in it as comments.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from fieldtwin.gateway.core.image.image import TagKind
@@ -26,19 +26,33 @@ _NEEDS = {"send": "send_command", "set": "set_value", "fault": "inject_fault", "
 
 def scenario(system: System, program: str, proof: Proof, result: SearchResult) -> str:
     """Return a scenario file (docs/reference/scenarios.md) for the counterexample `result` of `program`."""
-    steps = list(_steps(system, program, proof.make(), result.way))
+    comment = f"The shortest way that was found ({len(result.way)} scans) to where this does not hold: {result.broken}"
+    never = outputs_seen(system, program, proof, result.way)
+    requirement = proof.requirement.get(result.broken, "")
+    return scenario_file(system, program, result.broken, comment, proof.make(), result.way, never, requirement)
+
+
+def scenario_file(
+    system: System, program: str, broken: str, comment: str, made: Program, way: Sequence[Given], never: str,
+    requirement: str = "",
+) -> str:  # fmt: skip
+    """Return a scenario file with the inputs of `way`, which violates the invariant `broken` of `program`.
+
+    `made` is the program, and `never` a condition of scenarios that must never be true ("" for none).
+    """
+    steps = list(_steps(system, program, made, way))
     needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
     lines = [
-        f"# The shortest way that was found ({len(result.way)} scans) to where this does not hold: {result.broken}",
-        f"scenario: {_text(f'{program}: {result.broken}')}",
+        f"# {comment}",
+        f"scenario: {_text(f'{program}: {broken}')}",
         f"system: {_text(system.path.name)}",
     ]
     if needs:
         lines.append(f"needs: [{', '.join(needs)}]")
-    if requirement := proof.requirement.get(result.broken):
+    if requirement:
         lines.append(f"requirements: [{_text(requirement)}]")
-    if seen := _seen(system, program, proof, result):
-        lines += ["never:", f"  - {_text(seen)}"]
+    if never:
+        lines += ["never:", f"  - {_text(never)}"]
     lines.append("steps:")
     lines += [f"  # {what}" if word == "#" else f"  - {word}: {what}" for word, what in steps]
     lines.append(f"  - pause: {ARRIVES}")
@@ -50,7 +64,7 @@ def _text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def _seen(system: System, program: str, proof: Proof, result: SearchResult) -> str:
+def outputs_seen(system: System, program: str, proof: Proof, way: Sequence[Given]) -> str:
     """Return the outputs that the broken program showed, as an expression ``PROGRAM.VARIABLE == VALUE and ...``.
 
     Outputs that are bound to a device are left out, because the device's tag covers them.
@@ -58,14 +72,14 @@ def _seen(system: System, program: str, proof: Proof, result: SearchResult) -> s
     bound = system.plc.programs[program].outputs
     words = {v.name: dict(v.words) for v in proof.make().variables.values()}
     parts = []
-    for name, value in shown(proof, result.way).items():
+    for name, value in shown(proof, way).items():
         if name not in bound and value is not None:
             word = words[name].get(value) if isinstance(value, int) else None
             parts.append(f"{program}.{name} == {repr(word) if word else repr(value)}")
     return " and ".join(parts)
 
 
-def _steps(system: System, program: str, made: Program, way: tuple[Given, ...]) -> Iterator[tuple[str, str]]:
+def _steps(system: System, program: str, made: Program, way: Sequence[Given]) -> Iterator[tuple[str, str]]:
     """Yield (keyword, argument) for each step; the keyword ``#`` is a comment."""
     bindings = system.plc.programs[program].inputs
     before: dict[str, Any] = {}

@@ -71,6 +71,8 @@ class CompiledUnit:
     symbols: Mapping[str, tuple[Symbol, ...]] = field(default_factory=dict)
     """By POU, or method (``pou.method``), in lower case: its variables, each with the Python code that reads it."""
     global_symbols: tuple[Symbol, ...] = ()
+    places: tuple[t.Pos, ...] = ()
+    """The position in the source of each line of `python`."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -141,7 +143,8 @@ class _Unit:
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
-        code = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs).code(text)
+        lines = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs)
+        code = lines.code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
             self.path,
@@ -161,6 +164,7 @@ class _Unit:
             dict(self._names()),
             {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
             tuple(dict.fromkeys(self.env.globals.values())),
+            tuple(lines.places()),
         )
 
     def _names(self) -> Iterator[tuple[str, str]]:

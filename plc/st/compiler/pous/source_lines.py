@@ -23,7 +23,7 @@ class SourceLines:
 
     def code(self, text: str) -> tuple[CodeType, ...]:
         """Return the code of each file, in the order of the Python code `text`. Raises `FileInvalid` beyond Python's limits."""
-        places = self._places()
+        places = self.places()
         try:
             tree = ast.parse(text)
             parts: list[tuple[str, list[ast.stmt]]] = []
@@ -38,7 +38,7 @@ class SourceLines:
             place = places[min(at, len(places)) - 1]
             raise FileInvalid(f"too deep for the compiler: {e}", path=place.path, line=place.line, column=1) from e
 
-    def _places(self) -> list[t.Pos]:
+    def places(self) -> list[t.Pos]:
         """Return the position in the source of each line of the Python code."""
         last, places = t.Pos(1, 1, self.path), []
         for _, pos in self.out.lines:

@@ -1,0 +1,233 @@
+"""Proves properties of a program in Structured Text, and reports what was proved, what was only bounded, and what is violated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import z3
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.model_checking.properties import Asked, Expression, State, asked
+from fieldtwin.plc.st.model_checking.replay import Check, ModelDisagrees, Replay, held, instances
+from fieldtwin.plc.st.model_checking.solving import FAILS, Answer, Limits, Scan, solve
+from fieldtwin.plc.st.model_checking.transition import HIDDEN, Builder, Transition
+from fieldtwin.plc.st.program import StProgram, program_class
+from fieldtwin.plc.st.syntax import tree as t
+
+_HOLDS_NS = tuple(round(seconds * 1e9) for seconds in (10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02))
+NO_FAILURE = "no scan ends with an error"
+"""The name of the invariant that is always examined: no division by zero, no index outside of its array, and so on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question about a program of a unit.
+
+    `invariants` and `assumptions` are names with expressions over the variables of the program. The time between two scans is
+    any time from `interval_ns[0]` to `interval_ns[1]`.
+    """
+
+    unit: t.SourceUnit
+    path: str
+    program: str
+    dialect: Dialect = STANDARD
+    invariants: tuple[tuple[str, str], ...] = ()
+    assumptions: tuple[tuple[str, str], ...] = ()
+    interval_ns: tuple[int, int] = (1_000_000, 3_600_000_000_000)
+    states: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The answer about an invariant. `failure` is the error of the scan that violates it, if that scan ended with one.
+
+    `values` are the program's variables after the last scan of a counterexample.
+    """
+
+    name: str
+    expression: str
+    check: Check | None
+    answer: Answer
+    failure: str = ""
+    values: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """Return ``proved``, ``violated`` or ``bounded``."""
+        return "violated" if self.answer.way is not None else "bounded" if self.answer.proved is None else "proved"
+
+
+@dataclass(frozen=True, slots=True)
+class StateResult:
+    """The answer about a state: it is reached by the scans of the answer (none: it is the initial state), or proved to be
+    unreachable, or neither is known."""
+
+    pou: str
+    variable: str
+    state: str
+    answer: Answer
+
+    @property
+    def verdict(self) -> str:
+        """Return ``reached``, ``unreachable`` or ``open``."""
+        return "reached" if self.answer.way is not None else "open" if self.answer.proved is None else "unreachable"
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All answers about a program. `unknowns` are the operations whose results may have any value in the model."""
+
+    program: str
+    invariants: tuple[Result, ...]
+    states: tuple[StateResult, ...]
+    assumptions: tuple[tuple[str, str], ...]
+    interval_ns: tuple[int, int]
+    unknowns: tuple[tuple[str, t.Pos], ...]
+    make: type[StProgram]
+
+    replay: Replay
+
+    @property
+    def proved(self) -> bool:
+        """Return whether all invariants are proved."""
+        return all(result.verdict == "proved" for result in self.invariants)
+
+    def held(self, result: Result, cycle_ns: int) -> tuple[Scan, ...] | None:
+        """Return scans every `cycle_ns` that violate an invariant, and keep the inputs of its counterexample as long as possible.
+
+        None if the counterexample needs inputs that change in certain scans, or scans at other times.
+        """
+        for hold_ns in (*_HOLDS_NS, cycle_ns):
+            way = held(result.answer.way or (), hold_ns, cycle_ns)
+            if hold_ns >= cycle_ns and (found := self.replay.first_violation(way, result.check)):
+                return way[: found[0]]
+        return None
+
+
+def prove(question: Question, limits: Limits) -> Report:
+    """Answer a question within limits.
+
+    Raises `FileInvalid` for an error in the program or a construct without a model, `UsageError` for an error in an
+    expression, and `ModelDisagrees` if the program does not do what the model does.
+    """
+    _refuse_shared(question)
+    found = asked(
+        question.unit, question.program, question.path, question.dialect, question.invariants, question.assumptions
+    )
+    kind = program_class(found.unit, question.program)
+    return _Proof(question, found, kind).report(limits)
+
+
+def _refuse_shared(question: Question) -> None:
+    """Refuse a program whose global variables another program may change, because the model contains one program."""
+    others = [p.name for p in question.unit.pous if p.kind == "PROGRAM" and p.name.lower() != question.program.lower()]
+    blocks = [block for block in question.unit.globals if "CONSTANT" not in block.qualifiers and block.variables]
+    if others and blocks:
+        shared = blocks[0].variables[0]
+        raise FileInvalid(
+            f"plc prove examines one program, and {others[0]} may change the global variable {shared.name}",
+            path=shared.pos.path, line=shared.pos.line, column=shared.pos.column,
+            hint="pass values between programs through their inputs and outputs",
+        )  # fmt: skip
+
+
+class _Proof:
+    def __init__(self, question: Question, found: Asked, kind: type[StProgram]) -> None:
+        self._question, self._found, self._kind = question, found, kind
+        own = kind()
+        self._states: list[State] = [
+            state for state in found.states if question.states and instances(own, self._pou(state.away))
+        ]
+        self._checked: list[Expression] = [*found.invariants, *(state.away for state in self._states)]
+        self._replay = Replay(kind, [self._check(each) for each in found.assumptions])
+
+    def _pou(self, expression: Expression) -> str:
+        return "" if expression.pou.lower() == self._question.program.lower() else expression.pou
+
+    def _check(self, expression: Expression) -> Check:
+        return Check(expression.key, self._pou(expression))
+
+    def report(self, limits: Limits) -> Report:
+        program = self._kind()
+        builder = Builder(program, self._question.interval_ns)
+        calls = [
+            [(instances(program, self._pou(e)), e.key) for e in each]
+            for each in (self._found.assumptions, self._checked)
+        ]
+        transition = builder.build(*calls)
+        numbers = [FAILS, *range(len(self._checked))]
+        initial = [n for n in numbers if n != FAILS and not _is_true(transition.initially[n])]
+        first_state = len(self._found.invariants)
+        started = [n for n in initial if n >= first_state]
+        answers = solve(
+            transition,
+            [n for n in numbers if n not in started],
+            limits,
+            lambda number, way: self._accepts(transition, number, way),
+        )
+        answers.update({n: Answer(way=()) for n in started})
+        return Report(
+            program=self._question.program,
+            invariants=(
+                *(
+                    self._result(e.name, e.text, self._check(e), answers[n])
+                    for n, e in enumerate(self._found.invariants)
+                ),
+                self._result(NO_FAILURE, "", None, answers[FAILS]),
+            ),
+            states=tuple(
+                StateResult(
+                    s.machine.pou, s.machine.variable, s.state, self._shortened(self._check(s.away), answers[n])
+                )
+                for n, s in enumerate(self._states, first_state)
+            ),
+            assumptions=self._question.assumptions,
+            interval_ns=self._question.interval_ns,
+            unknowns=tuple(dict.fromkeys(transition.unknowns)),
+            make=self._kind,
+            replay=self._replay,
+        )
+
+    def _accepts(self, transition: Transition, number: int, way: tuple[Scan, ...]) -> str:
+        """Execute a counterexample. Return "" if the program does the same. Raises `ModelDisagrees` if the model is wrong."""
+        check = None if number == FAILS else self._check(self._checked[number])
+        found = self._replay.first_violation(way, check)
+        if found is not None and found[0] == len(way):
+            return ""
+        if transition.unknowns:
+            what, pos = transition.unknowns[0]
+            return f"the model has no exact result of {what} in line {pos.line}, and the counterexample depends on it"
+        name = NO_FAILURE if number == FAILS else self._checked[number].name
+        raise ModelDisagrees(
+            f"the model and the program {self._question.program} disagree about {name!r}",
+            expected=f"a violation in scan {len(way)}",
+            got=f"one in scan {found[0]}" if found else "none",
+            where=self._question.path,
+            hint="this is a defect of fieldtwin; please report it with the program",
+        )
+
+    def _shortened(self, check: Check | None, answer: Answer) -> Answer:
+        if answer.way:
+            answer.way = self._replay.shortened(answer.way, check, self._question.interval_ns[0])
+        return answer
+
+    def _result(self, name: str, text: str, check: Check | None, answer: Answer) -> Result:
+        answer = self._shortened(check, answer)
+        failure, values = "", {}
+        for _, failed, program in self._replay.scans(answer.way or ()):
+            failure = failed
+            values = {
+                v.name: program.__dict__[v.name]
+                for v in program.variables.values()
+                if v.name not in dict((answer.way or ())[0].values) and not v.name.startswith(HIDDEN)
+            }
+        return Result(name, text, check, answer, failure, values)
+
+
+def _is_true(condition: Any) -> bool:
+    return bool(z3.is_true(z3.simplify(condition)))
+
+
+__all__ = ["Limits", "Question", "Report", "Result", "StateResult", "prove"]

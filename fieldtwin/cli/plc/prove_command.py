@@ -77,12 +77,11 @@ class ProofOptions:
 
 @click.command("prove", cls=GroupedCommand)
 @click.argument("source", shell_complete=systems)
-@click.option("--program", default="", metavar="NAME", help="The program; default: the only one that can be proved.")
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Write a counterexample to this file, as a scenario of the system.",
+@group(
+    "Program",
+    click.option(
+        "--program", default="", metavar="NAME", help="The program; default: the only one that can be proved."
+    ),
 )
 @group("Programs in Structured Text", dialect_option, library_option, wanted=ProofOptions)
 @group(
@@ -91,7 +90,17 @@ class ProofOptions:
         "--max-states", type=click.IntRange(1), default=200_000, show_default=True, help="The largest number of states."
     ),
 )
-@group("Options", json_option, sources=TemplateSearchOptions)
+@group(
+    "Output",
+    click.option(
+        "-o",
+        "--output",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Write a counterexample to this file, as a scenario of the system.",
+    ),
+    json_option,
+)
+@group("Profiles and templates", sources=TemplateSearchOptions)
 def prove(
     source: str,
     program: str,

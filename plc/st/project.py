@@ -43,11 +43,6 @@ def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Pat
     return _compiled(_texts((path,)), _texts(libraries), str(path), dialect)
 
 
-def read_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> SourceUnit:
-    """Read the declarations that `compile_source` compiles. Raises `FileInvalid` for the first syntax error, with the others."""
-    return _unit_of(_texts((path,)), _texts(libraries), dialect)
-
-
 def read_with(
     path: Path,
     beside: tuple[Path, ...],
@@ -79,14 +74,10 @@ def _text(path: Path) -> str:
 @lru_cache(maxsize=32)
 def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect) -> CompiledUnit:
     """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
-    unit = _unit_of(texts, libraries, dialect)
+    unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
     return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
-
-
-def _unit_of(texts: Texts, libraries: Texts, dialect: Dialect) -> SourceUnit:
-    return with_library(_parsed(texts, dialect), _library(libraries, dialect))
 
 
 def _library(

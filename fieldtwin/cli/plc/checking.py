@@ -37,7 +37,7 @@ def checked(programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset
     from fieldtwin.plc.st.findings.find import findings
     from fieldtwin.plc.st.findings.tasks import written_by_several_tasks
     from fieldtwin.plc.st.findings.waivers import waivers_of, without_waived
-    from fieldtwin.plc.st.project import compile_source, read_source
+    from fieldtwin.plc.st.project import compile_source
 
     found = Checked([], [], [], [])
     for (path, dialect, libraries), tasks in programs.items():
@@ -48,8 +48,9 @@ def checked(programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset
             continue
         found.units.append(unit)
         own = {str(file) for file in source_files(path)}
-        source = read_source(path, dialect, libraries)
-        about = [one for one in (*findings(source), *written_by_several_tasks(source, tasks)) if one.path in own]
+        about = [
+            one for one in (*findings(unit.source), *written_by_several_tasks(unit.source, tasks)) if one.path in own
+        ]
         waivers = [waiver for file in sorted(own) for waiver in waivers_of(file)]
         warnings, waived = without_waived((*unit.warnings, *about), waivers)
         warnings.sort(key=lambda one: (one.path, one.line, one.column, one.id))

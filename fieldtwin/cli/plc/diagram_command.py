@@ -80,11 +80,10 @@ def diagram(
 
 def _of_file(source: StSource) -> dict[str, StateDiagram]:
     """Return the state machines of a source by the name of their POU, with the variable if a POU has several."""
-    from fieldtwin.plc.st.project import compile_source, read_source
+    from fieldtwin.plc.st.project import compile_source
     from fieldtwin.plc.st.state_diagram import state_diagrams
 
-    compile_source(*source)  # an error in the source is reported, and not drawn
-    found = list(state_diagrams(read_source(*source)))
+    found = list(state_diagrams(compile_source(*source).source))  # an error in the source is reported, and not drawn
     pous = [machine.pou for machine in found]
     return {m.pou if pous.count(m.pou) == 1 else f"{m.pou}.{m.variable}": m for m in found}
 

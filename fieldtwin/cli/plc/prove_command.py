@@ -188,15 +188,16 @@ def _prove_file(
     from fieldtwin.plc.st.model_checking.proof import Limits, Question, prove
     from fieldtwin.plc.st.model_checking.properties import named
     from fieldtwin.plc.st.program import program_class
-    from fieldtwin.plc.st.project import compile_source, read_source
+    from fieldtwin.plc.st.project import compile_source
 
-    kind = program_class(compile_source(*source), program)
+    unit = compile_source(*source)
+    kind = program_class(unit, program)
     shortest, longest = wanted.scan_interval or (shortest_ms, max(shortest_ms, LONGEST_MS))
     if shortest > longest:
         raise UsageError("the shortest time between two scans is above the longest", got=f"{shortest:g} {longest:g}")
     end_ns = WallClock().monotonic_ns() + round(wanted.time_limit * 1e9)
     question = Question(
-        read_source(*source), str(source[0]), kind.__name__, source[1],
+        unit.source, str(source[0]), kind.__name__, source[1],
         (*invariants.items(), *map(named, wanted.invariants)), (*assumptions.items(), *map(named, wanted.assumptions)),
         (round(shortest * NS_PER_MS), round(longest * NS_PER_MS)),
     )  # fmt: skip

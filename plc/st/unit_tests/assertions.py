@@ -44,7 +44,32 @@ def invalid(pos: t.Pos, message: str, expected: str = "", got: str = "", hint: s
     return FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint)
 
 
-def condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr:
+def bound(call: t.Call, parameters: tuple[str, ...]) -> dict[str, t.Expr]:
+    """Return the arguments of a call by parameter in capitals. The last one, MESSAGE, is optional.
+
+    Raises `FileInvalid` for an unknown, repeated or missing argument.
+    """
+    of, expected = call.ref.name, ", ".join(parameters)
+    found: dict[str, t.Expr] = {}
+    for n, argument in enumerate(call.arguments):
+        key = argument.name.upper() or (parameters[n] if n < len(parameters) else "")
+        if key not in parameters or key in found or argument.value is None:
+            got = argument.name or f"{len(call.arguments)} arguments"
+            raise invalid(argument.pos, f"the arguments of {of}", expected, got)
+        found[key] = argument.value
+    if missing := [name for name in parameters if name not in (*found, "MESSAGE")]:
+        raise invalid(call.pos, f"{of} lacks {', '.join(missing)}", expected)
+    return found
+
+
+def assertion(kind: str, pos: t.Pos, number: int, given: list[t.Expr], of_test: int = 0) -> list[t.Statement]:
+    """Return the statements of an assertion: its arguments, each evaluated once, and the check of the condition `kind`."""
+    held = [t.Hold(value.pos, f"0value_{number}_{n}", value) for n, value in enumerate(given)]
+    shown: list[t.Expr] = [t.Ref(hold.pos, hold.name) for hold in held]
+    return [*held, t.Assertion(pos, number, _condition(kind, pos, shown), tuple(shown), of_test)]
+
+
+def _condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr:
     """Return the condition that an assertion checks. `values` are its arguments without the message."""
     if name == "ASSERT_TRUE":
         return values[0]

@@ -7,7 +7,7 @@ block in a test executes it once, as a scan does; time passes with ADVANCE_TIME 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
@@ -69,25 +69,18 @@ class _Count:
     values: tuple[Any, ...] = ()
 
 
-@dataclass
-class Recorded:
-    """The records of the probes for coverage: numbers, and pairs of a number and a value."""
-
-    executed: set[Any] = field(default_factory=set)
-
-
 class _TestContext(Context):
     """The context of compiled code in a test: its time is that of the test."""
 
     __slots__ = ("_advances", "counts", "executed", "finished")
 
-    def __init__(self, recorded: Recorded) -> None:
+    def __init__(self, recorded: set[Any]) -> None:
         super().__init__()
         self.first_scan = True
         self.counts: dict[int, _Count] = {}
         self.finished: set[int] = set()
         """The numbers of the cyclic tests that have ended."""
-        self.executed: Callable[[Any], None] = recorded.executed.add
+        self.executed: Callable[[Any], None] = recorded.add
         self._advances = 0
 
     def asserted(self, number: int, holds: bool, shown: tuple[Any, ...], of_test: int) -> None:
@@ -113,13 +106,13 @@ class _TestContext(Context):
         self.left = MAX_STEPS
 
 
-def run_tests(unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: Recorded) -> Iterator[TestResult]:
-    """Run each test. `recorded` collects what the probes of all of them record."""
+def run_tests(unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: set[Any]) -> Iterator[TestResult]:
+    """Run each test. The probes for coverage add their records to `recorded`: numbers, and pairs of a number and a value."""
     for _, group in groupby(tests, lambda test: test.program):
         yield from _run(unit, list(group), recorded)
 
 
-def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: Recorded) -> Iterator[TestResult]:
+def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: set[Any]) -> Iterator[TestResult]:
     """Run the program of `tests`: once, or if they are cyclic, until all of them have ended."""
     context = _TestContext(recorded)
     error, place = "", ("", 0)
@@ -137,12 +130,13 @@ def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: Recorded) ->
         error, place = _reason(e), _place(e, unit, tests[0])
     for test in tests:
         found = tuple(_result(number, text, context, unit) for number, text in test.assertions.items())
-        ended = not test.cyclic or test.number in context.finished
-        reason = error or f"it did not call TEST_FINISHED within {values.duration_text(MAX_CYCLIC_NS, 'T')}"
-        at = place if error else (test.pos.path, test.pos.line)
-        yield TestResult(
-            test, found, context.now_ns, *(("", ("", 0)) if ended and (test.cyclic or not error) else (reason, at))
-        )
+        if test.cyclic and test.number in context.finished:
+            yield TestResult(test, found, context.now_ns)  # an error after its end is not an error of this test
+        elif test.cyclic and not error:
+            late = f"it did not call TEST_FINISHED within {values.duration_text(MAX_CYCLIC_NS, 'T')}"
+            yield TestResult(test, found, context.now_ns, late, (test.pos.path, test.pos.line))
+        else:
+            yield TestResult(test, found, context.now_ns, error, place)
 
 
 def _result(number: int, text: AssertionText, context: _TestContext, unit: CompiledUnit) -> AssertionResult:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
@@ -17,7 +18,7 @@ from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.project import read_with
 from fieldtwin.plc.st.unit_tests.assertions import TranslatedTest
 from fieldtwin.plc.st.unit_tests.blocks import programs_as_blocks
-from fieldtwin.plc.st.unit_tests.run import Recorded, TestResult, run_tests
+from fieldtwin.plc.st.unit_tests.run import TestResult, run_tests
 from fieldtwin.plc.st.unit_tests.tcunit import is_suite, suites_as_programs
 from fieldtwin.plc.st.unit_tests.translate import tests_as_programs
 
@@ -32,7 +33,7 @@ class Suite:
     _probes: Probes
     _unused: Probes
     """The probes of the POUs that no test uses: their places count as not executed."""
-    _recorded: Recorded
+    _recorded: set[Any]
 
     def run(self) -> Iterator[TestResult]:
         """Run each test."""
@@ -42,7 +43,7 @@ class Suite:
         """Return each place of the tested files, and whether a test has executed it."""
         return {
             **self._unused.result(set(), {}),
-            **self._probes.result(self._recorded.executed, self.unit.probed),
+            **self._probes.result(self._recorded, self.unit.probed),
         }
 
 
@@ -60,12 +61,12 @@ def load_suite(
     if not unit.tests and not any(map(is_suite, unit.pous)):
         raise FileInvalid("no test in this file", path=str(path), expected="TEST 'name' ... END_TEST")
     probes, unused = Probes(), Probes()
-    files = [str(path), *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))]
-    libraries_files = {str(file) for library in libraries for file in source_files(library)} - set(map(str, beside))
-    for other in others:
-        unused.insert(other, [*files, *libraries_files])
     if coverage:
-        unit = probes.insert(unit, [*files, *libraries_files])
+        left_out = {str(path), *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))}
+        left_out |= {str(file) for library in libraries for file in source_files(library)} - set(map(str, beside))
+        for other in others:
+            unused.insert(other, left_out)
+        unit = probes.insert(unit, left_out)
     numbers, errors = count(1), ErrorCollector()
     unit, tests = tests_as_programs(unit, numbers, errors)
     unit, cyclic = suites_as_programs(unit, numbers, errors)
@@ -73,7 +74,7 @@ def load_suite(
     tests += cyclic
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     compiled = compile_unit(unit, str(path), tuple(dict.fromkeys((str(path), *sorted(used)))), dialect)
-    return Suite(path, compiled, tests, probes, unused, Recorded())
+    return Suite(path, compiled, tests, probes, unused, set())
 
 
 def _beside(path: Path) -> Iterator[Path]:

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import with_parts
 from fieldtwin.plc.st.syntax.written import text_of
-from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest, condition, invalid
+from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest, assertion, bound, invalid
 
 _SUITE = "FB_TestSuite"
 _EQUAL, _TRUE, _FALSE = "ASSERTEQUALS", "ASSERTTRUE", "ASSERTFALSE"
@@ -112,15 +112,13 @@ class _Suite:
     def _assertion(self, call: t.Call, name: str, test: TranslatedTest) -> list[t.Statement]:
         given, message = _arguments(call, _parameters(call, name))
         number = next(self.numbers)
-        held = [t.Hold(value.pos, f"0value_{number}_{n}", value) for n, value in enumerate(given)]
-        shown: list[t.Expr] = [t.Ref(hold.pos, hold.name) for hold in held]
         kind = {_TRUE: "ASSERT_TRUE", _FALSE: "ASSERT_FALSE"}.get(
             name, "ASSERT_NEAR" if len(given) > 2 else "ASSERT_EQ"
         )
         expected = {_TRUE: "TRUE", _FALSE: "FALSE"}.get(name, "")
         said = replace(call, arguments=tuple(one for one in call.arguments if one.value in given))
         test.assertions[number] = AssertionText(call.pos, text_of(said), expected, message)
-        return [*held, t.Assertion(call.pos, number, condition(kind, call.pos, shown), tuple(shown), test.number)]
+        return assertion(kind, call.pos, number, given, test.number)
 
 
 def _called(statement: Any) -> str:
@@ -150,16 +148,7 @@ def _parameters(call: t.Call, name: str) -> tuple[str, ...]:
 
 def _arguments(call: t.Call, parameters: tuple[str, ...]) -> tuple[list[t.Expr], str]:
     """Return the actual value, the expected one and the tolerance, as far as the assertion has them, and the text of Message."""
-    names = (*parameters, "MESSAGE")
-    found: dict[str, t.Expr] = {}
-    for n, argument in enumerate(call.arguments):
-        key = argument.name.upper() or (names[n] if n < len(names) else "")
-        if key not in names or key in found or argument.value is None:
-            raise invalid(argument.pos, f"the arguments of {call.ref.name}", ", ".join(names), argument.name)
-        found[key] = argument.value
-    missing = [name for name in parameters if name not in found]
-    if missing:
-        raise invalid(call.pos, f"{call.ref.name} lacks {', '.join(missing)}", ", ".join(names))
+    found = bound(call, (*parameters, "MESSAGE"))
     message = found.get("MESSAGE")
     text = message.text[1:-1] if isinstance(message, t.Literal) else ""
     order = [name for name in ("CONDITION", "ACTUAL", "EXPECTED", "DELTA") if name in parameters]

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import with_parts
 from fieldtwin.plc.st.syntax.written import text_of
-from fieldtwin.plc.st.unit_tests.assertions import COMPARISONS, AssertionText, TranslatedTest, condition, invalid
+from fieldtwin.plc.st.unit_tests.assertions import COMPARISONS, AssertionText, TranslatedTest, assertion, bound, invalid
 
 _PARAMETERS = {
     "ASSERT_TRUE": ("IN",),
@@ -93,26 +93,14 @@ class _Translation:
         if name == "ADVANCE_TIME":
             return [t.Advance(call.pos, given[0])]
         number = next(self._numbers)
-        held = [t.Hold(value.pos, f"0value_{number}_{n}", value) for n, value in enumerate(given)]
-        shown: list[t.Expr] = [t.Ref(hold.pos, hold.name) for hold in held]
         said = t.Call(call.pos, call.ref, tuple(t.Argument(one.pos, "", one) for one in given))
         text = AssertionText(call.pos, text_of(said), _EXPECTED[name], message)
         self._test.assertions[number] = text
-        return [*held, t.Assertion(call.pos, number, condition(name, call.pos, shown), tuple(shown))]
+        return assertion(name, call.pos, number, given)
 
     def _arguments(self, call: t.Call, name: str) -> tuple[list[t.Expr], str]:
         """Return the arguments in the order of the parameters, and the text of MESSAGE, which comes last."""
-        names = (*_PARAMETERS[name], "MESSAGE") if name != "ADVANCE_TIME" else _PARAMETERS[name]
-        found: dict[str, t.Expr] = {}
-        for n, argument in enumerate(call.arguments):
-            key = argument.name.upper() or (names[n] if n < len(names) else "")
-            if key not in names or key in found or argument.value is None:
-                got = argument.name or f"{len(call.arguments)} arguments"
-                raise invalid(argument.pos, f"the arguments of {name}", ", ".join(names), got)
-            found[key] = argument.value
-        missing = [one for one in _PARAMETERS[name] if one not in found]
-        if missing:
-            raise invalid(call.pos, f"{name} lacks {', '.join(missing)}", expected=", ".join(names))
+        found = bound(call, (*_PARAMETERS[name], "MESSAGE") if name != "ADVANCE_TIME" else _PARAMETERS[name])
         message = found.pop("MESSAGE", None)
         if message is not None and not (isinstance(message, t.Literal) and message.kind == "STRING_LITERAL"):
             raise invalid(message.pos, f"MESSAGE of {name}", expected="a text in quotation marks", got=text_of(message))

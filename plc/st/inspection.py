@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from itertools import product
+from itertools import islice, product
 from typing import Any
 
 from fieldtwin.gateway.core.values import Scalar
@@ -44,11 +44,17 @@ class Inspection:
 
     def find(self, body: Any, path: str) -> InternalVariable | None:
         """Return the variable with this path in `body`, and None for a path that names no variable, or one with members."""
-        name, rest = _first(path)
+        name, rest = first_name(path)
         top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
         if top is None:
             return None
-        found: Typed | None = (top[1], _of(body, top[0]))
+        found = self.within((top[1], _of(body, top[0])), rest)
+        if found is None or isinstance(found[0], ty.Struct | ty.Block):
+            return None
+        return InternalVariable(path, str(found[0]), shown_value(*found))
+
+    def within(self, found: Typed | None, rest: str) -> Typed | None:
+        """Return the part of a variable that the `rest` of a path selects, such as ``.ET`` or ``[3]``; None for any other."""
         at = 0
         while found is not None and at < len(rest):
             step = _STEP.match(rest, at)
@@ -56,16 +62,14 @@ class Inspection:
                 return None
             at = step.end()
             found = self._member(found, step[1]) if step[1] else _element(found, step[2])
-        if found is None or isinstance(found[0], ty.Struct | ty.Block):
-            return None
-        return InternalVariable(path, str(found[0]), shown_value(*found))
+        return found
 
     def attribute(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes of a path without indices, such as ``v_delay.ET``, and the type of its value.
 
         None for other paths, and for a variable with members.
         """
-        name, rest = _first(path)
+        name, rest = first_name(path)
         top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
         if top is None or "[" in rest:
             return None
@@ -92,16 +96,16 @@ class Inspection:
 
     def _below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
         if isinstance(kind, ty.Struct | ty.Block):
-            for member, of, inside in self._members(kind, value):
+            for member, of, inside in self.members(kind, value):
                 yield from self._below(f"{name}.{member}", of, inside)
         elif isinstance(kind, ty.Array) and isinstance(kind.of, ty.Struct | ty.Block | ty.Array):
-            for at in product(*(range(low, high + 1) for low, high in kind.ranges)):
-                index = ",".join(map(str, at))
-                yield from self._below(f"{name}[{index}]", kind.of, _at(kind, value, at))
+            for index, element in elements(kind, value):
+                yield from self._below(f"{name}{index}", kind.of, element)
         else:
             yield name
 
-    def _members(self, kind: ty.Struct | ty.Block, value: Any) -> Iterator[tuple[str, ty.Type, Any]]:
+    def members(self, kind: ty.Struct | ty.Block, value: Any) -> Iterator[tuple[str, ty.Type, Any]]:
+        """Return the name, type and value of each member of a structure or block."""
         if isinstance(kind, ty.Struct):
             for field, (name, of) in kind.fields.items():
                 yield name, of, getattr(value, f"m_{field}")
@@ -116,7 +120,7 @@ class Inspection:
         kind, value = found
         if not isinstance(kind, ty.Struct | ty.Block):
             return None
-        members = self._members(kind, value)
+        members = self.members(kind, value)
         return next(((of, inside) for member, of, inside in members if member.lower() == name.lower()), None)
 
 
@@ -125,7 +129,7 @@ def _declared(variables: Sequence[tuple[str, ty.Type]]) -> list[tuple[str, ty.Ty
     return [(name, kind) for name, kind in variables if not name[0].isdigit()]
 
 
-def _first(path: str) -> tuple[str, str]:
+def first_name(path: str) -> tuple[str, str]:
     """Return the name with which a path begins, and the rest."""
     end = next((at for at, letter in enumerate(path) if letter in ".["), len(path))
     return path[:end], path[end:]
@@ -143,6 +147,12 @@ def _element(found: Typed, index: str) -> Typed | None:
     if not all(low <= i <= high for i, (low, high) in zip(at, kind.ranges, strict=True)):
         return None
     return kind.of, _at(kind, value, at)
+
+
+def elements(kind: ty.Array, value: Any) -> Iterator[tuple[str, Any]]:
+    """Return each element of an array with its index, such as ``[3]`` or ``[1,2]``."""
+    for at in product(*(range(low, high + 1) for low, high in kind.ranges)):
+        yield f"[{','.join(map(str, at))}]", _at(kind, value, at)
 
 
 def _at(kind: ty.Array, value: Any, at: Sequence[int]) -> Any:
@@ -183,10 +193,7 @@ def literal(kind: ty.Type, value: Any) -> str:
 
 def _elements(kind: ty.Array, value: list[Any]) -> str:
     count = ty.elements(ty.Array(kind.ranges, ty.INT))
-    chosen = product(*(range(low, high + 1) for low, high in kind.ranges))
-    texts = [
-        _text(shown_value(kind.of, _at(kind, value, at))) for at, _ in zip(chosen, range(SHOWN_ELEMENTS), strict=False)
-    ]
+    texts = [_text(shown_value(kind.of, one)) for _, one in islice(elements(kind, value), SHOWN_ELEMENTS)]
     return f"[{', '.join(texts)}{f', ... {count} elements' if count > SHOWN_ELEMENTS else ''}]"
 
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice, product
+from itertools import islice
 from types import FrameType
 from typing import Any
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.scope import Symbol
-from fieldtwin.plc.st.inspection import literal
+from fieldtwin.plc.st.inspection import Inspection, elements, first_name, literal
 
 MAX_ELEMENTS = 1000
 """How many elements of an array are listed."""
-_STEP = re.compile(r"\.(\w+)|\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\]")
 _POU = re.compile(r"(?:f|B|P)_(\w+)")
 
 
@@ -46,6 +45,7 @@ class Units:
     def __init__(self, units: Sequence[CompiledUnit], names: Mapping[str, str]) -> None:
         """`names` are the names to show of POUs that the source does not name, such as tests, in lower case."""
         self._by_file = {file: unit for unit in units for file in unit.files}
+        self._inspections = {file: Inspection(unit, ()) for unit in units for file in unit.files}
         self._names = names
 
     def of(self, frame: FrameType) -> CompiledUnit | None:
@@ -77,23 +77,23 @@ class Units:
 
     def parts(self, variable: Variable, frame: FrameType) -> list[Variable]:
         """Return the members or elements of a variable; at most `MAX_ELEMENTS` of an array."""
-        unit = self.of(frame)
-        return list(_parts(variable, unit)) if unit is not None else []
+        kind, value, inspection = variable.type, variable.value, self._inspections.get(frame.f_code.co_filename)
+        if isinstance(kind, ty.Array):
+            return [Variable(index, kind.of, one) for index, one in islice(elements(kind, value), MAX_ELEMENTS)]
+        if isinstance(kind, ty.Struct | ty.Block) and inspection is not None:
+            return [Variable(*member) for member in inspection.members(kind, value)]
+        return []
 
     def find(self, path: str, frame: FrameType) -> Variable | None:
         """Return the variable with this path, such as ``levels[3]`` or ``timer.ET``, in any case of letters; None without one."""
-        end = next((at for at, letter in enumerate(path) if letter in ".["), len(path))
-        name, at = path[:end].strip().lower(), end
+        name, rest = first_name(path)
         known = [*self.variables(frame), *self.global_variables(frame)]
-        found = next((one for one in known if one.name.lower() == name), None)
-        while found is not None and at < len(path):
-            step = _STEP.match(path, at)
-            if step is None:
-                return None
-            at = step.end()
-            wanted = step[1].lower() if step[1] else f"[{','.join(part.strip() for part in step[2].split(','))}]"
-            found = next((one for one in self.parts(found, frame) if one.name.lower() == wanted), None)
-        return found
+        top = next((one for one in known if one.name.lower() == name.strip().lower()), None)
+        inspection = self._inspections.get(frame.f_code.co_filename)
+        if top is None or inspection is None:
+            return None
+        found = inspection.within((top.type, top.value), rest)
+        return Variable(path, *found) if found is not None else None
 
     def _symbols(self, frame: FrameType) -> list[Symbol]:
         """Return the variables that a frame sees, without global ones."""
@@ -118,23 +118,3 @@ def _read(symbol: Symbol, frame: FrameType) -> Iterator[Variable]:
     except (NameError, AttributeError):
         return
     yield Variable(symbol.name, symbol.type, value)
-
-
-def _parts(variable: Variable, unit: CompiledUnit) -> Iterator[Variable]:
-    kind, value = variable.type, variable.value
-    if isinstance(kind, ty.Struct):
-        for field, (name, of) in kind.fields.items():
-            yield Variable(name, of, getattr(value, f"m_{field}"))
-    elif isinstance(kind, ty.Block) and kind.standard is not None:
-        for name, of in (*kind.inputs.values(), *kind.outputs.values()):
-            yield Variable(name, of, getattr(value, name))
-    elif isinstance(kind, ty.Block):
-        for name, of in unit.blocks.get(kind.name.lower(), ()):
-            if not name[:1].isdigit():
-                yield Variable(name, of, getattr(value, f"v_{name.lower()}"))
-    elif isinstance(kind, ty.Array):
-        for at in islice(product(*(range(low, high + 1) for low, high in kind.ranges)), MAX_ELEMENTS):
-            element = value
-            for i, (low, _) in zip(at, kind.ranges, strict=True):
-                element = element[i - low]
-            yield Variable(f"[{','.join(map(str, at))}]", kind.of, element)

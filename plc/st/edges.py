@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 
 _BLOCKS = {"R_EDGE": "R_TRIG", "F_EDGE": "F_TRIG"}
@@ -58,17 +58,9 @@ def _check(variable: t.VarDecl, place: str, errors: ErrorCollector) -> None:
     kind = variable.type
     is_bool = isinstance(kind, t.NamedType) and kind.name.upper() == "BOOL"
     if variable.edge and not (is_bool and place == "VAR_INPUT"):
-        pos = variable.pos
-        errors.add(
-            FileInvalid(
-                f"{variable.edge} of {variable.name}",
-                path=pos.path,
-                line=pos.line,
-                column=pos.column,
-                expected="a BOOL in VAR_INPUT of a PROGRAM or FUNCTION_BLOCK",
-                got=place if is_bool else "another type",
-            )
-        )
+        expected = "a BOOL in VAR_INPUT of a PROGRAM or FUNCTION_BLOCK"
+        got = place if is_bool else "another type"
+        errors.add(invalid(variable.pos, f"{variable.edge} of {variable.name}", expected, got))
 
 
 def _trigger(name: str) -> str:

@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 
 
@@ -59,7 +59,7 @@ class _Names:
                 self.fail(using.pos, f"a namespace {using.name!r} is not declared", hint)
 
     def fail(self, pos: t.Pos, message: str, hint: str = "") -> None:
-        self.errors.add(FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, hint=hint))
+        self.errors.add(invalid(pos, message, hint=hint))
 
     def find(self, parts: Sequence[str], within: t.Within, pos: t.Pos) -> tuple[t.TypeDecl | t.Pou, int] | None:
         """Return the declaration to which a name refers, and how many of its `parts` belong to the name of the declaration."""

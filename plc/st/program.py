@@ -39,6 +39,7 @@ from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
+from fieldtwin.plc.st.syntax.errors import invalid
 
 WRITES = "st_writes"
 """The message input through which servers write variables: a JSON object with values by name (`StProgram.put`)."""
@@ -268,7 +269,7 @@ def program_class(
     if found is None:
         for m in missing.values():
             if m.name.lower() == wanted.lower():
-                raise FileInvalid(m.reason, path=m.pos.path, line=m.pos.line, column=m.pos.column)
+                raise invalid(m.pos, m.reason)
         raise FileInvalid(
             f"no PROGRAM {name}" if name else "which PROGRAM is meant",
             path=unit.path,

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 
 MAX_SITUATIONS = 5_000
 """The largest number of sets of active steps that are examined; a larger chart is not checked."""
@@ -34,7 +35,7 @@ def check_reachability(chart: t.Chart) -> Iterator[FileInvalid]:
             enabled.add(number)
             rest = active - sources
             if rest & targets:
-                yield _error(
+                yield invalid(
                     one.pos, f"the transition activates {_names(chart, rest & targets)}, which can already be active"
                 )
                 return
@@ -47,17 +48,13 @@ def check_reachability(chart: t.Chart) -> Iterator[FileInvalid]:
     reached = frozenset().union(*seen)
     for step in chart.steps:
         if step.name.lower() not in reached:
-            yield _error(step.pos, f"step {step.name} cannot be reached from the initial step")
+            yield invalid(step.pos, f"step {step.name} cannot be reached from the initial step")
     for number, (one, sources, _) in enumerate(moves):
         if number not in enabled and sources <= reached:
-            yield _error(
+            yield invalid(
                 one.pos, f"{_names(chart, sources)} can never be active together, so the transition is never enabled"
             )
 
 
 def _names(chart: t.Chart, steps: frozenset[str]) -> str:
     return ", ".join(step.name for step in chart.steps if step.name.lower() in steps)
-
-
-def _error(pos: t.Pos, message: str) -> FileInvalid:
-    return FileInvalid(message, path=pos.path, line=pos.line, column=pos.column)

@@ -11,11 +11,11 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.charts.reachability import check_reachability
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.parse import parse
 from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
@@ -170,9 +170,7 @@ class _Translation:
             self._bad(one.pos, f"indicator variables are not supported, and action {one.action} has one")
 
     def _bad(self, pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> None:
-        self._found.add(
-            FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint)
-        )
+        self._found.add(invalid(pos, message, expected, got, hint))
 
     # -- statements -------------------------------------------------------------------------------------------------------
 

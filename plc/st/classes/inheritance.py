@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 
 MAX_BASES = 32
 """How many POUs may be above one, from base to base."""
@@ -99,9 +99,7 @@ class _Order:
             self._bad(name.pos, f"{pou.name} extends {found.name}, which is FINAL")
 
     def _bad(self, pos: t.Pos, message: str, expected: str = "", hint: str = "") -> None:
-        self.errors.add(
-            FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, hint=hint)
-        )
+        self.errors.add(invalid(pos, message, expected, hint=hint))
 
 
 def _inherited(base: t.Pou, block: t.VarBlock) -> tuple[t.VarBlock, ...]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.dialects import Dialect
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 
 _KIND = "VAR_INST"
@@ -28,11 +28,8 @@ def without_instance_variables(unit: t.SourceUnit, dialect: Dialect) -> t.Source
     for pou in unit.pous:
         for block in (*pou.blocks, *(b for method in pou.methods for b in method.blocks if not dialect.vendor)):
             if block.kind == _KIND:
-                pos = block.pos
                 hint = "the dialects codesys and twincat have it in a METHOD"
-                errors.add(
-                    FileInvalid(_KIND, path=pos.path, line=pos.line, column=pos.column, expected="VAR", hint=hint)
-                )
+                errors.add(invalid(block.pos, _KIND, "VAR", hint=hint))
         pous.append(_moved(pou))
     errors.raise_all()
     return replace(unit, pous=tuple(pous))

@@ -13,6 +13,7 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector, Followi
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning, WarningCollector
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.source import shortened
 from fieldtwin.plc.st.syntax.tree import Argument, Expr, Missing, Pos, Ref
 
@@ -224,9 +225,7 @@ class Environment:
     def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
         if pos.element:
             message = f"{pos.element}: {message}"
-        return FileInvalid(
-            message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
-        )
+        return invalid(pos, message, expected, shortened(got), hint)
 
     @contextmanager
     def declaring(self, name: str, faulty: set[str]) -> Iterator[None]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 
 COMPARISONS = {
     "ASSERT_EQ": "=", "ASSERT_NE": "<>", "ASSERT_LT": "<", "ASSERT_LE": "<=", "ASSERT_GT": ">", "ASSERT_GE": ">=",
@@ -37,11 +37,6 @@ class TranslatedTest:
     assertions: dict[int, AssertionText]
     number: int = 0
     cyclic: bool = False
-
-
-def invalid(pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
-    """Return an error at a place of the source."""
-    return FileInvalid(message, path=pos.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint)
 
 
 def bound(call: t.Call, parameters: tuple[str, ...]) -> dict[str, t.Expr]:

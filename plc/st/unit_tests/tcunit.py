@@ -13,9 +13,10 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 from fieldtwin.plc.st.syntax.written import text_of
-from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest, assertion, bound, invalid
+from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest, assertion, bound
 
 _SUITE = "FB_TestSuite"
 _EQUAL, _TRUE, _FALSE = "ASSERTEQUALS", "ASSERTTRUE", "ASSERTFALSE"

@@ -15,9 +15,10 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 from fieldtwin.plc.st.syntax.written import text_of
-from fieldtwin.plc.st.unit_tests.assertions import COMPARISONS, AssertionText, TranslatedTest, assertion, bound, invalid
+from fieldtwin.plc.st.unit_tests.assertions import COMPARISONS, AssertionText, TranslatedTest, assertion, bound
 
 _PARAMETERS = {
     "ASSERT_TRUE": ("IN",),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
-from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.scope import Environment
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of
+from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.written import text_of
 
 
@@ -137,7 +137,4 @@ def _with_values(pou: t.Pou, changed: dict[tuple[str, str], t.ConfiguredVariable
 
 
 def _fail(one: t.ConfiguredVariable, message: str, *, expected: str) -> NoReturn:
-    pos, name = one.pos, ".".join(one.path)
-    raise FileInvalid(
-        f"VAR_CONFIG {name}: {message}", path=pos.path, line=pos.line, column=pos.column, expected=expected
-    )
+    raise invalid(one.pos, f"VAR_CONFIG {'.'.join(one.path)}: {message}", expected)

@@ -15,7 +15,7 @@ class Kind(Enum):
     TRANSITION = "transitions"
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@dataclass(frozen=True, slots=True)
 class Place:
     """A statement, a branch of an IF or CASE, or a transition between two states, at a line of a file.
 
@@ -25,13 +25,9 @@ class Place:
     path: str
     line: int
     column: int
-    kind_name: str
+    kind: Kind
     name: str
     pou: str
-
-    @property
-    def kind(self) -> Kind:
-        return Kind[self.kind_name]
 
 
 @dataclass
@@ -60,7 +56,8 @@ class Coverage:
 
     def missed(self, kind: Kind) -> list[Place]:
         """Return the places of a kind that were not executed, in the order of the source."""
-        return sorted(place for place, executed in self.executed.items() if place.kind is kind and not executed)
+        found = (place for place, executed in self.executed.items() if place.kind is kind and not executed)
+        return sorted(found, key=lambda place: (place.path, place.line, place.column, place.name, place.pou))
 
 
 def line_ranges(lines: Iterable[int]) -> str:

@@ -118,7 +118,7 @@ class _Body:
 
 
 def _place(kind: Kind, pos: t.Pos, name: str, pou: str) -> Place:
-    return Place(pos.path, pos.line, pos.column, kind.name, name, pou)
+    return Place(pos.path, pos.line, pos.column, kind, name, pou)
 
 
 def _state_name(kind: ty.Type | None, value: Any) -> str:

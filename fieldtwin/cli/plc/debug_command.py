@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -78,12 +78,8 @@ def debug(
         stderr.print(f"waiting for an editor on 127.0.0.1:{server.getsockname()[1]}", markup=False)
         connection, _ = server.accept()
     with connection, connection.makefile("rb") as reading, connection.makefile("wb") as writing:
-        Session(Messages(_binary(reading), _binary(writing)), launch).serve()
+        Session(Messages(reading, writing), launch).serve()
     return 0
-
-
-def _binary(stream: Any) -> BinaryIO:
-    return stream  # type: ignore[no-any-return]
 
 
 def _debuggee(

@@ -210,8 +210,7 @@ class Described(Protocol):
     def describe(self) -> dict[str, Any]: ...
 
 
-@dataclass(frozen=True, slots=True)
-class SourceLine:
+class SourceLine(msgspec.Struct, frozen=True, gc=False):
     """A line of a program's source.
 
     It is stored as an instruction of a code object; the line is looked up only when it is shown."""
@@ -310,8 +309,10 @@ class Program(ABC):
         assigned = self._assigned.get(name)
         return SourceLine(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
 
-    def decided(self, name: str) -> Described | None:
-        """Return the statement that assigned output `name` last, with what decided; None if that is not known."""
+    def decided(self, name: str, place: SourceLine) -> Described | None:
+        """Return the statement in the line `place` that assigned output `name` last, with what decided; None if that is not
+        known.
+        """
         return None
 
     def put(self, name: str, value: Scalar) -> None:

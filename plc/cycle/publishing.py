@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.image.image import (
@@ -60,9 +61,12 @@ class PublishedVariable:
             self.outbox = box
 
 
-@dataclass(frozen=True, slots=True)
-class TagChange:
-    """A change of a tag, for the command `why`: the program that made it, and the inputs as the program read them."""
+class TagChange(msgspec.Struct, frozen=True, gc=False):
+    """A change of a tag, for the command `why`: the program that made it, and the inputs as the program read them.
+
+    All changes of a program in one scan share the same `inputs`. A large program makes hundreds of changes in each scan, so this
+    class and those of its parts are of a kind that is created quickly.
+    """
 
     tag: str
     t_ns: int
@@ -212,6 +216,7 @@ class OutputImage:
     def _collect(self, outputs: list[PublishedVariable], now_ns: int, scan: int, seen: Seen) -> None:
         """Collect the values of the `outputs` of one program, and record changes with the inputs that `seen` returns."""
         values, forced, namespace = self._values, self.forces.outputs, outputs[0].namespace
+        inputs: dict[str, Scalar | None] | None = None
         for output in outputs:
             value = namespace[output.name]
             if output.outbox is not None:
@@ -234,12 +239,15 @@ class OutputImage:
                 broken = False
                 self._missing.pop(output.index, None)
             if value is not before or broken:
-                kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
-                place, decided = None, None
-                if force is None:
-                    place, decided = output.program.place(output.name), output.program.decided(output.name)
+                kept = self.changes.get(output.tag)
+                if kept is None:
+                    kept = self.changes[output.tag] = deque(maxlen=MAX_CHANGES)
+                if inputs is None:
+                    inputs = seen()
+                place = output.program.place(output.name) if force is None else None
+                decided = output.program.decided(output.name, place) if place is not None else None
                 change = TagChange(
-                    output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place, decided
+                    output.tag, now_ns, scan, output.owner, before, value, inputs, force is not None, place, decided
                 )
                 kept.append(change)
                 if self.on_change is not None:

@@ -5,10 +5,12 @@ So `fieldtwin plc why` can show which statement gave a tag its value, and what d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
+
+import msgspec
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.inspection import Inspection, literal
@@ -140,32 +142,44 @@ class DecisionReader:
 
     def __init__(self, inspection: Inspection, decisions: Decisions, hidden: frozenset[str]) -> None:
         self._inspection, self._decisions, self._hidden = inspection, decisions, hidden
-        self._variables: dict[tuple[str, int, str], list[tuple[str, ty.Type, attrgetter[Any]]]] = {}
+        self._variables: dict[tuple[str, int, str], tuple[_Variables, Callable[[Any], tuple[Any, ...]]]] = {}
+        """By decision: its variables, and the function that reads them from a program."""
 
     def read(self, body: Any, key: tuple[str, int, str]) -> Decided | None:
         """Return the decision for a file, a line and a variable, with the present values; None without such a statement."""
         decision = self._decisions.get(key)
         if decision is None:
             return None
-        variables = self._variables.get(key)
-        if variables is None:
-            variables = self._variables[key] = list(self._found(decision))
-        return Decided(decision, tuple([(path, kind, of(body)) for path, kind, of in variables]))
+        found = self._variables.get(key)
+        if found is None:
+            found = self._variables[key] = self._found(decision)
+        variables, read = found
+        return Decided(decision, variables, read(body))
 
-    def _found(self, decision: Decision) -> Iterator[tuple[str, ty.Type, attrgetter[Any]]]:
-        for path in decision.reads:
-            found = self._inspection.attribute(path) if path.partition(".")[0].lower() not in self._hidden else None
-            if found is not None:
-                attribute, kind = found
-                yield path, kind, attrgetter(attribute)
+    def _found(self, decision: Decision) -> tuple[_Variables, Callable[[Any], tuple[Any, ...]]]:
+        shown = [path for path in decision.reads if path.partition(".")[0].lower() not in self._hidden]
+        found = [(path, *attribute) for path in shown if (attribute := self._inspection.attribute(path)) is not None]
+        return tuple([(path, kind) for path, _, kind in found]), _reader([attribute for _, attribute, _ in found])
 
 
-@dataclass(frozen=True, slots=True)
-class Decided:
-    """An executed decision, with the values of its variables after the scan: path, type and value."""
+def _reader(attributes: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """Return a function that reads these attributes of an object, with one call for all of them."""
+    if len(attributes) > 1:
+        return attrgetter(*attributes)
+    each = [attrgetter(attribute) for attribute in attributes]
+    return lambda body: tuple([read(body) for read in each])
+
+
+_Variables = tuple[tuple[str, ty.Type], ...]
+"""The paths and types of variables."""
+
+
+class Decided(msgspec.Struct, frozen=True, gc=False):
+    """An executed decision, with the values of its variables after the scan."""
 
     decision: Decision
-    values: tuple[tuple[str, ty.Type, Any], ...]
+    variables: _Variables
+    values: tuple[Any, ...]
 
     def describe(self) -> dict[str, Any]:
         """Return data for JSON."""
@@ -174,5 +188,7 @@ class Decided:
             "conditions": [
                 {"line": one.line, "text": one.text, "holds": one.holds} for one in self.decision.conditions
             ],
-            "variables": {path: literal(kind, value) for path, kind, value in self.values},
+            "variables": {
+                path: literal(kind, value) for (path, kind), value in zip(self.variables, self.values, strict=True)
+            },
         }

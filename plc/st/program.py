@@ -143,9 +143,9 @@ class StProgram(Program):
             return SourceLine(*line)
         return SourceLine(self.source_path, line) if line else None
 
-    def decided(self, name: str) -> Decided | None:
-        found, place = self.st_variables.get(name), self.place(name)
-        if found is None or place is None or found.shared:
+    def decided(self, name: str, place: SourceLine) -> Decided | None:
+        found = self.st_variables.get(name)
+        if found is None or found.shared:
             return None
         return self.st_decisions.read(self.st_body, (place.path, place.line, name.lower()))
 

@@ -431,6 +431,7 @@ def test_why_a_tag_changed_is_known() -> None:
     assert [(c.scan, c.program, c.before, c.after) for c in changes] == [(1, "copy", None, 1.5), (3, "copy", 1.5, 2.5)]
     assert changes[-1].inputs == {"x": 2.5, "n": 8, "flag": False, "box": None}
     assert changes[-1].describe(14 * MS)["age_ms"] == 1.0
+    assert changes[-1].inputs is rig.scan.output_image.changes["copy.count"][-1].inputs  # read once in each scan
     rig.feed(20, messages=(b"\0\1", b"abc", b"x" * 16))
     rig.execute(21)
     assert changes[-1].inputs["box"] == f"0001, 616263, {'78' * 16}"

@@ -6,6 +6,9 @@ from typing import Any
 
 from st_bench import program, scan
 
+from fieldtwin.plc.program import Described
+from fieldtwin.plc.st.program import StProgram
+
 PUMP = """TYPE States : (IDLE, FILLING, FULL, FAULT); END_TYPE
 PROGRAM p
 VAR_INPUT level : REAL; END_VAR
@@ -29,13 +32,18 @@ END_PROGRAM
 """
 
 
+def decision_of(made: StProgram, name: str) -> Described | None:
+    place = made.place(name)
+    return made.decided(name, place) if place is not None else None
+
+
 def decided(level: float, t_s: int, name: str) -> dict[str, Any] | None:
     made = program(PUMP)
     made.level = 0.0
     scan(made, 1, ms=0)
     made.level = level
     scan(made, 2, ms=1000 * t_s)
-    found = made.decided(name)
+    found = decision_of(made, name)
     return found.describe() if found is not None else None
 
 
@@ -66,7 +74,7 @@ def test_else_of_a_case_is_decided_by_all_labels() -> None:
     made.level = 90.0
     scan(made, 1)
     scan(made, 2)
-    found = made.decided("q")
+    found = decision_of(made, "q")
     assert found is not None
     assert found.describe()["conditions"] == [{"line": 7, "text": "state = IDLE, FAULT, FILLING", "holds": False}]
 
@@ -77,7 +85,7 @@ def test_a_variable_with_its_initial_value_or_a_set_one_has_no_decision() -> Non
     made.level = 90.0
     scan(made)
     made.put("state", 3)
-    assert made.decided("state") is None
+    assert decision_of(made, "state") is None
 
 
 def test_an_output_of_a_block_is_assigned_by_its_call() -> None:
@@ -89,7 +97,7 @@ def test_an_output_of_a_block_is_assigned_by_its_call() -> None:
         END_PROGRAM"""
     )
     scan(made)
-    found = made.decided("done")
+    found = decision_of(made, "done")
     assert found is not None
     assert found.describe() == {
         "statement": "timer(IN := TRUE, PT := T#1s500ms, Q => done)",
@@ -107,6 +115,6 @@ def test_values_are_written_as_in_the_source() -> None:
     )
     scan(made, 1, ms=0)
     scan(made, 2, ms=1500)
-    found = made.decided("q")
+    found = decision_of(made, "q")
     assert found is not None
     assert found.describe()["variables"] == {"timer.ET": "T#1s500ms", "x": "0.1", "s": "'on'"}

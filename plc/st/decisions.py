@@ -159,10 +159,10 @@ class DecisionReader:
     def _found(self, decision: Decision) -> tuple[_Variables, Callable[[Any], tuple[Any, ...]]]:
         shown = [path for path in decision.reads if path.partition(".")[0].lower() not in self._hidden]
         found = [(path, *attribute) for path in shown if (attribute := self._inspection.attribute(path)) is not None]
-        return tuple([(path, kind) for path, _, kind in found]), _reader([attribute for _, attribute, _ in found])
+        return tuple([(path, kind) for path, _, kind in found]), reader([attribute for _, attribute, _ in found])
 
 
-def _reader(attributes: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+def reader(attributes: list[str]) -> Callable[[Any], tuple[Any, ...]]:
     """Return a function that reads these attributes of an object, with one call for all of them."""
     if len(attributes) > 1:
         return attrgetter(*attributes)

@@ -33,7 +33,7 @@ from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
-from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of
+from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of, reader
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection
 from fieldtwin.plc.st.project import compile_source
@@ -69,15 +69,25 @@ class StProgram(Program):
         self.st_inputs = [_Input(v) for v in inputs if not v.shared]
         self.st_shared_inputs = [_Input(v) for v in inputs if v.shared]
         """The inputs that are global variables with an address."""
-        self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
+        self.st_converted: list[tuple[str, str, Callable[[Any], Any]]] = []
+        """The outputs and locals whose tags hold other values than the variables."""
         self.st_shared: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         """The outputs and locals that are global variables with an address."""
+        same: list[tuple[str, str]] = []
         for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
                 setattr(self.st_body, v.attribute, self.__dict__[v.name])
             elif v.role != "input" and _tag_kind(v.kind) is not None and v.name in self.st_variables:
-                shown = self.st_shared if v.shared else self.st_outputs
-                shown.append((v.name, v.attribute, _to_tag(v.kind)))
+                convert = _to_tag(v.kind)
+                if v.shared:
+                    self.st_shared.append((v.name, v.attribute, convert))
+                elif convert is not None:
+                    self.st_converted.append((v.name, v.attribute, convert))
+                else:
+                    same.append((v.name, v.attribute))
+        self.st_outputs = [name for name, _ in same]
+        self.st_read = reader([attribute for _, attribute in same])
+        """Reads the values of `st_outputs`, all at once, because a large program has hundreds."""
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
         self.st_show()
 
@@ -113,9 +123,9 @@ class StProgram(Program):
 
     def st_show(self) -> None:
         body, namespace = self.st_body, self.__dict__
-        for name, attribute, convert in self.st_outputs:
-            value = getattr(body, attribute)
-            namespace[name] = convert(value) if convert else value
+        namespace.update(zip(self.st_outputs, self.st_read(body), strict=True))
+        for name, attribute, to_tag in self.st_converted:
+            namespace[name] = to_tag(getattr(body, attribute))
         for name, attribute, convert in self.st_shared:
             value = getattr(self.st_resource.globals, attribute)
             namespace[name] = convert(value) if convert else value
@@ -285,13 +295,13 @@ def program_class(
     tags = {v.name: made for v in found.variables if (made := _tag_of(v, connected)) is not None}
     if takes_writes:
         tags = {WRITES: message_input(), **tags}
-    reader = DecisionReader(
+    decided = DecisionReader(
         Inspection(unit, [(v.name, v.kind) for v in found.variables]),
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )
     named = instance.name if instance is not None and connected else ""
-    return _class_of(unit, found, reader, tags, frozenset(), named)
+    return _class_of(unit, found, decided, tags, frozenset(), named)
 
 
 def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:

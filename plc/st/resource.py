@@ -16,6 +16,7 @@ from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.pous.inlining import NAMES
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
 MAX_STEPS = 1_000_000
@@ -70,7 +71,7 @@ class Resource:
 
     def __init__(self, unit: CompiledUnit, context: Context | None = None) -> None:
         self.context = context or Context()
-        self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
+        self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS, **NAMES}
         for part in unit.code:
             exec(part, self.space)
         self.globals: Any = self.space["_G"]

@@ -349,6 +349,11 @@ def _widens(source: Elementary, target: Elementary) -> bool:
     return source.kind == "bool" and target.kind == "bits"
 
 
+def is_rounded(source: Elementary, target: Elementary) -> bool:
+    """Return whether a value of `source` as a `target`, which is REAL or LREAL, has to be rounded to 32 bits."""
+    return target.bits == 32 and (source.kind == "real" or source.bits > 16)
+
+
 def of_bits(kind: Type | None) -> TypeGuard[Elementary]:
     """Return whether the type is a bit string type or BOOL."""
     return isinstance(kind, Elementary) and kind.kind in ("bits", "bool")

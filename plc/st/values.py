@@ -80,7 +80,8 @@ __all__ = [  # and all names that compiled code calls
     "whole",
 ]
 
-_FLOAT = struct.Struct("<f")
+SINGLE = struct.Struct("f")
+"""A 32-bit float in the computer's own form, whose rounding gives infinity beyond the range."""
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
 _BASED = re.compile(r"(2|8|16)#([0-9a-f][0-9a-f_]{0,79})", re.ASCII | re.IGNORECASE)
 _REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
@@ -89,10 +90,7 @@ MAX_SHOWN = 60
 
 def real(x: float) -> float:
     """Return `x` rounded to a 32-bit float, or infinity beyond its range, as IEC 60559 requires."""
-    try:
-        rounded: float = _FLOAT.unpack(_FLOAT.pack(x))[0]
-    except OverflowError:
-        return math.copysign(math.inf, x)
+    rounded: float = SINGLE.unpack(SINGLE.pack(x))[0]
     return rounded
 
 

@@ -65,7 +65,7 @@ def _warning(source: ty.Elementary, sink: ty.Elementary) -> str:
 
 def _code(code: str, source: ty.Elementary, sink: ty.Elementary) -> str:
     if sink.kind == "real":
-        return f"_v.real({code})" if sink.bits == 32 else f"float({code})"
+        return f"_v.real({code})" if ty.is_rounded(source, sink) else f"float({code})"
     if sink.low <= source.low and source.high <= sink.high:
         return code
     return f"_v.signed({code}, {sink.bits})" if sink.low < 0 else f"({code} & {sink.high})"

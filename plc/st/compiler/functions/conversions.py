@@ -91,7 +91,7 @@ def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | Non
     if kind.kind in whole and target.kind in whole:
         return _between_integers(code, kind, target)
     if kind.kind in whole and target.kind == "real":
-        return f"_v.real({code})" if target.bits == 32 else f"float({code})"
+        return f"_v.real({code})" if ty.is_rounded(kind, target) else f"float({code})"
     if kind.kind == "real":
         return _of_real(code, target, cut)
     if kind.kind == "duration" or target.kind == "duration":

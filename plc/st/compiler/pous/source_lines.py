@@ -8,6 +8,7 @@ from types import CodeType
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.compiler.assignments import Assignments
+from fieldtwin.plc.st.compiler.pous.inlining import Inlining
 from fieldtwin.plc.st.compiler.scope import CodeWriter
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -56,4 +57,5 @@ class SourceLines:
             own = self.outputs.get(statement.name, frozenset())
             if own or self.shared:
                 Assignments(own, self.shared, path).visit(statement)
+            Inlining().visit(statement)
         return ast.fix_missing_locations(statement)

@@ -44,7 +44,7 @@ def print_report(report: Report) -> None:
         stdout.print(f"  assumed: {_named(name, text)}", markup=False, soft_wrap=True)
     for what, pos in report.unknowns:
         where = f"{pos.path}:{pos.line}"
-        stdout.print(f"  not exact: the result of {what} may be any number ({where})", markup=False, soft_wrap=True)
+        stdout.print(f"  not exact: {what} may have any result ({where})", markup=False, soft_wrap=True)
     for result in report.invariants:
         _print_result(report, result)
     machine = ""

@@ -14,8 +14,10 @@ from fieldtwin.plc.st.model_checking.execution.merging import options_of
 from fieldtwin.plc.st.model_checking.execution.operations import is_none
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
+    TEXT,
     Choice,
     Int,
+    Text,
     Undefined,
     as_condition,
     bits_of,
@@ -82,15 +84,16 @@ def _parts(owner: Any) -> list[tuple[Any, Any]]:
 
 def _is_object(value: Any) -> bool:
     """Return whether a value is an object with variables. References do not count."""
-    plain = bool | int | float | str | Int | Choice | floats.Float | z3.AstRef | Instance
+    plain = bool | int | float | str | Text | Int | Choice | floats.Float | z3.AstRef | Instance
     return value is not None and not isinstance(value, plain) and not isinstance(value, REFERENCES)
 
 
 @dataclass(frozen=True, slots=True)
 class Domain:
-    """The values that a variable can have: None, truth values, integers from `low` to `high`, numbers, or one text.
+    """The values that a variable can have: None, truth values, integers from `low` to `high`, numbers, or texts.
 
     `number` is "" for no number, "single" or "double" for any number, or the text of the only number.
+    `text` is the only text, or `TEXT` for any.
     """
 
     none: bool = False
@@ -98,7 +101,7 @@ class Domain:
     low: int | None = None
     high: int | None = None
     number: str = ""
-    text: str | None = None
+    text: str | Text | None = None
 
     @classmethod
     def of(cls, value: Any) -> Domain:
@@ -123,7 +126,7 @@ class Domain:
             if isinstance(value, float):
                 return cls(number=repr(value))
             return cls(number="single" if value.single else "double")
-        if isinstance(value, str):
+        if isinstance(value, str | Text):
             return cls(text=value)
         if isinstance(value, Instance):
             raise NotModelled("a variable of an interface type")
@@ -132,11 +135,9 @@ class Domain:
         raise NotModelled(f"a variable of the type {type(value).__name__}")
 
     def joined(self, other: Domain) -> Domain:
-        if self.text is not None and other.text is not None and self.text != other.text:
-            raise NotModelled("a STRING that changes")
         low = self.low if other.low is None else other.low if self.low is None else min(self.low, other.low)
         high = self.high if other.high is None else other.high if self.high is None else max(self.high, other.high)
-        text = self.text if other.text is None else other.text
+        text = other.text if self.text is None or self.text == other.text else self.text if other.text is None else TEXT
         number = self._number(other)
         return Domain(self.none or other.none, self.truths | other.truths, low, high, number, text)
 

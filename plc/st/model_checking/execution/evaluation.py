@@ -16,18 +16,22 @@ from fieldtwin.plc.st.model_checking.execution import floats, operations
 from fieldtwin.plc.st.model_checking.execution.memory import Memory
 from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
 from fieldtwin.plc.st.model_checking.execution.natives import BUILTINS, OF_VALUES
-from fieldtwin.plc.st.model_checking.execution.operations import is_known, truth
+from fieldtwin.plc.st.model_checking.execution.operations import is_known, is_text, is_unknown_text, truth
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
 from fieldtwin.plc.st.model_checking.execution.sources import Sources
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
+    TEXT,
     UNDEFINED,
     Choice,
     Condition,
     Int,
+    Text,
     Undefined,
     both,
     either,
+    made,
     negated,
+    width,
 )
 from fieldtwin.plc.st.runtime import moments
 
@@ -90,9 +94,21 @@ class Evaluation:
 
     def unknown(self, what: str) -> floats.Float:
         """Return a number that may have any value, as the result of `what`."""
-        made = z3.FP(f"unknown{len(self.unknowns)}", z3.Float64())
-        self.unknowns.append((made, what, self.line))
-        return floats.Float(made)
+        return floats.Float(self._unknown(what, z3.Float64()))
+
+    def unknown_condition(self, what: str) -> Condition:
+        """Return a condition that may be true or false, as the result of `what`."""
+        return self._unknown(what, z3.BoolSort())
+
+    def unknown_integer(self, what: str, low: int, high: int) -> Int | int:
+        """Return an integer that may have any value from `low` to `high`, as the result of `what`."""
+        found = self._unknown(what, z3.BitVecSort(width(low, high)))
+        return made(z3.If(z3.And(found >= low, found <= high), found, low), low, high)
+
+    def _unknown(self, what: str, sort: Any) -> Any:
+        found = z3.Const(f"unknown{len(self.unknowns)}", sort)
+        self.unknowns.append((found, what, self.line))
+        return found
 
     # -- attributes -------------------------------------------------------------------------------------------------------
 
@@ -104,6 +120,8 @@ class Evaluation:
             return result
         if isinstance(owner, Undefined) or owner is None:
             return UNDEFINED
+        if isinstance(owner, Text):
+            raise NotModelled(operations.STRINGS)
         found = getattr(type(owner), name, None)
         return self.run(found.fget, (owner,)) if isinstance(found, property) and found.fget else getattr(owner, name)
 
@@ -177,15 +195,21 @@ class Evaluation:
         owner = self.value(node.value, frame)
         if isinstance(node.slice, ast.Slice):
             parts = [self.value(p, frame) if p else None for p in (node.slice.lower, node.slice.upper, node.slice.step)]
-            if not all(map(is_known, parts)) or not (isinstance(owner, list) or is_known(owner)):
-                raise NotModelled(operations.STRINGS)
-            return owner[slice(*parts)]
+            known = all(map(is_known, parts))
+            if known and (isinstance(owner, list) or is_known(owner)):
+                return owner[slice(*parts)]
+            if not is_text(owner):
+                raise NotModelled("a part of an array whose limits are not known")
+            return TEXT
         index = self.value(node.slice, frame)
         result: Any = UNDEFINED
         for condition, option in options_of(owner):
-            if not isinstance(option, list | tuple | str | Undefined):
+            if not isinstance(option, list | tuple | str | Text | Undefined):
                 raise NotModelled("an element of such a value")
-            found = UNDEFINED if isinstance(option, Undefined) else operations.item(list(option), index)
+            if isinstance(option, Undefined | Text):
+                found: Any = option if isinstance(option, Undefined) else TEXT
+            else:
+                found = operations.item(list(option), index)
             result = merged(condition, found, result)
         return result
 
@@ -242,6 +266,8 @@ class Evaluation:
         if isinstance(op, ast.In | ast.NotIn):
             found = either(*(operations.compare("==", left, each) for each in right))
             return found if isinstance(op, ast.In) else negated(found)
+        if is_unknown_text(left) or is_unknown_text(right):
+            return self.unknown_condition("the comparison of a STRING")
         return operations.compare(_OPERATORS[type(op)], left, right)
 
     # -- calls ------------------------------------------------------------------------------------------------------------
@@ -273,7 +299,7 @@ class Evaluation:
         name, module = getattr(function, "__name__", ""), getattr(function, "__module__", None)
         if module in (values.__name__, moments.__name__) and not isinstance(function, type):
             return self._of_values(function, name, given, dict(named or {}))
-        if isinstance(function, type) and function not in (bool, int, float, range, zip):
+        if isinstance(function, type) and function not in (bool, int, float, range, str, zip):
             return function(*given, **(named or {}))
         if self.sources.is_own(function) or ((module or "").startswith("fieldtwin.") and name != "is_good"):
             return self.run(function, given)
@@ -308,4 +334,6 @@ class Evaluation:
                 return UNDEFINED
         if name in OF_VALUES:
             return OF_VALUES[name](self, given)
+        if any(is_text(each) for each in given):
+            raise NotModelled(operations.STRINGS)
         return self.run(function, given)

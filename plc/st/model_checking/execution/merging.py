@@ -9,8 +9,10 @@ import z3
 
 from fieldtwin.plc.st.model_checking.execution.floats import is_float, merged_floats
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
+    TEXT,
     Choice,
     Condition,
+    Text,
     Undefined,
     both,
     either,
@@ -43,6 +45,8 @@ def merged(condition: Condition, yes: Any, no: Any) -> Any:
         return merged_floats(condition, yes, no)
     if isinstance(yes, str) and yes == no:
         return yes
+    if _is_unknown_text(yes, no):
+        return TEXT
     if isinstance(yes, tuple) and isinstance(no, tuple) and len(yes) == len(no):
         return tuple(merged(condition, a, b) for a, b in zip(yes, no, strict=True))
     return _choice([*_options(condition, yes), *_options(negated(condition), no)])
@@ -74,7 +78,12 @@ def _choice(options: list[tuple[Condition, Any]]) -> Any:
     return found[0][1] if len(found) == 1 else Choice(tuple(found))
 
 
+def _is_unknown_text(a: Any, b: Any) -> bool:
+    """Return whether one of two texts is not known."""
+    return (isinstance(a, Text) and isinstance(b, Text | str)) or (isinstance(b, Text) and isinstance(a, str))
+
+
 def _alike(a: Any, b: Any) -> bool:
-    if a is b or (isinstance(a, str) and isinstance(b, str) and a == b):
+    if a is b or (isinstance(a, str) and isinstance(b, str) and a == b) or _is_unknown_text(a, b):
         return True
     return any(is_kind(a) and is_kind(b) for is_kind in (is_condition, is_integer, is_float))

@@ -11,12 +11,14 @@ from typing import Any, Protocol
 
 import z3
 
+from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.model_checking.execution import floats, operations
-from fieldtwin.plc.st.model_checking.execution.merging import merged
+from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
 from fieldtwin.plc.st.model_checking.execution.operations import binary, compare, extreme, is_known, truth
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
+    TEXT,
     UNDEFINED,
     Condition,
     Int,
@@ -33,6 +35,10 @@ class Evaluation(Protocol):
     def fail_if(self, condition: Condition, message: str) -> None: ...
 
     def unknown(self, what: str) -> floats.Float: ...
+
+    def unknown_condition(self, what: str) -> Condition: ...
+
+    def unknown_integer(self, what: str, low: int, high: int) -> Int | int: ...
 
     def attribute(self, owner: Any, name: str) -> Any: ...
 
@@ -165,9 +171,12 @@ def _floating(x: Evaluation, given: tuple[Any, ...]) -> Any:
 
 
 def _length(x: Evaluation, given: tuple[Any, ...]) -> Any:
-    if isinstance(given[0], list | tuple):
-        return len(given[0])
-    raise NotModelled(operations.STRINGS)
+    result: Any = UNDEFINED
+    for condition, option in options_of(given[0]):
+        known = isinstance(option, list | tuple | str)
+        found = len(option) if known else x.unknown_integer("the length of a STRING", 0, ty.MAX_STRING)
+        result = merged(condition, found, result)
+    return result
 
 
 def _finite(x: Evaluation, given: tuple[Any, ...]) -> Any:
@@ -185,17 +194,40 @@ def _extreme(op: str) -> Model:
     return lambda x, given: extreme(op, given if len(given) > 1 else given[0])
 
 
+def _text(x: Evaluation, given: tuple[Any, ...]) -> Any:
+    return UNDEFINED if any(isinstance(each, Undefined) for each in given) else TEXT
+
+
+def _whole_number_of_text(x: Evaluation, given: tuple[Any, ...]) -> Any:
+    _, low, high = given
+    x.fail_if(x.unknown_condition("the conversion of a STRING"), "a string that is not a whole number")
+    return x.unknown_integer("the conversion of a STRING", low, high)
+
+
+def _number_of_text(x: Evaluation, given: tuple[Any, ...]) -> Any:
+    x.fail_if(x.unknown_condition("the conversion of a STRING"), "a string that is not a number")
+    return x.unknown("the conversion of a STRING")
+
+
+def _character(what: str) -> Model:
+    return lambda x, given: x.unknown_integer(what, 0, 65_535)
+
+
 OF_VALUES: dict[str, Model] = {
     "real": _real, "to_integer": _whole(cut=False), "truncated": _whole(cut=True), "power": _unknown("the power **"),
     "of_real": _of_real, "steps": _steps, "beyond": _beyond, "branch": _branch,
-    "to_bcd": _to_bcd, "of_bcd": _of_bcd,
+    "to_bcd": _to_bcd, "of_bcd": _of_bcd, "mid": _text, "right": _text, "inserted": _text, "deleted": _text, "replaced": _text,
+    "real_text": _text, "duration_text": _text, "date_text": _text, "moment_text": _text, "tod_text": _text,
+    "number_of": _whole_number_of_text, "real_of": _number_of_text, "code_of": _character("ASC"),
+    "find": lambda x, given: x.unknown_integer("FIND", 0, ty.MAX_STRING),
 }  # fmt: skip
-"""Models of functions of `fieldtwin.plc.st.values`, by name."""
+"""Models of functions of `fieldtwin.plc.st.values` and `fieldtwin.plc.st.runtime.moments`, by name."""
 BUILTINS: dict[str, Model] = {
     "range": number_range, "bool": _boolean, "int": _integer, "float": _floating, "len": _length, "isfinite": _finite,
     "any": _any, "min": _extreme("<"), "max": _extreme(">"), "abs": lambda x, given: operations.absolute(given[0]),
     "zip": lambda x, given: list(zip(*given, strict=True)), "hasattr": lambda x, given: hasattr(*given),
     "isinstance": lambda x, given: isinstance(*given), "getattr": lambda x, given: x.attribute(*given),
     "setattr": lambda x, given: x.put_attribute(*given), "atan2": _unknown("ATAN2"),
+    "str": _text, "chr": _text, "ord": _character("the number of a character"),
 }  # fmt: skip
 """Models of functions of Python, by name."""

@@ -12,10 +12,12 @@ from fieldtwin.plc.st.model_checking.execution import floats, symbolic
 from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
+    TEXT,
     UNDEFINED,
     Choice,
     Condition,
     Int,
+    Text,
     Undefined,
     as_condition,
     both,
@@ -40,7 +42,7 @@ _OF_CONDITIONS: dict[str, Callable[[Any, Any], Any]] = {
     "|": either,
     "^": lambda a, b: z3.Xor(as_condition(a), as_condition(b)),
 }
-STRINGS = "a STRING that depends on inputs or on the state"
+STRINGS = "this operation on a STRING that depends on inputs or on the state"
 
 
 def is_known(value: Any) -> bool:
@@ -48,6 +50,16 @@ def is_known(value: Any) -> bool:
     if isinstance(value, tuple):
         return all(map(is_known, value))
     return value is None or isinstance(value, bool | int | float | str | bytes | range)
+
+
+def is_text(value: Any) -> bool:
+    """Return whether `value` is a text, known or not, or one of several texts."""
+    return all(isinstance(option, str | Text) for _, option in options_of(value))
+
+
+def is_unknown_text(value: Any) -> bool:
+    """Return whether `value` can be a text that is not known."""
+    return any(isinstance(option, Text) for _, option in options_of(value))
 
 
 def truth(value: Any) -> Condition:
@@ -90,7 +102,9 @@ def binary(op: str, a: Any, b: Any) -> Any:
             return _OF_INTEGERS[op](a, b)
         if not floats.exact_division(a, b):
             raise NotModelled("the division of a whole number above 2**53 as a real number")
-    elif isinstance(a, str) or isinstance(b, str):
+    elif op == "+" and is_text(a) and is_text(b):
+        return TEXT
+    elif is_text(a) or is_text(b):
         raise NotModelled(STRINGS)
     elif not all(is_integer(x) or floats.is_float(x) for x in (a, b)):
         raise NotModelled(f"the operator {op} of such values")
@@ -112,7 +126,7 @@ def compare(op: str, a: Any, b: Any) -> Condition:
     a, b = _number(a), _number(b)
     if is_integer(a) and is_integer(b):
         return symbolic.compare(op, a, b)
-    if isinstance(a, str) or isinstance(b, str):
+    if is_text(a) or is_text(b):
         raise NotModelled(STRINGS)
     if not all(is_integer(x) or floats.is_float(x) for x in (a, b)):
         raise NotModelled(f"the comparison {op} of such values")

@@ -29,6 +29,13 @@ class Undefined:
 UNDEFINED = Undefined()
 
 
+class Text:
+    """A text that is not known. Its length, its number and the result of a comparison may have any value."""
+
+
+TEXT = Text()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Int:
     """An integer that is not known: a signed bit vector of exactly `width(low, high)` bits, from `low` to `high`."""

@@ -167,7 +167,23 @@ VAR one : Meter; two : Doubled; full, early : BOOL; END_VAR
   early := two.Add(by := by) AND NOT full;
 END_PROGRAM
 """
+TEXTS = """
+PROGRAM Texts
+VAR_INPUT n : INT; on : BOOL; x : REAL; t : TIME; END_VAR
+VAR shown, name, last : STRING; size, same, at : INT; was : BOOL; lines : ARRAY[0..2] OF STRING; END_VAR
+VAR_TEMP word : STRING; END_VAR
+  name := SEL(on, 'off', 'on');
+  size := LEN(name);
+  IF name = 'on' THEN same := same + 1; END_IF
+  word := CONCAT(name, '!');
+  at := FIND('on!off!', 'off');
+  shown := CONCAT(word, INT_TO_STRING(n), REAL_TO_STRING(x), TIME_TO_STRING(t), BOOL_TO_STRING(on));
+  lines[LIMIT(0, n, 2)] := MID(shown, 3, 2);
+  IF on THEN last := REPLACE(INSERT(DELETE(shown, 1, 1), 'x', 1), name, 1, 1); ELSE last := RIGHT(shown, 2); END_IF
+  was := on;
+END_PROGRAM
+"""
 EXAMPLES = {
     "integers": INTEGERS, "failing": FAILING, "parts": PARTS, "times": TIMES, "reals": REALS, "alarms": ALARMS, "chart": CHART,
-    "classes": CLASSES,
+    "classes": CLASSES, "texts": TEXTS,
 }  # fmt: skip

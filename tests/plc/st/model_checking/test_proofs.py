@@ -291,7 +291,8 @@ def test_errors_in_expressions_name_the_expression() -> None:
     [
         ("PROGRAM P VAR_INPUT m : MESSAGES; END_VAR END_PROGRAM", "MESSAGES, which the variable m has"),
         ("PROGRAM P VAR a : LTIME; END_VAR a := SCAN_TIME(); END_PROGRAM", r":1:\d+: .*SCAN_TIME"),
-        ("PROGRAM P VAR_INPUT b : BOOL; END_VAR VAR s : STRING; END_VAR s := SEL(b, 'x', 'y'); END_PROGRAM", "STRING"),
+        ("PROGRAM P VAR_INPUT n : INT; END_VAR VAR s : STRING; END_VAR s := MAX(INT_TO_STRING(n), 'x'); END_PROGRAM",
+         "this operation on a STRING"),
         ("PROGRAM P VAR_INPUT n : DINT; END_VAR VAR i : DINT; END_VAR WHILE i < n DO i := i + 1; END_WHILE END_PROGRAM",
          "a loop that can run more than 200 times"),
         ("INTERFACE I END_INTERFACE FUNCTION_BLOCK F IMPLEMENTS I END_FUNCTION_BLOCK "
@@ -304,3 +305,41 @@ def test_errors_in_expressions_name_the_expression() -> None:
 def test_a_construct_without_a_model_is_refused_by_name(text: str, what: str) -> None:
     with pytest.raises(FileInvalid, match=what):
         proved(text)
+
+
+TEXT = "PROGRAM P VAR_INPUT n : INT; on : BOOL; END_VAR VAR s : STRING; b : BOOL; i : INT; END_VAR {} END_PROGRAM"
+
+
+@pytest.mark.parametrize(
+    ("statements", "invariant", "unknown"),
+    [
+        ("b := LEN(INT_TO_STRING(n)) > 1;", "b", "the length of a STRING"),
+        ("b := INT_TO_STRING(n) = '7';", "b", "the comparison of a STRING"),
+        ("b := s < 'b'; s := SEL(on, 'a', 'c');", "b", "the comparison of a STRING"),
+        ("b := FIND(INT_TO_STRING(n), '7') > 0;", "b", "FIND"),
+        ("b := STRING_TO_INT(CONCAT(INT_TO_STRING(n MOD 10), '1')) > 5;", "b", "the conversion of a STRING"),
+        ("b := MID(INT_TO_STRING(n), 1, 1) = '7';", "b", "the comparison of a STRING"),
+        ("b := ASC(RIGHT(INT_TO_STRING(n), 1), 1) = 16#37;", "b", "ASC"),
+    ],
+)
+def test_the_model_does_not_know_texts_and_proves_nothing_about_them(
+    statements: str, invariant: str, unknown: str
+) -> None:
+    """Each condition can be true and false. So neither it nor its opposite may be proved."""
+    report = proved(TEXT.format(statements), invariant, f"NOT {invariant}", scans=3)
+    assert "proved" not in [r.verdict for r in report.invariants[:2]]
+    assert unknown in {what for what, _ in report.unknowns}
+
+
+def test_a_program_that_writes_texts_has_proofs_about_its_other_variables() -> None:
+    statements = "IF on AND i < 5 THEN i := i + 1; END_IF; s := CONCAT('step ', INT_TO_STRING(i)); b := s = 'step 2';"
+    report = proved(TEXT.format(statements), "i <= 5", "i < 5")
+    assert [r.verdict for r in report.invariants] == ["proved", "violated", "proved"]
+
+
+def test_a_choice_between_texts_is_exact_in_its_scan() -> None:
+    report = proved(
+        TEXT.format("i := LEN(SEL(on, 'off', 'on')); b := SEL(on, 'off', 'on') = 'on';"), "i = 3 - BOOL_TO_INT(b)"
+    )
+    assert one(report).verdict == "proved"
+    assert report.unknowns == ()

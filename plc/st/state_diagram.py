@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+from fieldtwin.plc.st.charts.check import charts_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.written import case_label, reference, text_of
 from fieldtwin.plc.states import Transition
@@ -35,6 +36,8 @@ class StateDiagram:
     initial: str
     transitions: tuple[Transition, ...]
     computed: tuple[t.Pos, ...] = ()
+    action: str = ""
+    """The action whose body is the chart; "" for the body of the POU."""
 
     def leaving(self, state: str) -> list[Transition]:
         """Return the transitions that begin in `state`, in textual order."""
@@ -55,7 +58,7 @@ class StateAssignment:
 def state_diagrams(unit: t.SourceUnit) -> Iterator[StateDiagram]:
     """Return the state machines of all POUs in the order of the unit, and within a POU in the order of their first CASE."""
     for pou, found in _machines(unit):
-        yield found.diagram() if isinstance(found, _Machine) else _chart(pou.name, found)
+        yield found.diagram() if isinstance(found, _Machine) else _chart(pou.name, *found)
 
 
 def state_assignments(unit: t.SourceUnit) -> Iterator[StateAssignment]:
@@ -65,13 +68,13 @@ def state_assignments(unit: t.SourceUnit) -> Iterator[StateAssignment]:
             yield from found.assignments()
 
 
-def _machines(unit: t.SourceUnit) -> Iterator[tuple[t.Pou, t.Chart | _Machine]]:
-    """Return the charts, and the state machines of CASEs, of all POUs."""
+def _machines(unit: t.SourceUnit) -> Iterator[tuple[t.Pou, tuple[str, t.Chart] | _Machine]]:
+    """Return the charts, each with its action, and the state machines of CASEs, of all POUs."""
     enums = {declared.name.lower(): declared for declared in unit.types if isinstance(declared, t.EnumDecl)}
     globals_ = {v.name.lower(): v for block in unit.globals for v in block.variables}
     for pou in unit.pous:
-        if pou.chart is not None:
-            yield pou, pou.chart
+        for action, chart in charts_of(pou).items():
+            yield pou, (action, chart)
         own = {v.name.lower(): v for block in pou.blocks for v in block.variables}
         bodies = [pou.body, *(action.body for action in pou.actions)]
         cases = [case for body in bodies for case in _cases(body)]
@@ -82,7 +85,7 @@ def _machines(unit: t.SourceUnit) -> Iterator[tuple[t.Pou, t.Chart | _Machine]]:
                 yield pou, found
 
 
-def _chart(pou: str, chart: t.Chart) -> StateDiagram:
+def _chart(pou: str, action: str, chart: t.Chart) -> StateDiagram:
     """Return a chart. A transition between several steps is an arrow from each of its sources to each of its targets."""
     names = {step.name.lower(): step.name for step in chart.steps}
     transitions = [
@@ -92,7 +95,7 @@ def _chart(pou: str, chart: t.Chart) -> StateDiagram:
         for target in one.targets
     ]
     initial = next(step.name for step in chart.steps if step.initial)
-    return StateDiagram(pou, "", tuple(names.values()), initial, tuple(transitions))
+    return StateDiagram(pou, "", tuple(names.values()), initial, tuple(transitions), action=action)
 
 
 def _cut(label: str) -> str:

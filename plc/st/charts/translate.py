@@ -12,15 +12,11 @@ from functools import cache
 from typing import Any
 
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
-from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.plc.st.charts.reachability import check_reachability
+from fieldtwin.plc.st.charts.check import TIMED, charts_of, check_charts, indicators
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.parse import parse
-from fieldtwin.plc.st.syntax.walk import nodes, with_parts
+from fieldtwin.plc.st.syntax.walk import with_parts
 
-_TIMED = ("L", "D", "SD", "DS", "SL")
-_QUALIFIERS = ("N", "R", "S", "P", "P0", "P1", *_TIMED)
 _HIDDEN = "hidden_"
 STEP = "0step"
 """The name of the function block of a step."""
@@ -74,107 +70,64 @@ def is_hidden(name: str) -> bool:
 
 
 def without_charts(unit: t.SourceUnit) -> t.SourceUnit:
-    """Return `unit` with the charts of its POUs as statements.
+    """Return `unit` with the charts of its POUs and of their actions as statements.
 
     Raises `FileInvalid` with line and column for the first error of a chart, and with the others.
     """
-    if all(pou.chart is None for pou in unit.pous):
+    if not any(charts_of(pou) for pou in unit.pous):
         return unit
     found = ErrorCollector()
-    shared = frozenset(v.name.lower() for block in unit.globals for v in block.variables)
-    pous = tuple(
-        _Translation(pou, pou.chart, shared, found).pou() if pou.chart is not None else pou for pou in unit.pous
-    )
+    for pou in unit.pous:
+        check_charts(pou, found)
     found.raise_all()
+    shared = frozenset(v.name.lower() for block in unit.globals for v in block.variables)
+    pous = tuple(_without_charts(pou, shared) if charts_of(pou) else pou for pou in unit.pous)
     return replace(unit, pous=(*_blocks(), *pous))
 
 
-class _Translation:
-    """The translation of the chart of one POU."""
+def _without_charts(pou: t.Pou, shared: frozenset[str]) -> t.Pou:
+    """Return a POU with its charts as statements. `shared` are the names of global variables, in lower case."""
+    parts = {name: _Translation(pou, name, chart, shared) for name, chart in charts_of(pou).items()}
+    variables = tuple(one for part in parts.values() for one in part.variables())
+    block = t.VarBlock(pou.pos, "VAR", frozenset(), variables)
+    actions = tuple(
+        replace(action, body=parts[action.name].body(), chart=None) if action.name in parts else action
+        for action in pou.actions
+    )
+    body = parts[""].body() if "" in parts else pou.body
+    return replace(pou, blocks=(*pou.blocks, block), body=body, actions=actions, chart=None)
 
-    def __init__(self, pou: t.Pou, chart: t.Chart, shared: frozenset[str], found: ErrorCollector) -> None:
-        self._pou, self._chart, self._found = pou, chart, found
+
+class _Translation:
+    """The translation of one chart: the body of a POU, or of its action `name`."""
+
+    def __init__(self, pou: t.Pou, name: str, chart: t.Chart, shared: frozenset[str]) -> None:
+        self._pou, self._chart = pou, chart
         self._variables = shared | {v.name.lower() for block in pou.blocks for v in block.variables}
         """The variables of the POU and the global ones, in lower case."""
-        self._steps = {step.name.lower(): step for step in chart.steps}
         self._actions = {action.name.lower() for action in pou.actions}
+        self._started = f"0chart_{name}" if name else "0chart"
         self._controls: dict[str, list[tuple[t.Step, t.Association]]] = {}
         """By action in lower case: its associations, in the order of the source."""
-
-    def pou(self) -> t.Pou:
-        before = len(self._found.errors)
-        self._check()
-        if len(self._found.errors) > before:
-            return replace(self._pou, chart=None)
-        for step in self._chart.steps:
+        for step in chart.steps:
             for one in step.associations:
                 self._controls.setdefault(one.action.lower(), []).append((step, one))
+
+    def variables(self) -> list[t.VarDecl]:
+        """Return the variables that the statements of the chart use, and that the source does not declare."""
         at = self._pou.pos
-        variables = [_declared(step.pos, step.name, STEP) for step in self._chart.steps]
-        variables += [_declared(at, _control(name), "0action_control") for name in self._controls]
-        variables.append(_declared(at, "0chart", "0chart"))
-        block = t.VarBlock(at, "VAR", frozenset(), tuple(variables))
-        return replace(self._pou, blocks=(*self._pou.blocks, block), body=self._body(), chart=None)
-
-    # -- checks -----------------------------------------------------------------------------------------------------------
-
-    def _check(self) -> None:
-        if self._pou.body:
-            self._bad(self._pou.body[0].pos, "a statement next to steps", hint="put it into an ACTION")
-        seen: set[str] = set()
-        for step in self._chart.steps:
-            if step.name.lower() in seen:
-                self._bad(step.pos, f"step {step.name} is declared twice")
-            seen.add(step.name.lower())
-            for one in step.associations:
-                self._check_association(one)
-            self._check_twice(step)
-        self._check_calls()
-        initial = [step for step in self._chart.steps if step.initial]
-        if not initial:
-            pos = (self._chart.steps or self._chart.transitions)[0].pos
-            self._bad(pos, f"the chart of {self._pou.name} has no initial step", expected="one INITIAL_STEP")
-        for step in initial[1:]:
-            message = f"{step.name} is a second initial step; the first is {initial[0].name}"
-            self._bad(step.pos, message, expected="one INITIAL_STEP")
-        known = [step.name for step in self._chart.steps]
-        complete = len(initial) == 1 and len(seen) == len(known)
-        for transition in self._chart.transitions:
-            for name in (*transition.sources, *transition.targets):
-                if name.lower() not in seen:
-                    complete = False
-                    self._bad(transition.pos, f"step {name!r} is not declared", hint=did_you_mean(name, known))
-        if complete:
-            for error in check_reachability(self._chart):
-                self._found.add(error)
-
-    def _check_twice(self, step: t.Step) -> None:
-        seen: set[tuple[str, str]] = set()
-        for one in step.associations:
-            if (one.action.lower(), one.qualifier) in seen:
-                self._bad(one.pos, f"step {step.name} has action {one.action} twice with the qualifier {one.qualifier}")
-            seen.add((one.action.lower(), one.qualifier))
-
-    def _check_calls(self) -> None:
-        """Refuse the call of a step by an action. The chart itself calls the blocks of its steps."""
-        for one in nodes(self._pou.actions):
-            if isinstance(one, t.Call) and one.ref.name.lower() in self._steps:
-                self._bad(one.pos, f"step {one.ref.name} cannot be called", hint="a transition activates a step")
-
-    def _check_association(self, one: t.Association) -> None:
-        if one.qualifier not in _QUALIFIERS:
-            self._bad(one.pos, f"the qualifier of action {one.action}", ", ".join(_QUALIFIERS), one.qualifier)
-        elif one.qualifier in _TIMED and not one.arguments:
-            self._bad(one.pos, f"action {one.action} has no time", f"{one.action}({one.qualifier}, T#1s)")
-        elif len(one.arguments) > (one.qualifier in _TIMED):
-            self._bad(one.pos, f"indicator variables are not supported, and action {one.action} has one")
-
-    def _bad(self, pos: t.Pos, message: str, expected: str = "", got: str = "", hint: str = "") -> None:
-        self._found.add(invalid(pos, message, expected, got, hint))
+        named = {one.name.lower(): one for one in self._chart.transitions if one.body}
+        return [
+            *(_declared(step.pos, step.name, STEP) for step in self._chart.steps),
+            *(_declared(at, _control(name), "0action_control") for name in self._controls),
+            *(_declared(one.pos, one.name, "BOOL") for one in named.values()),
+            _declared(at, self._started, "0chart"),
+        ]
 
     # -- statements -------------------------------------------------------------------------------------------------------
 
-    def _body(self) -> tuple[t.Statement, ...]:
+    def body(self) -> tuple[t.Statement, ...]:
+        """Return the statements that execute the chart once."""
         at = self._pou.pos
         statements: list[t.Statement] = [
             _assign(step.pos, step.name, flag, _false(step.pos))
@@ -188,12 +141,13 @@ class _Translation:
         )
         evolution = tuple(self._evolution(one) for one in transitions)
         first = next(step for step in self._chart.steps if step.initial)
-        start = (_assign(at, first.name, "0gained", _true(at)), _assign(at, "0chart", "0started", _true(at)))
-        statements.append(t.If(at, ((_member(at, "0chart", "0started"), evolution),), start))
+        start = (_assign(at, first.name, "0gained", _true(at)), _assign(at, self._started, "0started", _true(at)))
+        statements.append(t.If(at, ((_member(at, self._started, "0started"), evolution),), start))
         statements += [_call(step.pos, step.name) for step in self._chart.steps]
         for name in self._controls:
             statements += self._control(name)
         statements += [self._execution(name) for name in self._controls]
+        statements += self._indicators()
         return tuple(statements)
 
     def _evolution(self, transition: t.Transition) -> t.Statement:
@@ -206,8 +160,10 @@ class _Translation:
         cleared = [_assign(pos, name, "0lost", _true(pos)) for name in transition.sources]
         cleared += [_assign(pos, name, "0gained", _true(pos)) for name in transition.targets]
         recorded = (transition.probe,) if transition.probe is not None else ()
-        inner = t.If(pos, ((transition.condition, (*recorded, *cleared)),))
-        return t.If(pos, ((_all(pos, "AND", enabled), (inner,)),))
+        evaluated: list[t.Statement] = [t.If(pos, ((transition.condition, (*recorded, *cleared)),))]
+        if transition.body:  # a body that assigns nothing in this scan does not clear the transition
+            evaluated[:0] = (t.Assign(pos, t.Ref(pos, transition.name), _false(pos)), *transition.body)
+        return t.If(pos, ((_all(pos, "AND", enabled), tuple(evaluated)),))
 
     def _control(self, name: str) -> list[t.Statement]:
         """Return the statements that set the inputs of an action's control and call it."""
@@ -220,10 +176,19 @@ class _Translation:
             active: list[t.Expr] = [_member(one.pos, step.name, flag) for step, one in steps]
             statements.append(_assign(pos, control, f"0{qualifier.lower()}", _all(pos, "OR", active)))
             for step, one in steps:
-                if one.arguments:
+                if qualifier in TIMED:
                     time = _assign(one.pos, control, f"0t_{qualifier.lower()}", one.arguments[0])
                     statements.append(t.If(one.pos, ((_member(one.pos, step.name, "X"), (time,)),)))
         return [*statements, _call(pos, control)]
+
+    def _indicators(self) -> list[t.Statement]:
+        """Return statements that only make the compiler check the indicator variables: an indicator has no effect (6.7.4.3)."""
+        return [
+            t.Hold(one.pos, f"0indicator{number}", indicator, f"the indicator of action {one.action}")
+            for step in self._chart.steps
+            for one in step.associations
+            for number, indicator in enumerate(indicators(one))
+        ]
 
     def _execution(self, name: str) -> t.Statement:
         """Return the call of an action while the output of its control is TRUE, or the assignment of the BOOL variable."""

@@ -53,15 +53,7 @@ class Probes:
 
     def _pou(self, pou: t.Pou, assigned: Sequence[StateAssignment]) -> t.Pou:
         body = _Body(self, pou, assigned)
-        chart = pou.chart
-        if chart is not None:
-            chart = replace(chart, transitions=tuple(self._transition(pou, one) for one in chart.transitions))
-        changed: t.Pou = with_parts(pou, body.changed, but="chart")
-        return replace(changed, chart=chart)
-
-    def _transition(self, pou: t.Pou, one: t.Transition) -> t.Transition:
-        name = f"{', '.join(one.sources)} -> {', '.join(one.targets)}"
-        return replace(one, probe=self.probe(Kind.TRANSITION, one.pos, f"{pou.name} {name}", pou.name))
+        return with_parts(pou, body.changed)  # type: ignore[no-any-return]
 
     def probe(self, kind: Kind, pos: t.Pos, name: str, pou: str) -> t.Probe:
         number = next(self._numbers)
@@ -92,6 +84,8 @@ class _Body:
     def changed(self, node: Any) -> Any:
         if isinstance(node, tuple) and any(isinstance(part, _STATEMENTS) for part in node):
             return tuple(one for statement in node for one in self._statement(statement))
+        if isinstance(node, t.Chart):
+            return replace(node, transitions=tuple(self._transition(one) for one in node.transitions))
         if isinstance(node, t.If):
             branches = tuple(
                 (condition, self._branch(node.pos, f"THEN {n}", body))
@@ -105,6 +99,11 @@ class _Body:
             )
             return replace(node, branches=cases, otherwise=self._branch(node.pos, "ELSE", node.otherwise))
         return with_parts(node, self.changed)
+
+    def _transition(self, one: t.Transition) -> t.Transition:
+        name = f"{self._pou} {', '.join(one.sources)} -> {', '.join(one.targets)}"
+        probe = self._probes.probe(Kind.TRANSITION, one.pos, name, self._pou)
+        return replace(one, probe=probe, body=self.changed(one.body))
 
     def _statement(self, statement: Any) -> list[Any]:
         found: list[Any] = []

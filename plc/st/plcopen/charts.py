@@ -9,15 +9,18 @@ Blocks, contacts, coils and variables beside the chart are a network in LD or FB
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.plcopen.elements import Element
-from fieldtwin.plc.st.plcopen.networks import Drawing, Drawn
+from fieldtwin.plc.st.plcopen.networks import Drawing, Drawn, drawn
 from fieldtwin.plc.st.plcopen.nodes import Node, nodes_of, pin_of, refuse_elements
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.parse import parse_expression
+from fieldtwin.plc.st.syntax.parse import parse_expression, parse_statements
 
+_ASSIGNS = re.compile(r"[A-Za-z_][\w.]*\s*:=|(?:IF|CASE|FOR|WHILE|REPEAT)\b|.*;\s*\S", re.IGNORECASE | re.DOTALL)
+"""The beginning of a body that assigns its condition, instead of being one."""
 _UNSUPPORTED = ("macroStep", "jump", "label", "return", "error", "vendorElement")
 
 
@@ -85,8 +88,6 @@ class _Reader(Drawing):
         return t.Step(node.pos, _name(node, "name"), initial, tuple(associations))
 
     def _association(self, step: Node, block: Node, action: Element) -> t.Association:
-        if action.attributes.get("indicator"):
-            raise block.unsupported("an action has an indicator variable, which is not supported")
         reference, inline = action.find("reference"), action.find("inline")
         if reference is not None:
             name = reference.attributes.get("name", "").strip()
@@ -97,7 +98,8 @@ class _Reader(Drawing):
             raise block.unsupported("an action has neither a name nor statements in ST")
         qualifier = action.attributes.get("qualifier", "N").strip().upper()
         duration = action.attributes.get("duration", "").strip()
-        arguments = (parse_expression(self.standard(duration), block.pos),) if duration else ()
+        given = (duration, action.attributes.get("indicator", "").strip())
+        arguments = tuple(parse_expression(self.standard(text), block.pos) for text in given if text)
         return t.Association(block.pos, name, qualifier, arguments)
 
     # -- transitions ------------------------------------------------------------------------------------------------------
@@ -108,7 +110,12 @@ class _Reader(Drawing):
             raise node.error(f"the transition has no step {'before' if not sources else 'after'} it")
         priority = node.element.attributes.get("priority", "").strip()
         number = int(priority) if priority.isascii() and priority.isdigit() else 0
-        return t.Transition(node.pos, "", number or None, sources, targets, self._condition(node))
+        name, declared = self._declared(node)
+        if declared is None:
+            return t.Transition(node.pos, "", number or None, sources, targets, self._condition(node))
+        body = self._body(node, name, declared)
+        condition = t.Ref(node.pos, name) if body else self._in_text(node, declared)
+        return t.Transition(node.pos, name if body else "", number or None, sources, targets, condition, body=body)
 
     def _sources(self, node: Node, seen: frozenset[str]) -> Iterator[str]:
         """Yield the steps from which a transition, or the element before it, comes."""
@@ -154,22 +161,35 @@ class _Reader(Drawing):
         condition = node.element.find("condition")
         for part in condition.children if condition is not None else ():
             if part.tag == "reference":
-                name = part.attributes.get("name", "").strip()
-                declared = self.named.get(name.lower())
-                return self._parsed(node, name) if declared is None else self._in_text(node, declared)
+                return self._parsed(node, part.attributes.get("name", "").strip())
             if part.tag == "inline":
                 return self._in_text(node, part)
             if part.tag == "connectionPointIn":
                 return self._flow(node, pin_of("", part, part))
         raise node.error("the transition has no condition")
 
+    def _declared(self, node: Node) -> tuple[str, Element | None]:
+        """Return the name in the condition of a transition, and the body that the POU has for this name."""
+        condition = node.element.find("condition")
+        reference = condition.find("reference") if condition is not None else None
+        name = reference.attributes.get("name", "").strip() if reference is not None else ""
+        return name, self.named.get(name.lower())
+
+    def _body(self, node: Node, name: str, body: Element) -> tuple[t.Statement, ...]:
+        """Return the statements of the body of a named transition; none if the body is only an expression."""
+        language = next((part for part in body.children if part.tag in ("FBD", "LD")), None)
+        if language is not None:
+            found = drawn(language, f"transition {name}", node.pos.path, self.standard, name.lower())
+            self.edges += found.edges
+            return found.body
+        text = _text(body.find("ST"))
+        return parse_statements(self.standard(text), node.pos) if _ASSIGNS.match(text) else ()
+
     def _in_text(self, node: Node, body: Element) -> t.Expr:
         """Return a condition in ST: ``:= a AND b;``, as the standard writes it, or only the expression."""
-        text = body.find("ST")
-        if text is None:
-            raise node.unsupported("the condition of a transition has a body in another language than ST")
-        written_text = "".join(piece for _, piece in text.texts()).strip()
-        return self._parsed(node, written_text.removeprefix(":=").rstrip("; \t\r\n"))
+        if body.find("ST") is None:
+            raise node.unsupported("the condition of a transition has a body in another language than ST, LD and FBD")
+        return self._parsed(node, _text(body.find("ST")).removeprefix(":=").rstrip("; \t\r\n"))
 
     def _source(self, node: Node, source: str, output: str) -> t.Expr:
         other = self.nodes.get(source)
@@ -178,6 +198,10 @@ class _Reader(Drawing):
         if other.tag == "step":
             return t.Ref(node.pos, _name(other, "name"), (t.Member(node.pos, "X"),))
         return super()._source(node, source, output)
+
+
+def _text(element: Element | None) -> str:
+    return "".join(piece for _, piece in element.texts()).strip() if element is not None else ""
 
 
 def _name(node: Node, attribute: str) -> str:

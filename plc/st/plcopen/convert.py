@@ -176,8 +176,12 @@ class _Converter:
                 if body is None:
                     raise self._fail(action, f"action {name} has no body", expected="<body><ST>")
                 self._put(action.line, f"ACTION {self._name(action)}:")
+                is_chart = any(language.tag == "SFC" for language in body.children)
+                if is_chart:  # the statements in its action blocks become actions, which are not nested
+                    self._put(action.line, "END_ACTION")
                 self._body(pou, body, self._name(action))
-                self._put(action.end_line, "END_ACTION")
+                if not is_chart:
+                    self._put(action.end_line, "END_ACTION")
 
     def _variables(self, block: Element) -> None:
         if block.tag == "globalVars":
@@ -255,8 +259,8 @@ class _Converter:
                 raise self._unsupported(language, f"{of} is a function that detects an edge, which is not supported")
             self.drawings[self._name(pou).lower(), action.lower()] = found
             return
-        if language.tag == "SFC" and not action and _kind(pou) != "FUNCTION":
-            self._chart(pou, language, own)
+        if language.tag == "SFC" and _kind(pou) != "FUNCTION":
+            self._chart(pou, language, own, action)
             return
         if language.tag != "ST":
             raise self._unsupported(language, f"{of} has a body in {language.tag}, which is not supported")
@@ -268,7 +272,7 @@ class _Converter:
                 if piece.strip():
                     self._put(line + offset, piece)
 
-    def _chart(self, pou: Element, language: Element, own: set[str]) -> None:
+    def _chart(self, pou: Element, language: Element, own: set[str], action: str) -> None:
         """Read a chart, and write the statements in its action blocks as actions."""
         named = {
             transition.attributes.get("name", "").lower(): body
@@ -276,12 +280,13 @@ class _Converter:
             if (body := transition.find("body")) is not None
         }
         name = self._name(pou)
-        found = read_chart(language, name, self.path, lambda text: self._unqualified(text, own), named)
+        of = f"{name}.{action}" if action else name
+        found = read_chart(language, of, self.path, lambda text: self._unqualified(text, own), named)
         for inline in found.inline:
             self._put(inline.element.line, f"ACTION {inline.name}:")
             self._statements(inline.element, own)
             self._put(inline.element.end_line, "END_ACTION")
-        self.drawings[name.lower(), ""] = found.drawn
+        self.drawings[name.lower(), action.lower()] = found.drawn
 
     def _unqualified(self, text: str, own: set[str]) -> str:
         """Write ``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; columns stay the same, so that errors name the

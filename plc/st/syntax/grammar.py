@@ -40,9 +40,9 @@ _READABLE = {
 
 @cache
 def parser() -> Lark:
-    """Return the parser, with the rules `start` and `expression` as its starts."""
+    """Return the parser, with the rules `start`, `expression` and `body` as its starts."""
     grammar = resources.files("fieldtwin.plc.st.syntax").joinpath("grammar.lark").read_text(encoding="utf-8")
-    starts = ["start", "expression"]
+    starts = ["start", "expression", "body"]
     return Lark(
         grammar, start=starts, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 from lark.exceptions import UnexpectedInput, VisitError
 
@@ -61,9 +62,18 @@ def parse(text: str, path: str = "", dialect: Dialect = STANDARD, before: tuple[
 
 def parse_expression(text: str, at: t.Pos) -> t.Expr:
     """Return the tree of one expression of a drawing; all its parts are at the element `at`. Raises `FileInvalid`."""
+    return _parsed(text, at, "expression")  # type: ignore[no-any-return]
+
+
+def parse_statements(text: str, at: t.Pos) -> tuple[t.Statement, ...]:
+    """Return the statements in an element `at` of a drawing, as `parse_expression` does."""
+    return _parsed(text, at, "body")  # type: ignore[no-any-return]
+
+
+def _parsed(text: str, at: t.Pos, start: str) -> Any:
     try:
         text = blanked(text, at.path)
-        return _Build(at.path, at=at).transform(parser().parse(text, start="expression"))  # type: ignore[no-any-return]
+        return _Build(at.path, at=at).transform(parser().parse(text, start=start))
     except UnexpectedInput as e:
         error = invalid(e, text, at.path)
     except VisitError as e:

@@ -167,16 +167,20 @@ class VarBlock:
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """An action of a PROGRAM or FUNCTION_BLOCK: statements with a name that use the variables of the POU."""
+    """An action of a PROGRAM or FUNCTION_BLOCK: statements, or a chart, with a name that use the variables of the POU."""
 
     pos: Pos
     name: str
     body: tuple[Statement, ...]
+    chart: Chart | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """An action of a step with its qualifier in capitals; `arguments` are the expressions after the qualifier."""
+    """An action of a step with its qualifier in capitals.
+
+    `arguments` are the expressions after the qualifier: the time, if the qualifier has one, and the indicator variables.
+    """
 
     pos: Pos
     action: str
@@ -194,7 +198,10 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A transition between steps. `sources` and `targets` are names; `priority` is None if it is not stated."""
+    """A transition between steps. `sources` and `targets` are names; `priority` is None if it is not stated.
+
+    The statements in `body` assign the condition to the name of the transition, and `condition` reads it.
+    """
 
     pos: Pos
     name: str
@@ -203,11 +210,12 @@ class Transition:
     targets: tuple[str, ...]
     condition: Expr
     probe: Probe | None = None
+    body: tuple[Statement, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK (IEC 61131-3, 6.7).
+    """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK, or of its action (IEC 61131-3, 6.7).
 
     `before` are the statements of the blocks that are drawn beside the chart. Each scan executes them before the transitions.
     """

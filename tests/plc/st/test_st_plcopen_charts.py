@@ -247,8 +247,8 @@ def test_a_wrong_chart_is_refused_with_the_element(body: str, said: str) -> None
             "another language than ST",
         ),
         (
-            LOOP + transition("2", "1") + element("actionBlock", "3", "1", inside='<action indicator="x"/>'),
-            "an indicator variable",
+            LOOP + transition("2", "1") + element("actionBlock", "3", "1", inside="<action/>"),
+            "neither a name nor statements",
         ),
     ],
 )
@@ -264,3 +264,77 @@ def test_an_error_in_an_inline_action_has_its_line() -> None:
     with pytest.raises(FileInvalid, match="nothing") as caught:
         compile_unit(read_plcopen(text, "main.xml"), "main.xml", ("main.xml",))
     assert caught.value.line == line
+
+
+def test_an_indicator_of_an_action_is_read_and_has_to_be_a_bool() -> None:
+    block = '<action localId="8" qualifier="L" duration="T#20ms" indicator="stop"><reference name="q"/></action>'
+    body = LOOP + transition("2", "1") + element("actionBlock", "3", "1", inside=block)
+    (association,) = chart(body).steps[0].associations
+    assert [text_of(one) for one in association.arguments] == ["T#20ms", "stop"]
+    with pytest.raises(FileInvalid, match="the indicator of action q; expected BOOL; got INT"):
+        running(body.replace('indicator="stop"', 'indicator="n"'))
+
+
+def named_transition(language: str) -> str:
+    return f"<transitions><transition name='Ready'><body>{language}</body></transition></transitions>"
+
+
+IN_FBD = (
+    '<FBD><inVariable localId="1"><position x="0" y="0"/><connectionPointOut/><expression>go</expression></inVariable>'
+    '<inVariable localId="2"><position x="0" y="9"/><connectionPointOut/><expression>stop</expression>'
+    '</inVariable><block localId="3" typeName="AND"><position x="9" y="0"/><inputVariables>'
+    + "".join(
+        f'<variable formalParameter="IN{n}" edge="{edge}"><connectionPointIn><connection refLocalId="{n}"/>'
+        "</connectionPointIn></variable>"
+        for n, edge in ((1, "none"), (2, "falling"))
+    )
+    + '</inputVariables><outputVariables><variable formalParameter="OUT"><connectionPointOut/></variable></outputVariables>'
+    '</block><outVariable localId="4"><position x="20" y="0"/><connectionPointIn><connection refLocalId="3"/>'
+    "</connectionPointIn><expression>Ready</expression></outVariable></FBD>"
+)
+IN_ST = f"<ST><p {XHTML}>IF go THEN\nReady := NOT stop; END_IF</p></ST>"
+
+
+@pytest.mark.parametrize("language", [IN_FBD, IN_ST])
+def test_a_named_transition_may_have_a_body(language: str) -> None:
+    body = (
+        step("1", "A", "4", initial=True)
+        + transition("2", "1", condition='<condition><reference name="Ready"/></condition>')
+        + step("3", "B", "2")
+        + transition("4", "3", condition=inline("NOT go"))
+    )
+    text = project(body, named_transition(language))
+    made = program_class(compile_unit(read_plcopen(text, "main.xml"), "main.xml", ("main.xml",)), "Main")()
+    seen = []
+    for number, (go, stop) in enumerate([(False, False), (True, True), (True, False), (False, False), (True, True)], 1):
+        made.go, made.stop = go, stop  # type: ignore[attr-defined]
+        scan(made, number)
+        found = made.internal("B.X")
+        assert found is not None
+        seen.append(found.value)
+    assert seen == [False, False, True, False, False]
+
+
+def test_the_body_of_an_action_may_be_a_chart() -> None:
+    inner = (
+        step("1", "Red", "4", initial=True) + transition("2", "1", condition=inline("go")) + step("3", "Green", "2")
+        + transition("4", "3", condition=inline("go"))
+        + element(
+            "actionBlock", "6", "3",
+            inside=f'<action localId="8" qualifier="P1"><inline><ST><p {XHTML}>n := n + 1;</p></ST></inline></action>',
+        )
+    )  # fmt: skip
+    actions = f"<actions><action name='Blink'><body><SFC>{inner}</SFC></body></action></actions>"
+    outer = (
+        LOOP
+        + transition("2", "1", condition=inline("FALSE"))
+        + element("actionBlock", "6", "1", inside='<action localId="7"><reference name="Blink"/></action>')
+    )
+    text = project(outer, actions)
+    made = program_class(compile_unit(read_plcopen(text, "main.xml"), "main.xml", ("main.xml",)), "Main")()
+    seen = []
+    for number in range(1, 7):
+        made.go = True  # type: ignore[attr-defined]
+        scan(made, number)
+        seen.append(made.n)  # type: ignore[attr-defined]
+    assert seen == [0, 1, 1, 2, 2, 3]

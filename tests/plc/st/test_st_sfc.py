@@ -196,7 +196,20 @@ A, B = "INITIAL_STEP A: END_STEP\n", "STEP B: END_STEP\n"
         ),
         ("INITIAL_STEP A: x(Q); END_STEP", 2, "the qualifier of action x"),
         ("INITIAL_STEP A: x(L); END_STEP", 2, "action x has no time"),
-        ("INITIAL_STEP A: x(N, x); END_STEP", 2, "indicator variables are not supported"),
+        ("INITIAL_STEP A: x(N, 5); END_STEP", 2, "the indicator of action x is not a variable"),
+        ("INITIAL_STEP A: x(L, T#1s, t); END_STEP", 2, "the indicator of action x; expected BOOL; got TIME"),
+        ("INITIAL_STEP A: x(N, y); END_STEP", 2, "'y' is not declared"),
+        (A + B + "TRANSITION FROM A TO B: y := x; END_TRANSITION", 4, "a transition with a body needs a name"),
+        (A + B + "TRANSITION x FROM A TO B: x := TRUE; END_TRANSITION", 4, "transition x has a name that is used"),
+        (A + B + "TRANSITION B FROM A TO B: B := TRUE; END_TRANSITION", 4, "transition B has a name that is used"),
+        (A + B + "TRANSITION go FROM A TO B:\nRETURN; END_TRANSITION", 5, "RETURN in the body of a transition"),
+        (A + "ACTION go: INITIAL_STEP A: END_STEP END_ACTION", 3, "step A is declared twice"),
+        (A + "ACTION go: STEP B: END_STEP END_ACTION", 3, "the chart of p.go has no initial step"),
+        (A + "ACTION go: INITIAL_STEP B: END_STEP\nx := TRUE; END_ACTION", 4, "a statement next to steps"),
+        (
+            A.replace(":", ": x(N);") + "ACTION go: INITIAL_STEP B: x(N); END_STEP END_ACTION", 3,
+            "action x belongs to steps of two charts of p",
+        ),
         ("INITIAL_STEP A: y(N); END_STEP", 2, "'y' is not declared"),
         (A + "x := TRUE;", 3, "a statement next to steps"),
         ("INITIAL_STEP A: x(L, T#1s);\nx(L, T#2s); END_STEP", 3, "step A has action x twice with the qualifier L"),
@@ -207,7 +220,7 @@ A, B = "INITIAL_STEP A: END_STEP\n", "STEP B: END_STEP\n"
 )  # fmt: skip
 def test_an_error_in_a_chart_names_its_line(body: str, line: int, message: str) -> None:
     with pytest.raises(FileInvalid) as caught:
-        program(f"PROGRAM p VAR x : BOOL; END_VAR\n{body}\nEND_PROGRAM")
+        program(f"PROGRAM p VAR x : BOOL; t : TIME; END_VAR\n{body}\nEND_PROGRAM")
     assert caught.value.line == line
     assert message in str(caught.value)
 
@@ -234,3 +247,65 @@ def test_step_and_transition_remain_ordinary_names() -> None:
     )
     scan(made)
     assert made.transition == 3  # type: ignore[attr-defined]
+
+
+def test_an_indicator_variable_has_no_effect() -> None:
+    made = program("""
+        PROGRAM p VAR_OUTPUT q, done : BOOL; END_VAR
+        INITIAL_STEP A: q(L, T#10ms, done); Look(N, done, q); END_STEP
+        ACTION Look: done := NOT q; END_ACTION
+        END_PROGRAM""")
+    seen = []
+    for number in range(1, 4):
+        scan(made, number)
+        seen.append((made.q, made.done))  # type: ignore[attr-defined]
+    assert seen == [(True, False), (False, True), (False, True)]
+
+
+def test_the_body_of_a_transition_assigns_its_condition_while_its_steps_are_active() -> None:
+    made = program("""
+        PROGRAM p VAR_INPUT level : INT; END_VAR VAR_OUTPUT n : INT; END_VAR
+        INITIAL_STEP A: END_STEP
+        STEP B: END_STEP
+        TRANSITION full FROM A TO B:
+          n := n + 1;
+          IF level > 5 THEN full := TRUE; END_IF
+        END_TRANSITION
+        TRANSITION back FROM B TO A: back := level < 2; END_TRANSITION
+        END_PROGRAM""")
+    seen = []
+    for number, level in enumerate((9, 3, 9, 9, 1, 3, 1), 1):
+        made.level = level  # type: ignore[attr-defined]
+        scan(made, number)
+        seen.append((internal(made, "B.X"), made.n))  # type: ignore[attr-defined]
+    assert seen == [(False, 0), (False, 1), (True, 2), (True, 2), (False, 2), (False, 3), (False, 4)]
+
+
+def test_the_chart_of_an_action_runs_with_its_step_and_keeps_its_own_step() -> None:
+    made = program("""
+        PROGRAM p VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT red, green : BOOL; END_VAR
+        INITIAL_STEP Off: END_STEP
+        STEP On: Blink(N); END_STEP
+        TRANSITION FROM Off TO On := go; END_TRANSITION
+        TRANSITION FROM On TO Off := NOT go; END_TRANSITION
+        ACTION Blink:
+          INITIAL_STEP Stop: red(N); END_STEP
+          STEP Pass: green(N); END_STEP
+          TRANSITION FROM Stop TO Pass := TRUE; END_TRANSITION
+          TRANSITION FROM Pass TO Stop := TRUE; END_TRANSITION
+        END_ACTION
+        END_PROGRAM""")
+    seen = ""
+    for number, go in enumerate((0, 1, 1, 1, 0, 0, 1, 1), 1):
+        made.go = bool(go)  # type: ignore[attr-defined]
+        scan(made, number)
+        seen += "r" if made.red else "g" if made.green else "-"  # type: ignore[attr-defined]
+    assert seen == "-rgrggrg"  # the chart runs once more after its control, and continues where it stopped
+    assert list(made.internal_names()) == [
+        "Off.X", "Off.T", "On.X", "On.T", "Stop.X", "Stop.T", "Pass.X", "Pass.T",
+    ]  # fmt: skip
+
+
+def test_an_action_does_not_execute_its_own_chart() -> None:
+    with pytest.raises(FileInvalid, match=r"calls itself|recursi"):
+        program("PROGRAM p go(); ACTION go: INITIAL_STEP B: go(N); END_STEP END_ACTION END_PROGRAM")

@@ -12,7 +12,7 @@ from lark import Token, v_args
 from lark.tree import Meta
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.rules.base import Rules
+from fieldtwin.plc.st.syntax.rules.base import Bad, Rules
 
 
 @v_args(meta=True)
@@ -34,7 +34,12 @@ class ChartRules(Rules):
         name = str(rest.pop(0)) if isinstance(rest[0], Token) else ""
         priority = rest.pop(0) if isinstance(rest[0], int) else None
         sources, targets, condition = rest
-        return t.Transition(self._pos(word), name, priority, sources, targets, condition)
+        if not isinstance(condition, tuple):
+            return t.Transition(self._pos(word), name, priority, sources, targets, condition)
+        if not name:
+            raise Bad(word, "a transition with a body needs a name, to which the body assigns the condition")
+        read = t.Ref(self._pos(word), name)
+        return t.Transition(self._pos(word), name, priority, sources, targets, read, body=condition)
 
     def priority(self, meta: Meta, items: list[Any]) -> int:
         return int(items[0])
@@ -44,7 +49,7 @@ class ChartRules(Rules):
 
 
 def chart_of(items: Iterable[Any]) -> t.Chart | None:
-    """Return the chart in the body of a POU; None if the body has neither steps nor transitions."""
+    """Return the chart in the body of a POU or action; None if the body has neither steps nor transitions."""
     parts = tuple(items)
     steps = tuple(i for i in parts if isinstance(i, t.Step))
     transitions = tuple(i for i in parts if isinstance(i, t.Transition))

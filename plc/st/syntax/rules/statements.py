@@ -9,6 +9,7 @@ from lark.tree import Meta
 
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.rules.base import Rules
+from fieldtwin.plc.st.syntax.rules.charts import chart_of
 
 
 @v_args(meta=True)
@@ -18,11 +19,12 @@ class StatementRules(Rules):
     def body(self, meta: Meta, items: list[Any]) -> tuple[t.Statement, ...]:
         return tuple(i for i in items if i is not None)
 
-    pou_body = body
+    pou_body = action_body = body
 
     def action(self, meta: Meta, items: list[Any]) -> t.Action:
-        name, body = items
-        return t.Action(self._pos(name), str(name), body)
+        name, parts = items
+        body = tuple(i for i in parts if isinstance(i, t.Statement))
+        return t.Action(self._pos(name), str(name), body, chart_of(parts))
 
     def empty(self, meta: Meta, items: list[Any]) -> None:
         return None

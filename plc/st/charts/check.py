@@ -44,7 +44,7 @@ def indicators(one: t.Association) -> tuple[t.Expr, ...]:
 
 
 def _check_names(pou: t.Pou, charts: dict[str, t.Chart], found: ErrorCollector) -> None:
-    """Check that each step and each transition with a body has a name of its own, and each action is in one chart only."""
+    """Check that the names of steps and of transitions with a body are unique, and that each action is in one chart only."""
     seen: set[str] = set()
     taken = {v.name.lower() for block in pou.blocks for v in block.variables} | {a.name.lower() for a in pou.actions}
     of: dict[str, str] = {}

@@ -7,7 +7,7 @@ function and the state of a connection are kept in a `Hold`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.plcopen.elements import Element
 from fieldtwin.plc.st.plcopen.nodes import Node, Pin, in_order, nodes_of, refuse_elements, written
@@ -19,11 +19,12 @@ _EDGES = {"rising": "R_TRIG", "falling": "F_TRIG"}
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The statements of a drawn body, and the blocks for the edges that it detects; or a chart."""
+    """The statements of a drawn body with its drawing, and the blocks for the edges that it detects; or a chart."""
 
     body: tuple[t.Statement, ...]
     edges: tuple[t.VarDecl, ...]
     chart: t.Chart | None = None
+    graphic: t.Graphic | None = None
 
 
 def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suffix: str = "") -> Drawn:
@@ -33,7 +34,7 @@ def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suf
     Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
     """
     refuse_elements(body, ("jump", "error", "actionBlock"), of, path)
-    return Drawing(nodes_of(body, of, path), standard, suffix).drawn()
+    return replace(Drawing(nodes_of(body, of, path), standard, suffix).drawn(), graphic=t.Graphic(body))
 
 
 class Drawing:

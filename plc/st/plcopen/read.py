@@ -43,8 +43,9 @@ def _with_drawings(pou: t.Pou, drawings: Mapping[tuple[str, str], Drawn]) -> t.P
     edges = tuple(edge for one in found if one is not None for edge in one.edges)
     block = (t.VarBlock(pou.pos, "VAR", frozenset(), edges),) if edges else ()
     actions = tuple(
-        replace(action, body=one.body, chart=one.chart) if one is not None else action
+        replace(action, body=one.body, chart=one.chart, graphic=one.graphic) if one is not None else action
         for action, one in zip(pou.actions, found[1:], strict=True)
     )
     body, chart = (found[0].body, found[0].chart) if found[0] is not None else (pou.body, pou.chart)
-    return replace(pou, blocks=(*pou.blocks, *block), body=body, actions=actions, chart=chart)
+    graphic = found[0].graphic if found[0] is not None else None
+    return replace(pou, blocks=(*pou.blocks, *block), body=body, actions=actions, chart=chart, graphic=graphic)

@@ -3,7 +3,8 @@ resolved here."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from fieldtwin.plc.st.dialects import StWarning
 
@@ -165,6 +166,16 @@ class VarBlock:
     only_qualified: bool = False
 
 
+class Graphic:
+    """A body in LD or FBD as its file has it, for drawings. It is not a node, so walks and changes of the tree skip it."""
+
+    __slots__ = ("body",)
+
+    def __init__(self, body: Any) -> None:
+        self.body = body
+        """The element ``<LD>`` or ``<FBD>`` of the PLCopen XML file."""
+
+
 @dataclass(frozen=True, slots=True)
 class Action:
     """An action of a PROGRAM or FUNCTION_BLOCK: statements, or a chart, with a name that use the variables of the POU."""
@@ -173,6 +184,7 @@ class Action:
     name: str
     body: tuple[Statement, ...]
     chart: Chart | None = None
+    graphic: Graphic | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +258,7 @@ class Pou:
     implements: tuple[NamedType, ...] = ()
     modifiers: frozenset[str] = frozenset()
     within: Within = Within()
+    graphic: Graphic | None = field(default=None, compare=False)
 
 
 METHODS = ("METHOD", "GET", "SET")

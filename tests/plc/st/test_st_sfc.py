@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from random_charts import random_charts, text_of_chart
 from st_bench import program, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -128,38 +129,12 @@ def test_branches_activate_the_steps_of_a_reference_interpreter(scans: list[list
         assert {step for step in steps if internal(made, f"net.{step}.X")} == active
 
 
-def charts() -> st.SearchStrategy[tuple[list[str], list[tuple[list[str], list[str]]]]]:
-    """Return random safe charts: a step is replaced by a sequence, an alternative or a simultaneous branch, several times."""
-
-    def built(choices: list[tuple[int, int]]) -> tuple[list[str], list[tuple[list[str], list[str]]]]:
-        steps, moves = ["s0", "s1"], [(["s0"], ["s1"]), (["s1"], ["s0"])]
-        for kind, place in choices:
-            sources, targets = moves.pop(place % len(moves))
-            a, b, n = f"s{len(steps)}", f"s{len(steps) + 1}", kind % 3
-            if n == 0:  # a sequence
-                steps.append(a)
-                moves += [(sources, [a]), ([a], targets)]
-            elif n == 1:  # an alternative branch
-                steps += [a, b]
-                moves += [(sources, [a]), ([a], targets), (sources, [b]), ([b], targets)]
-            else:  # a simultaneous branch
-                steps += [a, b]
-                moves += [(sources, [a, b]), ([a, b], targets)]
-        return steps, moves
-
-    return st.lists(st.tuples(st.integers(0, 2), st.integers(0, 50)), max_size=6).map(built)
-
-
-@given(charts(), st.lists(st.integers(0, 2**20 - 1), max_size=20))
+@given(random_charts(), st.lists(st.integers(0, 2**20 - 1), max_size=20))
 def test_random_safe_charts_activate_the_steps_of_a_reference_interpreter(
     built: tuple[list[str], list[tuple[list[str], list[str]]]], scans: list[int]
 ) -> None:
     steps, moves = built
-    text = "PROGRAM p VAR_INPUT c : DWORD; END_VAR\n"
-    text += "".join(f"{'INITIAL_STEP' if step == 's0' else 'STEP'} {step}: END_STEP\n" for step in steps)
-    for n, (sources, targets) in enumerate(moves):
-        text += f"TRANSITION FROM ({', '.join(sources)}) TO ({', '.join(targets)}) := c.{n}; END_TRANSITION\n"
-    made = program(text + "END_PROGRAM")
+    made = program(text_of_chart(steps, moves))
     scan(made, 1)
     active = {"s0"}
     for number, bits in enumerate(scans, 2):

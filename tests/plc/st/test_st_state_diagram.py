@@ -172,7 +172,7 @@ def test_a_computed_state_is_reported_with_its_place(tmp_path: Path) -> None:
     [
         (TANK, ["--program", "Pump"], "Main"),
         (TANK.replace("level : REAL", "level : INTEGER"), [], "INTEGER"),
-        ("PROGRAM Main\nEND_PROGRAM", [], "no program has a state machine"),
+        ("PROGRAM Main\nEND_PROGRAM", [], "no program has a chart, a body in LD or FBD, or a state machine"),
         (TANK + TANK.replace("Main", "Second").partition("END_TYPE")[2], [], "--program NAME"),
     ],
 )

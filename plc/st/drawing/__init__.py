@@ -1,0 +1,1 @@
+"""Drawings of charts, ladder diagrams and function block diagrams as SVG."""

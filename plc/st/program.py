@@ -61,7 +61,7 @@ class StProgram(Program):
     def __init__(self, together: Together | None = None) -> None:
         """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
         self.st_resource = Resource.of(self.st_unit, together)
-        self.st_body: Any = self.st_resource.space[f"P_{identifier(self.st_declared.name)}"]()
+        self.st_body: Any = self.st_resource.created(f"P_{identifier(self.st_declared.name)}")
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""

@@ -7,16 +7,20 @@ that they see the same VAR_GLOBAL. A deep copy has separate global variables and
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.initial.values import FB_INIT
 from fieldtwin.plc.st.compiler.pous.inlining import NAMES
+from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
 MAX_STEPS = 1_000_000
@@ -72,12 +76,38 @@ class Resource:
     def __init__(self, unit: CompiledUnit, context: Context | None = None) -> None:
         self.context = context or Context()
         self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS, **NAMES}
-        for part in unit.code:
-            exec(part, self.space)
+        self._files = unit.files
+        with self._initialising():
+            for part in unit.code:
+                exec(part, self.space)
         self.globals: Any = self.space["_G"]
         self.absolute = ".scan_ns" in unit.python
         """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""
         self._has_references = "_v.pointed(" in unit.python
+
+    def created(self, name: str) -> Any:
+        """Return a new object of the class `name` of the compiled code, with its initial values.
+
+        Raises `FileInvalid` for an initial value that cannot be computed.
+        """
+        self.space["_G"] = self.globals
+        self.context.left = MAX_STEPS
+        with self._initialising():
+            return self.space[name]()
+
+    @contextmanager
+    def _initialising(self) -> Iterator[None]:
+        """Raise errors of initial values, and of FB_init, as `FileInvalid` with their line."""
+        try:
+            yield
+        except (LogicError, ScanTooLong, AttributeError, RecursionError) as e:
+            path, line = line_of_error(e, self._files) or (self._files[0] if self._files else "", 1)
+            message = "a variable is used before it has its initial value"
+            if isinstance(e, LogicError | ScanTooLong):
+                message = f"an initial value, or {FB_INIT}: {e.message}"
+            elif isinstance(e, RecursionError):
+                message = f"{FB_INIT} is nested too deep"
+            raise FileInvalid(message, path=path, line=line) from e
 
     @classmethod
     def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:
@@ -107,10 +137,22 @@ class Resource:
     def __deepcopy__(self, memo: dict[int, Any]) -> Resource:
         new = Resource.__new__(Resource)
         memo[id(self)] = new
+        new._files = self._files
         new.context, new.space, new.absolute = self.context, self.space, self.absolute
         new._has_references = self._has_references
         new.globals = copy.deepcopy(self.globals, memo)
         return new
+
+
+def line_of_error(error: BaseException, files: Sequence[str]) -> tuple[str, int] | None:
+    """Return the innermost line of the source in which an error occurred; None without one."""
+    found, frames = None, error.__traceback__
+    while frames is not None:
+        path = frames.tb_frame.f_code.co_filename
+        if path in files:
+            found = path, frames.tb_lineno
+        frames = frames.tb_next
+    return found
 
 
 def _numbered(roots: tuple[Any, ...]) -> dict[int, int]:

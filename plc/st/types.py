@@ -185,6 +185,8 @@ class Block:
     is_class: bool = False
     """Whether it is a class, which has no body and cannot be called."""
     abstract: bool = False
+    created: bool = False
+    """Whether it has a method FB_init, which is called when an instance is created."""
 
     def __str__(self) -> str:
         return self.name

@@ -31,9 +31,11 @@ from fieldtwin.plc.st.runtime.moments import (
 )
 from fieldtwin.plc.st.runtime.references import (
     Cell,
+    Characters,
     Cut,
     Element,
     Instance,
+    Letters,
     MemberReference,
     Whole,
     attempted,
@@ -43,6 +45,7 @@ from fieldtwin.plc.st.runtime.references import (
     instance,
     moved,
     pointed,
+    queried,
     same,
     view,
     whole,
@@ -50,9 +53,11 @@ from fieldtwin.plc.st.runtime.references import (
 
 __all__ = [  # and all names that compiled code calls
     "Cell",
+    "Characters",
     "Cut",
     "Element",
     "Instance",
+    "Letters",
     "LogicError",
     "MemberReference",
     "OpenArray",
@@ -70,6 +75,7 @@ __all__ = [  # and all names that compiled code calls
     "moment_text",
     "moved",
     "pointed",
+    "queried",
     "same",
     "split_date",
     "split_dt",
@@ -83,6 +89,8 @@ __all__ = [  # and all names that compiled code calls
 SINGLE = struct.Struct("f")
 """A 32-bit float in the computer's own form, whose rounding gives infinity beyond the range."""
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
+_LEADING_NUMBER = re.compile(r"\s*((2|8|16)#[0-9a-f][0-9a-f_]{0,79}|[+-]?[0-9][0-9_]{0,39})", re.ASCII | re.IGNORECASE)
+_LEADING_REAL = re.compile(r"\s*[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
 _BASED = re.compile(r"(2|8|16)#([0-9a-f][0-9a-f_]{0,79})", re.ASCII | re.IGNORECASE)
 _REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
 MAX_SHOWN = 60
@@ -212,6 +220,13 @@ def fill(target: list[Any], source: list[Any]) -> None:
 def with_members(made: Any, **members: Any) -> Any:
     for name, value in members.items():
         setattr(made, name, value)
+    return made
+
+
+def with_properties(made: Any, **setters: Any) -> Any:
+    """Return a new instance after a call of each of its methods `setters` with a value."""
+    for name, value in setters.items():
+        getattr(made, name)(value)
     return made
 
 
@@ -390,6 +405,21 @@ def number_of(text: str, low: int, high: int) -> int:
     if low <= value <= high:
         return value
     raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(value))
+
+
+def leading_number(text: str, low: int, high: int) -> int:
+    """Return the number with which a string begins, as CODESYS converts it: 12 for ``12abc``, 3 for ``3.14``, 0 without a number.
+
+    Raises `LogicError` for a number that does not fit.
+    """
+    found = _LEADING_NUMBER.match(text)
+    return number_of(found[0], low, high) if found is not None else 0
+
+
+def leading_real(text: str) -> float:
+    """Return the number with which a string begins, 0 without a number."""
+    found = _LEADING_REAL.match(text)
+    return float(found[0]) if found is not None else 0.0
 
 
 def real_of(text: str) -> float:

@@ -23,7 +23,7 @@ def test_each_file_of_the_list_has_all_fields_and_is_listed_once() -> None:
     files = yaml.safe_load(LIST.read_text(encoding="utf-8"))["files"]
     assert len(files) > 100
     for entry in files:
-        assert {*entry} - {"libraries"} == NEEDED, entry
+        assert {*entry} - {"libraries", "tests", "differ"} == NEEDED, entry
         assert entry["repository"].count("/") == 1
         assert not entry["path"].startswith("/")
         assert entry["dialect"] in DIALECTS
@@ -53,6 +53,14 @@ def test_the_script_counts_valid_files_and_prints_each_difference(tmp_path: Path
         "a/b: 1 of 1 valid files compile, 1 missing",
         "total: 1 of 1 valid files compile, 0 differences",
     ]
+    (folder / "good_tests.st").write_text(
+        "TEST 'first' VAR m : Main; END_VAR m(); ASSERT_EQ(m.n, 1); END_TEST\n"
+        "TEST 'second' VAR m : Main; END_VAR m(); ASSERT_EQ(m.n, 2); END_TEST\n"
+    )
+    tested = run(tmp_path, f"{good}, tests: good_tests.st, differ: [second]")
+    assert tested.returncode == 0, tested.stdout + tested.stderr
+    assert "results: 1 of 2 tests of the repositories pass" in tested.stdout
+    assert "a/b/good_tests.st: expected []; got ['second']" in run(tmp_path, f"{good}, tests: good_tests.st").stdout
     different = run(tmp_path, good, 'path: wrong.st, valid: "yes", expected: compiles')
     assert different.returncode == 1
     assert "total: 1 of 2 valid files compile, 1 differences" in different.stdout

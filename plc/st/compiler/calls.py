@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
@@ -64,12 +63,18 @@ class Calls(Expressions):
             self.env.unknown(call.pos, "a function", call.ref.name, known)
         raise self._wrong_call(call)
 
+    def result_of(self, call: t.Call) -> ty.Type | None:
+        """Return the type of the result of a user's function or method without compiling it; None for other calls."""
+        method = method_of(self, call.ref, "METHOD")
+        signature = method.signature if method is not None else self.env.functions.get(call.ref.name.lower())
+        return signature.returns if signature is not None else None
+
     def _wrong_call(self, call: t.Call) -> FileInvalid:
         """Return the error of a call in an expression that calls neither a function nor a method."""
         ref = call.ref
         last = ref.selectors[-1] if ref.selectors else None
         if isinstance(last, t.Member):
-            of = class_of(self, self.type_of(replace(ref, selectors=ref.selectors[:-1])))
+            of = class_of(self, self.type_of(ref.without_last()))
             if of is not None and last.name.lower() not in of.actions:
                 known = [one.signature.name for one in of.methods.values() if one.kind == "METHOD"]
                 self.env.unknown(last.pos, f"in {of.name}, a method", last.name, known)
@@ -181,7 +186,7 @@ class Calls(Expressions):
         if self._assign_property(ref, value, pos):
             return
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
-            whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
+            whole = self.writable(ref.without_last())
             part = ref.selectors[-1]
             bit(self, whole, part)
             given = self.coerced(value, part_of(part), pos)
@@ -234,9 +239,17 @@ class Calls(Expressions):
     def attempt(self, s: t.Attempt) -> None:
         """Write ``?=`` (IEC 61131-3:2013, table 52): NULL if the reference does not refer to a block of the target's type."""
         target, value = self.writable(s.target), self.value(s.value)
+        if isinstance(target.type, ty.Interface):
+            self.out.line(f"{target.code} = {references.queried(self, value, target.type, s.pos)}", s.pos)
+            return
         kinds = [v.type for v in (target, value)]
         if not all(isinstance(kind, ty.Pointer) and kind.word == references.REF_TO for kind in kinds):
-            self.env.fail(s.pos, "operands of ?=", expected="two references (REF_TO)", got=f"{kinds[0]} and {kinds[1]}")
+            self.env.fail(
+                s.pos,
+                "operands of ?=",
+                expected="two references (REF_TO) or interfaces",
+                got=f"{kinds[0]} and {kinds[1]}",
+            )
         to, of = (self.env.target(kind, s.pos) for kind in kinds if isinstance(kind, ty.Pointer))
         code = value.code
         if to != of:

@@ -11,8 +11,10 @@ from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value, identifier
+from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED, InitialValues
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, identifier
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.walk import nodes
 
 MAX_REPEATED = 100
 """The limit, in characters, up to which generated Python code repeats an initial value. A longer one becomes a function."""
@@ -41,9 +43,9 @@ class Declarations:
             with env.declaring(declared.name, env.faulty):
                 if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
                     env.fail(declared.pos, f"type {declared.name} is declared twice")
-                if isinstance(declared, t.EnumDecl):
-                    self._declare_enum(declared)
                 self._types[declared.name.lower()] = declared
+                if isinstance(declared, t.EnumDecl) and not _computed(declared):
+                    self.env.types[declared.name.lower()] = self._registered(declared)
 
     def resolve(self) -> None:
         """Resolve all types, after the global constants are known, because limits may use them."""
@@ -91,7 +93,7 @@ class Declarations:
         if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
             return None
         kind = self.type_of(v.type)
-        compiler = self._expressions()
+        compiler = self.constants()
         value = compiler.settled(compiler.value(v.initial, kind), v.initial.pos)
         text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
         if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
@@ -100,15 +102,16 @@ class Declarations:
 
     def constant_of(self, expr: t.Expr, kind: ty.Type, what: str) -> Any:
         """Return the value of a constant expression of type `kind`; `what` names it in errors. Raises `FileInvalid`."""
-        compiler = self._expressions()
+        compiler = self.constants()
         value = compiler.settled(compiler.value(expr, kind), expr.pos)
         compiler.coerced(value, kind, expr.pos, what)
         if value.constant is None:
             self.env.fail(expr.pos, what, expected="a constant")
         return value.constant
 
-    def _expressions(self) -> Calls:
-        compiler = Calls(self.env, self.scope, CodeWriter())
+    def constants(self, symbols: dict[str, Symbol] | None = None) -> Calls:
+        """Return a compiler of constant expressions. `symbols` are the constants that it knows; None for those of the POU."""
+        compiler = Calls(self.env, self.scope if symbols is None else symbols, CodeWriter())
         compiler.only_constants = True
         return compiler
 
@@ -257,22 +260,26 @@ class Declarations:
                 if isinstance(field.type, t.EnumType) and isinstance(kind, ty.Enum):
                     self.register(kind)
                 fields[field.name.lower()] = (field.name, kind)
+            if not fields and not self.env.dialect.vendor:
+                hint = "the dialects codesys and twincat accept it"
+                self.env.fail(declared.pos, f"{declared.name} is a STRUCT without members", hint=hint)
             total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
             refers = any(ty.holds_interface(kind) for _, kind in fields.values())
             struct = ty.Struct(declared.name, fields, total, nested + 1, refers)
             self._write_struct(struct, declared)
             return struct
-        assert isinstance(declared, t.AliasDecl)
+        if isinstance(declared, t.EnumDecl):
+            return self._registered(declared)
         kind = self.type_of(declared.type)
         if declared.initial is not None:
             code = self.initial(kind, declared.initial)
             self.env.type_initials[declared.name.lower()] = self.shared(code)
         return kind
 
-    def _declare_enum(self, declared: t.EnumDecl) -> None:
+    def _registered(self, declared: t.EnumDecl) -> ty.Enum:
         enum = self._enum(declared)
-        self.env.types[declared.name.lower()] = enum
         self.register(enum)
+        return enum
 
     def register(self, enum: ty.Enum) -> None:
         """Make the values of an enumeration known in the whole unit."""
@@ -285,7 +292,8 @@ class Declarations:
         values: dict[str, int] = {}
         number = 0
         for name, stated in declared.values:
-            number = number if stated is None else stated
+            if stated is not None:
+                number = stated if isinstance(stated, int) else self._computed_value(stated, values)
             if name.lower() in {v.lower() for v in values}:
                 self.env.fail(declared.pos, f"{declared.name} has the value {name} twice")
             values[name] = number
@@ -300,6 +308,24 @@ class Declarations:
                 self.env.unknown(declared.pos, f"in {declared.name}, a value", declared.initial.name, list(values))
             enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()], base)
         return enum
+
+    def _computed_value(self, expr: t.Expr, before: dict[str, int]) -> int:
+        """Return the value of an enumerated value's expression. `before` are the values that are declared before it."""
+        for ref in (node for node in nodes(expr) if isinstance(node, t.Ref)):
+            if isinstance(self._types.get(ref.name.lower()), t.EnumDecl):
+                self.named(ref.name, ref.pos)
+        known = {
+            name.lower(): Symbol(name, ty.LINT, repr(number), writable=False, constant=number)
+            for name, number in before.items()
+        }
+        compiler = self.constants({**self.scope, **known})
+        value = compiler.settled(compiler.value(expr), expr.pos)
+        whole = ty.is_kind(value.type, "int", "bits") or isinstance(value.type, ty.Enum)
+        if value.constant is None or not whole:
+            self.env.fail(
+                expr.pos, "the number of an enumerated value", expected="a constant whole number", got=str(value.type)
+            )
+        return int(value.constant)
 
     def _check_base(self, declared: t.EnumDecl, values: dict[str, int]) -> None:
         """Check that each value of an enumeration fits the type that is stated for them, an elementary type."""
@@ -350,12 +376,13 @@ class Declarations:
         if isinstance(base, ty.Block):
             bases, interfaces = base.bases | {base.name.lower()}, interfaces | base.interfaces
             actions |= base.actions
+        created = self.env.dialect.vendor and _fb_init(pou) is not None
         return ty.Block(
             pou.name, inputs,
             outputs,
             in_outs, elements=total, nested=nested + 1, actions=actions, publics=publics,
             bases=bases, interfaces=interfaces, refers=any(map(ty.holds_interface, held)), is_class=pou.kind == "CLASS",
-            abstract="ABSTRACT" in pou.modifiers,
+            abstract="ABSTRACT" in pou.modifiers, created=created or (isinstance(base, ty.Block) and base.created),
         )  # fmt: skip
 
     def _interface(self, pou: t.Pou) -> ty.Interface:
@@ -371,64 +398,33 @@ class Declarations:
         return frozenset(found)
 
     def _constant(self, expr: t.Expr, what: str) -> int:
-        return self._expressions().constant_integer(expr, what)
+        return self.constants().constant_integer(expr, what)
 
     # -- initial values -------------------------------------------------------------------------------------------------
 
     def initial(self, kind: ty.Type, init: t.Init | None, spec: t.TypeSpec | None = None) -> str:
-        """Return the Python expression of a new variable's value."""
-        of = _element(kind)
-        if isinstance(of, ty.Block) and of.abstract and (place := init or spec) is not None:
-            hint = "declare a POU that extends it, or pass an instance as VAR_IN_OUT"
-            self.env.fail(place.pos, f"{of} is ABSTRACT and has no instances", hint=hint)
-        if init is None:
-            named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
-            return self.env.type_initials.get(named) or default_value(kind)
-        if isinstance(init, t.InitArray):
-            return self._initial_array(kind, init)
-        if isinstance(init, t.InitStruct):
-            return self._initial_struct(kind, init)
-        compiler = self._expressions()
-        code = compiler.coerced(compiler.value(init, kind), kind, init.pos, "an initial value")
-        if compiler.out.lines:
-            self.env.fail(init.pos, "too deep an expression for an initial value")
-        return code
+        """Return the Python expression of a new variable's value, computed from constants only."""
+        return InitialValues(self).of(kind, init, spec)
 
-    def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
-        if not isinstance(kind, ty.Array):
-            self.env.fail(init.pos, "an array value for a type that is not an array", got=str(kind))
-        items, count = [], 0
-        total = ty.elements(ty.Array(kind.ranges, ty.INT))
-        for often, item in init.items:
-            if often < 0 or count + often > total:
-                self.env.fail(init.pos, "more values than elements", expected=f"at most {total}")
-            count += often
-            code = self.initial(kind.of, item)
-            items.append(code if often == 1 else f"*({code} for _ in range({often}))")
-        if count < total:
-            items.append(f"*({default_value(kind.of)} for _ in range({total - count}))")
-        sizes = tuple(high - low + 1 for low, high in kind.ranges[1:])
-        return f"_v.shaped([{', '.join(items)}], {sizes})" if sizes else f"[{', '.join(items)}]"
+    def creation(self, block: ty.Block) -> list[t.VarDecl]:
+        """Return the parameters of FB_init of a block, in their order, for which a declaration has arguments."""
+        pou = self._blocks.get(block.name.lower())
+        while pou is not None:
+            own = _fb_init(pou)
+            if own is not None:
+                given = [v for b in own.blocks if b.kind == "VAR_INPUT" for v in b.variables]
+                return given[len(FIXED) :]
+            pou = self._blocks.get(pou.extends[0].name.lower()) if pou.extends else None
+        return []
 
-    def _initial_struct(self, kind: ty.Type, init: t.InitStruct) -> str:
-        members = kind.fields if isinstance(kind, ty.Struct) else kind.inputs if isinstance(kind, ty.Block) else None
-        if members is None:
-            self.env.fail(init.pos, "a structure value for a type that is not a structure", got=str(kind))
-        given = []
-        for name, item in init.members:
-            if name.lower() not in members:
-                self.env.unknown(init.pos, f"in {kind}, a member", name, [n for n, _ in members.values()])
-            member, of = members[name.lower()]
-            attribute = f"m_{name.lower()}" if isinstance(kind, ty.Struct) else f"v_{name.lower()}"
-            if isinstance(kind, ty.Block) and kind.standard:
-                attribute = member
-            given.append(f"{attribute}={self.initial(of, item)}")
-        return f"_v.with_members({', '.join([default_value(kind), *given])})"
+    def needed(self, block: ty.Block) -> list[str]:
+        """Return the names of the parameters of FB_init that have no initial value."""
+        return [v.name for v in self.creation(block) if v.initial is None] if block.created else []
 
     def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
         out, names = self.out, [f"m_{name}" for name in struct.fields]
         with out.block(f"class S_{identifier(struct.name)}:", declared.pos):
-            out.line(f"__slots__ = ({', '.join(map(repr, names))},)")
+            out.line(f"__slots__ = {tuple(names)}")
             with out.block("def __init__(self):"):
                 for field in declared.fields:
                     kind = struct.fields[field.name.lower()][1]
@@ -447,8 +443,12 @@ class Declarations:
                 out.line("return new")
 
 
-def _element(kind: ty.Type) -> ty.Type:
-    """Return the type of the elements of an array, and of arrays in it; any other type itself."""
-    while isinstance(kind, ty.Array):
-        kind = kind.of
-    return kind
+def _computed(declared: t.EnumDecl) -> bool:
+    """Return whether an expression, which may use other declarations, states the number of a value."""
+    return not all(stated is None or isinstance(stated, int) for _, stated in declared.values)
+
+
+def _fb_init(pou: t.Pou) -> t.Pou | None:
+    """Return the method FB_init that a POU declares; None if it has none."""
+    found = (method for method in pou.methods if method.kind == "METHOD" and method.name.lower() == FB_INIT.lower())
+    return next(found, None)

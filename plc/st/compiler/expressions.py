@@ -20,7 +20,7 @@ from fieldtwin.plc.st.compiler.scope import (
     Symbol,
     Value,
 )
-from fieldtwin.plc.st.compiler.variables import lookup, part_of, variable
+from fieldtwin.plc.st.compiler.variables import character_type, lookup, part_of, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 80
@@ -153,8 +153,11 @@ class Expressions:
     def type_of(self, ref: t.Ref) -> ty.Type | None:
         """Return the type of a variable or of its part without compiling it, or None if it has no such part."""
         symbol, selectors = lookup(self, ref)
-        if symbol is not None:
-            kind: ty.Type | None = symbol.type
+        kind: ty.Type | None
+        if ref.of is not None:
+            kind = self.result_of(ref.of)
+        elif symbol is not None:
+            kind = symbol.type
         else:
             kind, selectors = own_property_type(self, ref)
         for selector in selectors:
@@ -167,7 +170,9 @@ class Expressions:
                 if isinstance(kind, ty.Pointer):
                     kind = self.env.target(kind, selector.pos)
                 else:
-                    kind = kind.of if isinstance(kind, ty.Array | ty.OpenArray) else None
+                    vendor = self.env.dialect.vendor
+                    of_string = character_type(kind, vendor=vendor) if isinstance(kind, ty.String) else None
+                    kind = kind.of if isinstance(kind, ty.Array | ty.OpenArray) else of_string
             else:
                 name = selector.name.lower()
                 members = kind.fields if isinstance(kind, ty.Struct) else {}
@@ -246,6 +251,10 @@ class Expressions:
 
     def call(self, call: t.Call) -> Value:
         """Compile a call of a function."""
+        raise NotImplementedError
+
+    def result_of(self, call: t.Call) -> ty.Type | None:
+        """Return the type of the result of a call without compiling it; None if it is not known."""
         raise NotImplementedError
 
     def take(self, argument: t.Argument, value: Value) -> None:

@@ -174,7 +174,8 @@ def default_value(kind: ty.Type) -> str:
     if isinstance(kind, ty.Struct):
         return f"S_{identifier(kind.name)}()"
     if isinstance(kind, ty.Block):
-        return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{identifier(kind.name)}()"
+        code = f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{identifier(kind.name)}()"
+        return f"{code}.created()" if kind.created else code
     if isinstance(kind, ty.Array):
         code = default_value(kind.of)
         for low, high in reversed(kind.ranges):
@@ -303,6 +304,8 @@ class Compiling(Protocol):
     def flat(self, value: Value, pos: Pos) -> Value: ...
 
     def earlier(self, value: Value, mark: int, pos: Pos) -> Value: ...
+
+    def typed(self, value: Value, pos: Pos) -> Value: ...
 
     def known(self, expr: Expr, result: float) -> Value: ...
 

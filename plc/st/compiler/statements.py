@@ -58,9 +58,12 @@ class Statements(Calls):
 
     def _assign(self, s: t.Assign) -> None:
         if s.word and not self.env.dialect.vendor:
-            self.env.fail(
-                s.pos, f"{s.word} is not in this dialect", expected=f"IF condition THEN {s.target.name} := ..."
+            expected = (
+                "one statement for each assignment"
+                if s.word == t.CHAINED
+                else f"IF condition THEN {s.target.name} := ..."
             )
+            self.env.fail(s.pos, f"{s.word} is not in this dialect", expected=expected)
         self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
     def _refer(self, s: t.Refer) -> None:
@@ -177,7 +180,7 @@ class Statements(Calls):
         """Return the reference to a function block, and the name of its action that `ref` selects; "" for the block itself."""
         last = ref.selectors[-1] if ref.selectors else None
         if isinstance(last, t.Member):
-            instance = t.Ref(ref.pos, ref.name, ref.selectors[:-1])
+            instance = ref.without_last()
             kind, name = self.type_of(instance), last.name.lower()
             if isinstance(kind, ty.Block) and self._is_action(kind.name.lower(), kind.actions, name):
                 return instance, name

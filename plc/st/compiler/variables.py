@@ -7,6 +7,7 @@ from fieldtwin.plc.st.compiler.classes.members import is_own, own_property, own_
 from fieldtwin.plc.st.compiler.implicit import as_number
 from fieldtwin.plc.st.compiler.scope import Compiling, Symbol, Value
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.written import reference
 
 _BITS = ("BYTE", "WORD", "DWORD", "LWORD")
 
@@ -32,8 +33,11 @@ def variable(x: Compiling, ref: t.Ref) -> Value:
 
 def place(x: Compiling, ref: t.Ref) -> Value:
     """Compile a name as `variable` does, except that a REFERENCE TO stands for itself."""
-    found = None if ref.name.lower() in x.symbols else own_property(x, ref)
-    value, selectors = found if found is not None else _variable(x, ref)
+    if ref.of is not None:
+        value, selectors = _result(x, ref.of), ref.selectors
+    else:
+        found = None if ref.name.lower() in x.symbols else own_property(x, ref)
+        value, selectors = found if found is not None else _variable(x, ref)
     for selector in selectors:
         value = _followed(x, value, selector.pos)
         if isinstance(selector, t.Deref):
@@ -45,6 +49,21 @@ def place(x: Compiling, ref: t.Ref) -> Value:
         else:
             value = bit(x, value, selector)
     return value
+
+
+def _result(x: Compiling, call: t.Call) -> Value:
+    """Return the result of a call of which a part is used. It is stored first, because the part may use it several times."""
+    value = x.typed(x.value(call), call.pos)
+    if not x.env.dialect.vendor:
+        hint = "assign the result to a variable first; the dialects codesys and twincat accept it"
+        x.env.fail(call.pos, f"a part of the result of {reference(call.ref)}", hint=hint)
+    if isinstance(value.type, ty.Nothing):
+        x.env.fail(call.pos, f"{reference(call.ref)} has no result")
+    if x.only_constants:
+        return value
+    stored = x.out.temporary()
+    x.out.line(f"{stored} = {value.code}", call.pos)
+    return Value(stored, value.type)
 
 
 def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
@@ -149,6 +168,8 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
         return _moved(x, value, kind, selector)
     if isinstance(kind, ty.OpenArray):
         return _open_index(x, value, kind, selector)
+    if isinstance(kind, ty.String):
+        return _character(x, value, kind, selector)
     if not isinstance(kind, ty.Array):
         x.env.fail(selector.pos, "an index into a value that is not an array", got=str(kind))
     if len(selector.indices) != len(kind.ranges):
@@ -166,6 +187,32 @@ def _index(x: Compiling, value: Value, selector: t.Index) -> Value:
             at = f"_v.index({index.code}, {low}, {high})"
         owner, code = code, f"{code}[{at}]"
     return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})", value.is_input)
+
+
+def _character(x: Compiling, value: Value, kind: ty.String, selector: t.Index) -> Value:
+    """Compile a character of a string: a CHAR by its index from 1 (IEC 61131-3:2013, 6.4.2), in the dialects of CODESYS a BYTE
+    by its index from 0; of a WSTRING a WCHAR or a WORD.
+    """
+    if len(selector.indices) != 1:
+        x.env.fail(selector.pos, "indices", expected=f"1 for {kind}", got=str(len(selector.indices)))
+    (expr,) = selector.indices
+    index = _whole_number(x, expr)
+    low = 0 if x.env.dialect.vendor else 1
+    if isinstance(index.constant, int) and not low <= index.constant <= kind.length:
+        x.env.fail(expr.pos, "an index outside its string", expected=f"{low} to {kind.length}", got=index.code)
+    held = value.reference or f"_v.Cell({value.code})"
+    owner = f"_v.Characters({held}, {kind.length})" if x.env.dialect.vendor else f"_v.Letters({held})"
+    at = f"_v.index({index.code}, {low}, {kind.length})"
+    of = character_type(kind, vendor=x.env.dialect.vendor)
+    writable = value.writable and bool(value.reference)
+    reference = f"_v.Element({owner}, {at})" if value.reference else ""
+    return Value(f"{owner}[{at}]", of, None, True, writable, reference, value.is_input)
+
+
+def character_type(kind: ty.String, *, vendor: bool) -> ty.Type:
+    """Return the type of a character of a string."""
+    narrow, wide = ("BYTE", "WORD") if vendor else ("CHAR", "WCHAR")
+    return ty.ELEMENTARY[wide if kind.wide else narrow]
 
 
 def _open_index(x: Compiling, value: Value, kind: ty.OpenArray, selector: t.Index) -> Value:

@@ -79,7 +79,7 @@ class Element:
         self.owner, self.at = owner, at
 
     def key(self) -> Key:
-        owner = self.owner.key() if isinstance(self.owner, Single | Characters) else (id(self.owner),)
+        owner = self.owner.key() if isinstance(self.owner, Single | Characters | Letters) else (id(self.owner),)
         return *owner, self.at
 
     @property
@@ -194,6 +194,38 @@ class Characters:
             self._of.v = text[:at] + chr(value) + text[at + 1 :]
 
 
+class Letters:
+    """A string as an array of its characters (IEC 61131-3:2013, 6.4.2). Raises `LogicError` for one after its end."""
+
+    __slots__ = ("_of",)
+
+    def __init__(self, of: Reference) -> None:
+        self._of = of
+
+    def key(self) -> Key:
+        return self._of.key()
+
+    def __len__(self) -> int:
+        return len(self._of.v)
+
+    def __getitem__(self, at: int) -> str:
+        text: str = self._of.v
+        return text[self._inside(at, text)]
+
+    def __setitem__(self, at: int, value: str) -> None:
+        text: str = self._of.v
+        self._inside(at, text)
+        self._of.v = text[:at] + value + text[at + 1 :]
+
+    @staticmethod
+    def _inside(at: int, text: str) -> int:
+        if at < len(text):
+            return at
+        raise LogicError(
+            "a character after the end of its string", expected=f"position 1 to {len(text)}", got=str(at + 1)
+        )
+
+
 REFERENCES = (Cell, MemberReference, Element, Cut)
 """The classes of references that variables may hold; `Whole` is a `Cell`."""
 
@@ -261,6 +293,11 @@ def whole(array: Any, size: int) -> Any:
             "a pointer to an array of another size is used as a whole", expected=f"{size} elements", got=str(len(array))
         )
     return array
+
+
+def queried(reference: Instance | None, interface: str) -> Instance | None:
+    """Return `reference` if its instance implements the interface with this name in lower case, otherwise NULL."""
+    return reference if reference is not None and interface in reference.of.kinds else None
 
 
 def attempted(reference: Reference | None, block: str) -> Reference | None:

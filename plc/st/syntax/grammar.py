@@ -20,11 +20,15 @@ _UNSUPPORTED = {
     word: construct
     for construct, words in {
         "labels and jumps": "JMP",
+        "exceptions (__TRY, __CATCH)": "__TRY __CATCH __FINALLY __ENDTRY",
+        "bodies in instruction list (IL)": "LD LDN ST STN CAL CALC CALCN JMPC JMPCN RETC RETCN ANDN ORN XORN",
     }.items()
     for word in words.split()
 }
 """The words of constructs that other compilers know, by which an error names the construct."""
 
+_LABEL = re.compile(r"(\A|;|\b(END_\w+|THEN|ELSE|DO|REPEAT))\s*[A-Za-z_]\w*\s*\Z", re.IGNORECASE)
+"""The text before the colon of a label."""
 _READABLE = {
     "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
     "DURATION": "a duration", "DATE": "a date", "TIME_OF_DAY": "a time of day", "DATE_AND_TIME": "a date",
@@ -80,6 +84,8 @@ def _unsupported(got: str, text: str, line: int, column: int) -> str:
     lines = text.split("\n")[:line]
     lines[-1] = lines[-1][: column - 1]
     before = re.search(r"([A-Za-z_]\w*)\s*\Z", "\n".join(lines[-2:]))
+    if got == ":" and _LABEL.search("\n".join(lines[-2:])):
+        return "labels and jumps"
     return _UNSUPPORTED.get(got.upper()) or (_UNSUPPORTED.get(before[1].upper(), "") if before else "")
 
 

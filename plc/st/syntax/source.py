@@ -1,7 +1,8 @@
 """The text of a Structured Text file before it is parsed: comments and pragmas become blanks, line for line, column for
 column.
 
-Comments may be nested (IEC 61131-3, 6.1.5). This module also refuses files and literals that are implausibly long.
+Comments may be nested (IEC 61131-3, 6.1.5). Parts whose condition is false become blanks too (`conditional`).
+This module also refuses files and literals that are implausibly long.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import re
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
+from fieldtwin.plc.st.syntax.conditional import Conditions, Wrong, is_directive
 
 MAX_CHARACTERS = 1_000_000
 """The longest file, in characters: some 30,000 lines."""
@@ -17,7 +19,6 @@ MAX_NAME = 255
 MAX_LITERAL = 4 * 65_535
 MAX_SHOWN = 60
 
-_CONDITIONAL = re.compile(r"\{\s*(IF|ELSIF|ELSE|END_IF|DEFINE|UNDEFINE)\b", re.IGNORECASE)
 _HARMLESS = re.compile(r"\{\s*(attribute|region|endregion|text|info|warning|error)\b", re.IGNORECASE)
 """Pragmas of CODESYS without effect on what a program computes; `qualified_only` is read by `project`."""
 _MARKS = re.compile(r"""\(\*|\*\)|/\*|\*/|//[^\n]*|'|"|\{""")
@@ -44,39 +45,54 @@ def blanked(text: str, path: str = "", dialect: Dialect = STANDARD, warnings: li
     text = text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
     out: list[str] = []
     at = 0
+    conditions = Conditions()
     while found := _MARKS.search(text, at):
         start, mark = found.start(), found.group()
+        if not conditions.active:
+            text = text[:at] + _NOT_A_LINE.sub(" ", text[at:start]) + text[start:]
         if mark in _ENDS:
-            end = _end_of_literal(text, found.end(), mark)
+            end = _end_of_literal(text, found.end(), mark, lines=dialect.vendor and conditions.active)
+            if end is None and not conditions.active:
+                end = found.end()
+            if end is None:
+                raise _error(
+                    text, start, "a string that does not end", path, shortened(text[start:].partition("\n")[0])
+                )
             if end - start > MAX_LITERAL:
                 raise _error(text, start, "a literal that is too long", path)
-            out.append(text[at:end])
+            literal = text[at:end]
+            out.append(literal if conditions.active else _NOT_A_LINE.sub(" ", literal))
         elif mark in ("*)", "*/"):
             end = found.end()  # the parser reports this error
             out.append(text[at:end])
         else:
             if mark == "{":
-                end = _end_of_pragma(text, start, path, dialect, warnings)
+                end = _end_of_pragma(text, start, path, dialect, warnings, conditions)
             else:
                 end = found.end() if mark.startswith("//") else _end_of_comment(text, found, path)
             out.append(text[at:start])
             out.append(_NOT_A_LINE.sub(" ", text[start:end]))
         at = end
+    if conditions.parts:
+        raise _error(text, conditions.parts[-1].at, "an {IF} that does not end", path, hint="write {END_IF}")
     out.append(text[at:])
     return "".join(out)
 
 
-def _end_of_literal(text: str, at: int, quote: str) -> int:
-    """Return the position after the closing quote, or the end of the line if there is none; the parser reports that
-    error."""
+def _end_of_literal(text: str, at: int, quote: str, *, lines: bool) -> int | None:
+    """Return the position after the closing quote; None if there is none in the text (`lines`) or in the line."""
     while found := _ENDS[quote].search(text, at):
-        if not found.group().startswith("$"):
-            return found.end() if found.group() == quote else found.start()
+        if found.group() == quote:
+            return found.end()
+        if found.group() == "\n" and not lines:
+            return None
         at = found.end()
-    return len(text)
+    return None
 
 
-def _end_of_pragma(text: str, start: int, path: str, dialect: Dialect, warnings: list[StWarning] | None) -> int:
+def _end_of_pragma(
+    text: str, start: int, path: str, dialect: Dialect, warnings: list[StWarning] | None, conditions: Conditions
+) -> int:
     """Return the position after a pragma, which is skipped. Raises `FileInvalid` for one that must not be skipped."""
     mark = "}}" if text.startswith("{{", start) else "}"
     at = text.find(mark, start)
@@ -84,8 +100,9 @@ def _end_of_pragma(text: str, start: int, path: str, dialect: Dialect, warnings:
         raise _error(text, start, "a pragma that does not end", path)
     end = at + len(mark)
     pragma = text[start:end]
-    if _CONDITIONAL.match(pragma):
-        raise _error(text, start, "conditional compilation is not supported", path, shortened(pragma))
+    if is_directive(pragma):
+        _follow(text, start, pragma, path, dialect, conditions)
+        return end
     if mark == "}}" and dialect.name != "matiec":
         raise _error(
             text, start, "program text in another language is not supported", path, shortened(pragma),
@@ -96,6 +113,19 @@ def _end_of_pragma(text: str, start: int, path: str, dialect: Dialect, warnings:
         shown = shortened(" ".join(pragma.split()))
         warnings.append(StWarning("ST007", f"this pragma is skipped: {shown}", path, line, column))
     return end
+
+
+def _follow(text: str, start: int, pragma: str, path: str, dialect: Dialect, conditions: Conditions) -> None:
+    """Follow a directive of conditional compilation. Raises `FileInvalid` for one that is wrong or not in the dialect."""
+    if not dialect.vendor:
+        hint = "the dialects codesys and twincat accept it"
+        raise _error(text, start, "conditional compilation is not in this dialect", path, shortened(pragma), hint)
+    try:
+        conditions.read(pragma, start)
+    except Wrong as e:
+        raise _error(
+            text, start, str(e), path, shortened(pragma), f"expected {e.expected}" if e.expected else ""
+        ) from e
 
 
 def _end_of_comment(text: str, opening: re.Match[str], path: str) -> int:

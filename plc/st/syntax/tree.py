@@ -3,7 +3,7 @@ resolved here."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fieldtwin.plc.st.dialects import StWarning
@@ -25,8 +25,11 @@ class Pos:
 
 @dataclass(frozen=True, slots=True)
 class NamedType:
+    """A type by its name. `arguments` are those of the method FB_init of the instances: one list for all, or one for each."""
+
     pos: Pos
     name: str
+    arguments: tuple[tuple[Argument, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +80,7 @@ class EnumType:
     """An enumeration without a name, in the declaration of a variable; as in `EnumDecl`."""
 
     pos: Pos
-    values: tuple[tuple[str, int | None], ...]
+    values: tuple[tuple[str, int | Expr | None], ...]
     base: NamedType | None = None
 
 
@@ -86,10 +89,14 @@ TypeSpec = EnumType | NamedType | SubrangeType | StringType | MessagesType | Arr
 
 @dataclass(frozen=True, slots=True)
 class InitArray:
-    """An initial array. `items`: the count and the value of each item (None: the type's own initial value)."""
+    """An initial array. `items`: the count and the value of each item (None: the type's own initial value).
+
+    Only the dialects of CODESYS have one that is not `bracketed`.
+    """
 
     pos: Pos
     items: tuple[tuple[int, Init | None], ...]
+    bracketed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,11 +135,13 @@ class StructDecl:
 
 @dataclass(frozen=True, slots=True)
 class EnumDecl:
-    """An enumeration. `values`: names with their stated number, if any. `base`: the type of the values, if it is stated."""
+    """An enumeration. `values`: names with their stated number, if any; also an expression in the dialects of CODESYS.
+    `base`: the type of the values, if it is stated.
+    """
 
     pos: Pos
     name: str
-    values: tuple[tuple[str, int | None], ...]
+    values: tuple[tuple[str, int | Expr | None], ...]
     initial: Init | None
     base: NamedType | None = None
     within: Within = Within()
@@ -385,11 +394,19 @@ Selector = Member | Bit | Index | Deref
 
 @dataclass(frozen=True, slots=True)
 class Ref:
-    """A reference to a variable or to a part of it. In the dialects of CODESYS, `name` may be ``THIS^`` or ``SUPER^``."""
+    """A reference to a variable or to a part of it. In the dialects of CODESYS, `name` may be ``THIS^`` or ``SUPER^``.
+
+    A part of the result of a call, such as ``f(x).member``, has the call in `of` and an empty `name`.
+    """
 
     pos: Pos
     name: str
     selectors: tuple[Selector, ...] = ()
+    of: Call | None = None
+
+    def without_last(self) -> Ref:
+        """Return the reference without its last selector."""
+        return replace(self, selectors=self.selectors[:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -433,13 +450,16 @@ class Unary:
 Expr = Literal | Ref | Call | Binary | Unary
 Init = Literal | Ref | Call | Binary | Unary | InitArray | InitStruct
 
+CHAINED = "a := b := value"
+"""The word of an assignment that passes on the value of the one before it."""
+
 # -- statements ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Assign:
     """``target := value``. `word` is ``S=`` or ``R=`` in the statement that CODESYS writes with it, whose condition is
-    around the assignment; else "".
+    around the assignment, and `CHAINED` for an assignment that passes on the value of the one before it; else "".
     """
 
     pos: Pos

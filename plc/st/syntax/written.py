@@ -46,7 +46,7 @@ def _within(text: str, own: int, level: int) -> str:
 
 def reference(ref: t.Ref) -> str:
     """Return a variable with its members, bits and indices."""
-    return ref.name + "".join(map(_selector, ref.selectors))
+    return (text_of(ref.of) if ref.of is not None else ref.name) + "".join(map(_selector, ref.selectors))
 
 
 def case_label(label: t.CaseLabel) -> str:

@@ -1,7 +1,7 @@
 """PROGRAMs as function blocks, so that a test can declare, call and read them like any other block.
 
 In a test a program has no process image. So its inputs are set by the test, and IS_GOOD(x) reads the additional input
-``x_IS_GOOD``, which is TRUE at first. Its local variables can be read, as outputs are.
+``x_IS_GOOD``, which is TRUE at first. Its local variables can be read, as outputs are, and so can those of function blocks.
 """
 
 from __future__ import annotations
@@ -23,10 +23,24 @@ def programs_as_blocks(unit: t.SourceUnit) -> t.SourceUnit:
     pous = (pou for pou in unit.pous if pou.name not in missing)
     return replace(
         unit,
-        pous=tuple(_block(pou) if pou.kind == "PROGRAM" else pou for pou in pous),
+        pous=tuple(_block(pou) if pou.kind == "PROGRAM" else _readable(pou) for pou in pous),
         instances=(),
         missing=(*unit.missing, *missing.values()),
     )
+
+
+def _readable(pou: t.Pou) -> t.Pou:
+    """Return a function block or class whose local variables a test can read, except those that state their access."""
+    if pou.kind not in ("FUNCTION_BLOCK", "CLASS"):
+        return pou
+    access = {"PUBLIC", "PROTECTED", "PRIVATE", "INTERNAL", "CONSTANT"}
+    blocks = (
+        replace(block, qualifiers=block.qualifiers | {"PUBLIC"})
+        if block.kind == "VAR" and not block.qualifiers & access
+        else block
+        for block in pou.blocks
+    )
+    return replace(pou, blocks=tuple(blocks))
 
 
 def _no_block(program: t.Pou) -> t.Missing | None:

@@ -17,7 +17,7 @@ from fieldtwin.plc.program import ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.inspection import literal
-from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource
+from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource, line_of_error
 from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest
 
 CYCLE_NS = 10 * NS_PER_MS
@@ -117,7 +117,7 @@ def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: set[Any]) ->
     context = _TestContext(recorded)
     error, place = "", ("", 0)
     try:
-        program = Resource(unit, context).space[f"P_{tests[0].program}"]()
+        program = Resource(unit, context).created(f"P_{tests[0].program}")
         program.execute()
         while (
             tests[0].cyclic
@@ -159,11 +159,4 @@ def _reason(error: BaseException) -> str:
 
 def _place(error: BaseException, unit: CompiledUnit, test: TranslatedTest) -> tuple[str, int]:
     """Return the innermost line of the source in which the error occurred; without one, that of the test."""
-    found = test.pos.path, test.pos.line
-    frames = error.__traceback__
-    while frames is not None:
-        path = frames.tb_frame.f_code.co_filename
-        if path in unit.files:
-            found = path, frames.tb_lineno
-        frames = frames.tb_next
-    return found
+    return line_of_error(error, unit.files) or (test.pos.path, test.pos.line)

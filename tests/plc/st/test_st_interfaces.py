@@ -441,7 +441,7 @@ def test_an_error_in_the_use_of_a_property_names_it(statement: str, message: str
             "FUNCTION_BLOCK b METHOD P END_METHOD PROPERTY P : INT GET END_GET END_PROPERTY END_FUNCTION_BLOCK",
             "declared twice",
         ),
-        ("FUNCTION_BLOCK b METHOD FB_Init : BOOL END_METHOD END_FUNCTION_BLOCK", "FB_Init, .* is not supported"),
+        ("FUNCTION_BLOCK b METHOD FB_Init : BOOL END_METHOD END_FUNCTION_BLOCK", "the first two inputs of FB_init"),
         ("FUNCTION_BLOCK b PROPERTY P : INT SET END_SET END_PROPERTY p := P + 1; END_FUNCTION_BLOCK", "no GET"),
     ],
 )

@@ -116,7 +116,7 @@ WITH_A_VARIABLE = {
 }  # fmt: skip
 """Functions of this PLC that refer to an input or a mailbox of the program."""
 ELSEWHERE = {"CONCAT_DT", "CONCAT_LDT", "SPLIT_DATE", "SPLIT_TOD", "SPLIT_LTOD", "SPLIT_DT", "SPLIT_LDT",
-             "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF"}  # fmt: skip
+             "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF", "__QUERYINTERFACE"}  # fmt: skip
 """Functions with outputs, or with seven parameters, which have too many orders, and functions of variables. They are in
 test_st_dates_and_bcd.py, test_st_references.py, test_st_pointers.py and test_st_open_arrays.py."""
 ALL = {**SAMPLES, **CONVERSIONS}

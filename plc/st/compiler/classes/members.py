@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.scope import Class, Compiling, Method, Symbol, Value, identifier
@@ -69,7 +69,7 @@ def method_of(x: Compiling, ref: t.Ref, kind: str) -> Method | None:
     if not before and is_own(x, ref):
         assert x.own is not None
         return (x.own if ref.name.lower() in THIS else x.own.ancestors[0]).of(kind, last.name)
-    of = class_of(x, x.type_of(replace(ref, selectors=tuple(before))))
+    of = class_of(x, x.type_of(ref.without_last()))
     return of.of(kind, last.name) if of is not None else None
 
 
@@ -85,7 +85,7 @@ def selected(x: Compiling, ref: t.Ref, kind: str) -> Selected | None:
     *before, last = ref.selectors
     if not isinstance(last, t.Member):
         return None
-    instance = replace(ref, selectors=tuple(before))
+    instance = ref.without_last()
     if not before and is_own(x, ref):
         return _of_own(x, ref, last, kind)
     of = class_of(x, x.type_of(instance))

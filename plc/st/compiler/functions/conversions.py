@@ -29,6 +29,7 @@ def conversion(name: str) -> Write | None:
     source, word, target = name.rpartition("_TO_")
     if word and source in _NAMES and target in _NAMES:
         return _made(_NAMES[source], _NAMES[target], cut=False)
+    name = name.removeprefix("ANY_")
     if name.startswith("TO_") and name[3:] in _NAMES:
         return _made(None, _NAMES[name[3:]], cut=False)
     return None
@@ -55,7 +56,11 @@ def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, t
     elif isinstance(kind, ty.Enum):
         kind = ty.DINT
     assert code is not None
-    made = _of_string(code, target) if isinstance(kind, ty.String) else _of_value(code, kind, target, cut)
+    made = (
+        _of_string(code, target, x.env.dialect.vendor)
+        if isinstance(kind, ty.String)
+        else _of_value(code, kind, target, cut)
+    )
     if made is None and x.env.dialect.vendor:
         made = _of_date(code, kind, target)
     if made is None:
@@ -65,7 +70,7 @@ def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, t
     return Value(made, target)
 
 
-def _of_string(code: str, target: ty.Type) -> str | None:
+def _of_string(code: str, target: ty.Type, vendor: bool) -> str | None:
     if isinstance(target, ty.String):
         return code if target.wide else f"{code}.encode('latin-1', 'replace').decode('latin-1')"
     assert isinstance(target, ty.Elementary)
@@ -73,9 +78,10 @@ def _of_string(code: str, target: ty.Type) -> str | None:
         first = f"({code}[:1] or {chr(39)}\\0{chr(39)})"
         return first if target == ty.WCHAR else f"{first}.encode('latin-1', 'replace').decode('latin-1')"
     if target.kind in ("int", "bits"):
-        return f"_v.number_of({code}, {target.low}, {target.high})"
+        return f"_v.{'leading_number' if vendor else 'number_of'}({code}, {target.low}, {target.high})"
     if target.kind == "real":
-        return f"_v.real(_v.real_of({code}))" if target.bits == 32 else f"_v.real_of({code})"
+        number = f"_v.{'leading_real' if vendor else 'real_of'}({code})"
+        return f"_v.real({number})" if target.bits == 32 else number
     return f"({code}.strip().upper() in ('TRUE', '1'))" if target.kind == "bool" else None
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.arguments import Formals
 from fieldtwin.plc.st.compiler.functions.library import ONE, Library
-from fieldtwin.plc.st.compiler.pointers.references import REFERENCE, adr, ref
+from fieldtwin.plc.st.compiler.pointers.references import REFERENCE, adr, queried, ref
 from fieldtwin.plc.st.compiler.pointers.sizes import size_of
 from fieldtwin.plc.st.compiler.scope import Compiling, Value
 from fieldtwin.plc.st.compiler.variables import lookup, place
@@ -48,6 +49,20 @@ def _is_valid(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     if found is None or not (isinstance(found.type, ty.Pointer) and found.type.word == REFERENCE):
         x.env.fail(expr.pos, f"the argument of {call.ref.name}", expected="a REFERENCE TO")
     return Value(f"({found.code} is not None)", ty.BOOL)
+
+
+@REFERENCES.add("__QUERYINTERFACE", takes=Formals(("IN", "OUT")))
+def _query_interface(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+    """Write the assignment of an instance to a variable of an interface; the result is whether the instance implements it."""
+    _only_in_dialects(x, call, "the standard has ?=")
+    source, target = given
+    kind = x.type_of(target) if isinstance(target, t.Ref) else None
+    if not (isinstance(target, t.Ref) and isinstance(kind, ty.Interface)):
+        x.env.fail(target.pos, f"the second argument of {call.ref.name}", expected="a variable of an interface type")
+    found = x.out.temporary()
+    x.out.line(f"{found} = {queried(x, x.value(source), kind, source.pos)}", call.pos)
+    x.take(t.Argument(target.pos, "", None, target), Value(found, kind))
+    return Value(f"({found} is not None)", ty.BOOL)
 
 
 def _only_in_dialects(x: Compiling, call: t.Call, instead: str) -> None:

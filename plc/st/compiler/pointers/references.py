@@ -132,6 +132,17 @@ def _target(kind: ty.Type) -> ty.Type | ty.Named:
     return kind
 
 
+def queried(x: Compiling, value: Value, kind: ty.Interface, pos: t.Pos) -> str:
+    """Return the reference to an instance as an interface that it may implement; it is NULL if the instance does not."""
+    if isinstance(value.type, ty.Block) and value.type.standard is None:
+        value = Value(f"_v.Instance({value.code})", value.type)
+    elif not isinstance(value.type, ty.Interface | ty.Null):
+        x.env.fail(
+            pos, "the source of an assignment attempt", expected="an interface or an instance", got=str(value.type)
+        )
+    return f"_v.queried({value.code}, {kind.name.lower()!r})"
+
+
 # -- operators ----------------------------------------------------------------------------------------------------------
 
 

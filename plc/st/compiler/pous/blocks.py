@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, by_reference, identifier
@@ -114,7 +115,7 @@ class Blocks(Bodies):
             self.out.line(f"retain = {self._marked(pou, symbols, 'RETAIN', 'PERSISTENT')}")
             self.out.line(f"non_retain = {self._marked(pou, symbols, 'NON_RETAIN')}")
             if isinstance(kind, ty.Block):
-                self.out.line(f"kinds = {(pou.name.lower(), *sorted(kind.bases))}")
+                self.out.line(f"kinds = {(pou.name.lower(), *sorted(kind.bases | kind.interfaces))}")
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(
                     pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT", *self._kept_temporaries(pou))
@@ -130,6 +131,45 @@ class Blocks(Bodies):
                     self.variables.initialise(pou, symbols, ("VAR_TEMP",))
                     self.body_of(pou, symbols, pou.name.lower()).body(pou.body)
             self.write_actions(pou, symbols)
+            if isinstance(kind, ty.Block) and kind.created:
+                self._write_creation(pou, kind)
+
+    def _write_creation(self, pou: t.Pou, kind: ty.Block) -> None:
+        """Write the method that calls FB_init of a new instance: first that of its base, then its own."""
+        own = self.env.classes[pou.name.lower()]
+        method = own.of("METHOD", FB_INIT)
+        if method is None:  # it has an error
+            return
+        if method.owner != pou.name:
+            self.out.line(f"created = B_{identifier(method.owner)}.created", pou.pos)
+            return
+        parameters = self.declarations.creation(kind)
+        names = [f"v_{v.name.lower()}" for v in parameters]
+        initials = {p.name.lower(): p.initial for p in method.signature.inputs}
+        given = [
+            name if v.initial is None else f"{name}={initials[v.name.lower()]}"
+            for name, v in zip(names, parameters, strict=True)
+        ]
+        with self.out.block(
+            f"def created(self, *{', '.join(['', *given])}):" if given else "def created(self):", method.pos
+        ):
+            base = own.ancestors[0].type if own.ancestors else None
+            if isinstance(base, ty.Block) and base.created:
+                needed = self.declarations.needed(base)
+                missing = [name for name in needed if f"v_{name.lower()}" not in names]
+                if missing:
+                    message = f"{FB_INIT} of {pou.name} has no input {missing[0]}, which {FB_INIT} of {base} has"
+                    self.env.fail(method.pos, message, expected=", ".join((*FIXED, *needed)))
+                of_base = {f"v_{v.name.lower()}" for v in self.declarations.creation(base)}
+                handed = ", ".join(f"{name}={name}" for name in names if name in of_base)
+                self.out.line(f"B_{identifier(base.name)}.created(self{', ' if handed else ''}{handed})", method.pos)
+            note = self.env.calls.setdefault(pou.name.lower(), {})
+            note.setdefault(method.key, method.pos)
+            self.out.line(
+                f"B_{identifier(pou.name)}.{method.attribute}({', '.join(['self', 'True', 'False', *names])})",
+                method.pos,
+            )
+            self.out.line("return self", method.pos)
 
     def _marked(self, pou: t.Pou, symbols: dict[str, Symbol], *words: str) -> tuple[str, ...]:
         """Return the attributes of the variables in blocks with one of these qualifiers."""

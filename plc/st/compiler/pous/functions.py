@@ -67,6 +67,6 @@ class Functions:
             for p in signature.inputs:
                 if reference := symbols[p.name.lower()].reference:
                     self.out.line(f"{reference} = _v.Cell({reference})", pou.pos)
-            self.variables.initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
+            self.variables.initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"), body.own)
             body.body(pou.body)
             self.out.line(body.leave, pou.pos)

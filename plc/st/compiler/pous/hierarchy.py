@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from fieldtwin.plc.st.compiler.declarations import Declarations
+from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.scope import Class, Environment, Method, Signature
 from fieldtwin.plc.st.syntax import tree as t
@@ -77,13 +78,8 @@ class Hierarchy:
             self.env.fail(
                 declared.pos, f"method {declared.name} in a PROGRAM", expected="one in a FUNCTION_BLOCK", hint=hint
             )
-        if vendor and declared.name.lower() == "fb_init":
-            hint = "declare initial values, or call a method in the first scan"
-            self.env.fail(
-                declared.pos,
-                f"{declared.name}, which is called when an instance is created, is not supported",
-                hint=hint,
-            )
+        if vendor and declared.name.lower() == FB_INIT.lower():
+            self._check_creation(declared)
         given = [word for word in _ACCESS if word in declared.modifiers]
         if len(given) > 1:
             self.env.fail(declared.pos, f"{declared.name} is {' and '.join(given)}", expected="one of them")
@@ -101,6 +97,21 @@ class Hierarchy:
             self.env.fail(declared.pos, f"{method} is ABSTRACT", expected=f"{pou.kind} ABSTRACT {pou.name}")
         return method
 
+    def _check_creation(self, declared: t.Pou) -> None:
+        """Check the parameters of FB_init."""
+        inputs = [v for b in declared.blocks if b.kind == "VAR_INPUT" for v in b.variables]
+        fixed = [
+            v.name.lower()
+            for v in inputs[: len(FIXED)]
+            if isinstance(v.type, t.NamedType) and v.type.name.upper() == "BOOL"
+        ]
+        if fixed != [name.lower() for name in FIXED]:
+            expected = " and ".join(f"{name} : BOOL" for name in FIXED)
+            self.env.fail(declared.pos, f"the first two inputs of {FB_INIT}", expected=expected)
+        for block in declared.blocks:
+            if block.kind == "VAR_IN_OUT":
+                self.env.fail(block.pos, f"VAR_IN_OUT in {FB_INIT}", expected="REFERENCE TO or POINTER TO in VAR_INPUT")
+
     def _check_override(self, declared: t.Pou, method: Method, before: Method | None) -> None:
         if before is None:
             if "OVERRIDE" in declared.modifiers:
@@ -109,6 +120,8 @@ class Hierarchy:
         if before.final:
             word = "PRIVATE" if before.access == "PRIVATE" else "FINAL"
             self.env.fail(declared.pos, f"{method} overrides {before}, which is {word}")
+        if self.env.dialect.vendor and declared.name.lower() == FB_INIT.lower():
+            return  # it may have more parameters, and both are called
         if not _same(before.signature, method.signature):
             self.env.fail(
                 declared.pos, f"{method} overrides {before} with a different signature",

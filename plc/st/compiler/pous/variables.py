@@ -11,7 +11,9 @@ from fieldtwin.plc.st.classes.inheritance import INHERITED
 from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.configurations.located import Offered
 from fieldtwin.plc.st.compiler.declarations import Declarations
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, by_reference
+from fieldtwin.plc.st.compiler.initial.order import in_order
+from fieldtwin.plc.st.compiler.initial.values import InitialValues
+from fieldtwin.plc.st.compiler.scope import Class, CodeWriter, Environment, Symbol, by_reference
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 from fieldtwin.plc.st.syntax.walk import nodes
@@ -120,7 +122,7 @@ class Variables:
             for block in self.unit.globals
             for v in block.variables
         ]
-        self.write_initials([(v, symbol) for v, symbol in found if symbol is not None], {})
+        self.write_initials([(v, symbol) for v, symbol in found if symbol is not None], Calls(self.env, {}, self.out))
 
     def kept_globals(self) -> dict[str, GlobalVariable]:
         """Return the global variables that keep their values, by list and name in lower case, such as ``valves.open``."""
@@ -138,6 +140,7 @@ class Variables:
         """
         symbols: dict[str, Symbol] = {}
         addressed = _addressed(pou)
+        indexed = addressed | _indexed(pou)
         for block in pou.blocks:
             if pou.kind not in ("PROGRAM", "FUNCTION_BLOCK", "CLASS") or block.kind == "VAR_TEMP":
                 self._no_retain(block, f"a variable of a {pou.kind}")
@@ -147,7 +150,8 @@ class Variables:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
                     symbol = self._variable(v, block, before, of_program=pou.kind == "PROGRAM")
-                    if "." not in symbol.code and v.name.lower() in addressed and not by_reference(symbol.type):
+                    names = indexed if isinstance(symbol.type, ty.String) else addressed
+                    if "." not in symbol.code and v.name.lower() in names and not by_reference(symbol.type):
                         symbol = replace(symbol, code=f"{symbol.code}.v", reference=symbol.code)
                     symbols[v.name.lower()] = symbol
                     if v.location:
@@ -192,28 +196,40 @@ class Variables:
             return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
-    def initialise(self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...]) -> None:
-        """Write the initial values of the variables in the blocks of these kinds, such as VAR and VAR_OUTPUT."""
+    def initialise(
+        self, pou: t.Pou, symbols: dict[str, Symbol], kinds: tuple[str, ...], own: Class | None = None
+    ) -> None:
+        """Write the initial values of the variables in the blocks of these kinds, such as VAR and VAR_OUTPUT.
+
+        `own` is the class to which a method belongs.
+        """
         variables = [v for block in pou.blocks if block.kind in kinds for v in block.variables]
-        self.write_initials([(v, symbols[v.name.lower()]) for v in variables if v.name.lower() in symbols], symbols)
+        found = [(v, symbols[v.name.lower()]) for v in variables if v.name.lower() in symbols]
+        compiler = Calls(self.env, symbols, self.out, pou.name.lower())
+        compiler.own = self.env.classes.get(pou.name.lower()) if own is None else own
+        self.write_initials(found, compiler)
 
-    def write_initials(self, variables: Sequence[tuple[t.VarDecl, Symbol]], symbols: dict[str, Symbol]) -> None:
-        """Write the initial values of variables: those of references last, because they may refer to the others."""
-        for v, symbol in sorted(variables, key=lambda each: isinstance(each[1].type, ty.Pointer)):
+    def write_initials(self, variables: Sequence[tuple[t.VarDecl, Symbol]], compiler: Calls) -> None:
+        """Write the initial values of variables: those of references last, because they may refer to the others.
+
+        In the dialects of CODESYS, an initial value may use other variables, which get their values before it.
+        """
+        ordered = sorted(variables, key=lambda each: isinstance(each[1].type, ty.Pointer))
+        for v, symbol in in_order(self.env, ordered) if self.env.dialect.vendor else ordered:
             with self.env.errors.collect():
-                self._write_initial(v, symbol, symbols)
+                self._write_initial(v, symbol, compiler)
 
-    def _write_initial(self, v: t.VarDecl, symbol: Symbol, symbols: dict[str, Symbol]) -> None:
+    def _write_initial(self, v: t.VarDecl, symbol: Symbol, compiler: Calls) -> None:
         """Write the assignment of a variable's initial value. A constant needs none, because its value is written at each use."""
         if symbol.constant is not None:
             return
         if isinstance(symbol.type, ty.MessagesIn | ty.MessagesOut):
             value = "()"  # messages are passed in from outside
         elif isinstance(symbol.type, ty.Pointer) and isinstance(v.initial, t.Call | t.Ref):
-            compiler = Calls(self.env, symbols, CodeWriter())
             value = compiler.given(v.initial, symbol.type, v.initial.pos, "an initial value")
         else:
-            value = self.declarations.initial(symbol.type, v.initial, v.type)
+            values = InitialValues(self.declarations, compiler if self.env.dialect.vendor else None)
+            value = values.of(symbol.type, v.initial, v.type)
         if symbol.reference:
             self.out.line(f"{symbol.reference} = _v.Cell({value})", v.pos)
         else:
@@ -223,6 +239,12 @@ class Variables:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
             hint = "VAR RETAIN of a PROGRAM, FUNCTION_BLOCK or CLASS can, and global variables with addresses"
             self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
+
+
+def _indexed(pou: t.Pou) -> set[str]:
+    """Return the names, in lower case, of the variables with an index after them, which may be strings."""
+    refs = (node for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Ref))
+    return {ref.name.lower() for ref in refs if any(isinstance(selector, t.Index) for selector in ref.selectors)}
 
 
 def _addressed(pou: t.Pou) -> set[str]:

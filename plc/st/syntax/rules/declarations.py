@@ -66,18 +66,22 @@ class DeclarationRules(Rules):
         bases = [t.NamedType(self._pos(i), str(i)) for i in items if isinstance(i, Token)]
         return t.EnumType(self._pos(meta), values, bases[0] if bases else None)
 
-    def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | None]:
-        return str(items[0]), items[1] if len(items) > 1 else None
-
-    def signed_integer(self, meta: Meta, items: list[Any]) -> int:
-        number = integer(items[-1])
-        return -number if str(items[0]) == "-" else number
+    def enum_value(self, meta: Meta, items: list[Any]) -> tuple[str, int | t.Expr | None]:
+        stated = items[1] if len(items) > 1 else None
+        return str(items[0]), stated if stated is None else _number_or_expression(stated)
 
     def alias_decl(self, meta: Meta, items: list[Any]) -> t.AliasDecl:
         return t.AliasDecl(self._pos(items[0]), str(items[0]), spec_of(items), initial_of(items))
 
     def named_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
         return t.NamedType(self._pos(meta), ".".join(items))
+
+    def created_type(self, meta: Meta, items: list[Any]) -> t.NamedType:
+        names = [item for item in items if isinstance(item, Token)]
+        return t.NamedType(self._pos(meta), ".".join(names), tuple(items[len(names) :]))
+
+    def created(self, meta: Meta, items: list[Any]) -> tuple[t.Argument, ...]:
+        return tuple(items)
 
     def subrange_type(self, meta: Meta, items: list[Any]) -> t.SubrangeType:
         return t.SubrangeType(self._pos(meta), str(items[0]), items[1], items[2])
@@ -115,6 +119,9 @@ class DeclarationRules(Rules):
     def init_array(self, meta: Meta, items: list[Any]) -> t.InitArray:
         return t.InitArray(self._pos(meta), tuple(items))
 
+    def unbracketed(self, meta: Meta, items: list[Any]) -> tuple[str, t.Init]:
+        return "initial", t.InitArray(self._pos(meta), tuple(items), bracketed=False)
+
     def one_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init]:
         return 1, items[0]
 
@@ -130,6 +137,15 @@ class DeclarationRules(Rules):
 
 def spec_of(items: list[Any]) -> t.TypeSpec:
     return next(i for i in items if isinstance(i, t.TypeSpec))
+
+
+def _number_or_expression(expr: t.Expr) -> int | t.Expr:
+    """Return the number of an integer literal with or without a sign, and any other expression, which needs the compiler."""
+    sign, literal = (expr.op, expr.operand) if isinstance(expr, t.Unary) else ("", expr)
+    if not (isinstance(literal, t.Literal) and literal.kind in ("INTEGER", "BASED")):
+        return expr
+    number = integer(Token(literal.kind, literal.text, line=literal.pos.line, column=literal.pos.column))
+    return -number if sign == "-" else number if sign in ("", "+") else expr
 
 
 def initial_of(items: list[Any]) -> t.Init | None:

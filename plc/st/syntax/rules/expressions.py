@@ -56,6 +56,10 @@ class ExpressionRules(Rules):
             raise Bad(name, "an address without a number is allowed in a declaration only")
         return t.Ref(self._pos(meta), address, tuple(selectors))
 
+    def of_call(self, meta: Meta, items: list[Any]) -> t.Ref:
+        call, *selectors = items
+        return t.Ref(self._pos(meta), "", tuple(selectors), call)
+
     def member(self, meta: Meta, items: list[Any]) -> t.Member:
         return t.Member(self._pos(meta), str(items[0]))
 

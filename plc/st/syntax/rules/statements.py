@@ -17,7 +17,10 @@ class StatementRules(Rules):
     """The methods of the transformer for statements."""
 
     def body(self, meta: Meta, items: list[Any]) -> tuple[t.Statement, ...]:
-        return tuple(i for i in items if i is not None)
+        statements: list[t.Statement] = []
+        for item in items:
+            statements += item if isinstance(item, list) else [item] if item is not None else []
+        return tuple(statements)
 
     pou_body = action_body = body
 
@@ -29,8 +32,14 @@ class StatementRules(Rules):
     def empty(self, meta: Meta, items: list[Any]) -> None:
         return None
 
-    def assign(self, meta: Meta, items: list[Any]) -> t.Assign:
-        return t.Assign(self._pos(meta), items[0], items[1])
+    def assign(self, meta: Meta, items: list[Any]) -> list[t.Assign]:
+        """Return one assignment, or those of ``a := b := value``: first that of the value, then of each variable."""
+        *targets, value = items
+        words = ["", *[t.CHAINED] * (len(targets) - 1)]
+        return [
+            t.Assign(self._pos(meta), target, given, word)
+            for target, given, word in zip(reversed(targets), (value, *reversed(targets[1:])), words, strict=True)
+        ]
 
     def refer(self, meta: Meta, items: list[Any]) -> t.Refer:
         return t.Refer(self._pos(meta), items[0], items[1])

@@ -14,6 +14,9 @@ from fieldtwin.plc.st.syntax.rules.base import Bad, Rules
 from fieldtwin.plc.st.syntax.rules.charts import chart_of
 from fieldtwin.plc.st.syntax.rules.declarations import initial_of, spec_of
 
+_OF_ALL_INTERFACES = "__system.iqueryinterface"
+"""The interface that others extend in CODESYS to be queried, in lower case. Here all interfaces can be queried."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Members:
@@ -184,7 +187,7 @@ class UnitRules(Rules):
         return t.NamedType(self._pos(meta), ".".join(items))
 
     def extends(self, meta: Meta, items: list[Any]) -> _Bases:
-        return _Bases("EXTENDS", tuple(items))
+        return _Bases("EXTENDS", tuple(item for item in items if item.name.lower() != _OF_ALL_INTERFACES))
 
     def implements(self, meta: Meta, items: list[Any]) -> _Bases:
         return _Bases("IMPLEMENTS", tuple(items))

@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from fieldtwin.run.virtual.fault_schedule import RandomFaults
 
 
+GUIDED = "guided"
+CHOSEN_FAULTS = ("random", GUIDED)
+"""The values of --faults with which each seed chooses the faults."""
+
+
 def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in value.split(",") if part.strip())
 
@@ -92,21 +97,21 @@ class FaultChoice:
         "--fault-every",
         type=Duration(),
         default=None,
-        help="With random faults: mean time between two faults; default: 2min.",
+        help="With random or guided faults: mean time between two faults; default: 2min.",
     )
     fault_kinds: tuple[str, ...] = option(
         "--fault-kinds",
         default="",
         callback=_each,
         metavar="NAME,...",
-        help="With random faults: only these (see fieldtwin faults); value faults occur only if they are named here.",
+        help="With random or guided faults: only these (see fieldtwin faults); value faults occur only if they are named here.",
     )
     fault_aims: tuple[str, ...] = option(
         "--fault-aims",
         default="",
         callback=_each,
         metavar="AIM,...",
-        help="With random faults: only on these targets (DEVICE, BUS or DEVICE.TAG); default: every device.",
+        help="With random or guided faults: only on these targets (DEVICE, BUS or DEVICE.TAG); default: every device.",
     )
 
     def of(self, faults: str | None) -> RandomFaults | None:
@@ -114,17 +119,18 @@ class FaultChoice:
 
         Raise `UsageError` for options without effect.
         """
-        if faults != "random":
+        if faults not in CHOSEN_FAULTS:
             if self.fault_every is not None or self.fault_kinds or self.fault_aims:
                 raise UsageError(
-                    "--fault-every, --fault-kinds and --fault-aims choose random faults", expected="--faults random"
+                    "--fault-every, --fault-kinds and --fault-aims choose random faults",
+                    expected="--faults random or --faults guided",
                 )
             return None
         # this module is imported here, because it loads emulators, which a plant does not need
         from fieldtwin.run.virtual.fault_schedule import MEAN_S, RandomFaults
 
         every_s = MEAN_S if self.fault_every is None else self.fault_every
-        return RandomFaults(every_s, self.fault_kinds, self.fault_aims)
+        return RandomFaults(every_s, self.fault_kinds, self.fault_aims, guided=faults == GUIDED)
 
 
 @dataclass(frozen=True)
@@ -133,15 +139,16 @@ class _ScenarioRuns(SeedOptions):
 
     faults: str | None = option(
         "--faults",
-        type=click.Choice(["random"]),
+        type=click.Choice(CHOSEN_FAULTS),
         default=None,
-        help="With --seeds: random faults, chosen by each seed. Only always, never, within and invariants are then checked.",
+        help="With --seeds: each seed chooses faults; guided: also by their effects and by the states of the programs. "
+        "Only always, never, within and invariants are then checked.",
     )
     duration_s: float = option(
         "--for",
         type=Duration(),
         default=0.0,
-        help="With random faults: length of a run; default: the maximum time of the steps, at least 10min.",
+        help="With random or guided faults: length of a run; default: the maximum time of the steps, at least 10min.",
     )
 
 
@@ -156,4 +163,6 @@ class CampaignOptions(FaultChoice, _ScenarioRuns):
         if given and not self.seeds:
             raise UsageError(f"{given} of scenarios needs --seeds", expected="--seeds 1..200")
         if self.duration_s and not self.faults:
-            raise UsageError("--for needs --faults random: without it the steps determine the length of a run")
+            raise UsageError(
+                "--for needs --faults random or guided: without it the steps determine the length of a run"
+            )

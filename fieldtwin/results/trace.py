@@ -167,6 +167,16 @@ class Trace:
             self._sink = None
 
 
+SMALL = range(-1, 32)
+"""Whole numbers that count as states: a counter or a measured value has more of them."""
+
+
+def state_of(event: TraceEvent) -> bool | int | str | None:
+    """Return the value of a STATE event if it is a truth value, a text, or a small whole number; else None."""
+    value = event.data.get("value")
+    return value if isinstance(value, bool | str) or (isinstance(value, int) and value in SMALL) else None
+
+
 REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
 """The keys in the data of a REFUSED event, from an entry of the gateway's journal
 (`fieldtwin.gateway.runtime.outputs.refusals.RefusedOutput`)."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 
+from fieldtwin.cli.campaign_options import CHOSEN_FAULTS
 from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, moved_options, option
 from fieldtwin.cli.options import Duration, Secret, json_option
@@ -196,8 +197,8 @@ def command(
     time see fieldtwin simulate.
     """
     place.check()
-    if field.faults == "random":
-        raise UsageError(SIMULATE.format("--faults random"))
+    if field.faults in CHOSEN_FAULTS:
+        raise UsageError(SIMULATE.format(f"--faults {field.faults}"))
     others = {
         **replay.given(), "--field": field.field_host, "--listen": listen, "--can": field.can, "--capture": capture,
         "--thread-store": thread.thread_store, "--metrics": metrics, "--log": log, "--studio": studio,

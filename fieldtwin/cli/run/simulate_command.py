@@ -45,8 +45,9 @@ OF_A_GROUP = (
     click.option(
         "--faults",
         default="",
-        metavar="FILE|random",
-        help="Inject the faults of this file (see fieldtwin faults); random: the seed chooses them.",
+        metavar="FILE|random|guided",
+        help="Inject the faults of this file (see fieldtwin faults); random: the seed chooses them; guided: also their effects "
+        "and the states of the programs.",
     ),
     choice=FaultChoice,
 )

@@ -24,6 +24,7 @@ from fieldtwin.run.places.bundle import files_of, profile_folders, relative
 from fieldtwin.run.places.place import Ended
 from fieldtwin.run.targets.virtual_scenario import group_of, reproduce, run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.run.virtual.guided_faults import guide_of
 from fieldtwin.run.virtual.run import texts_of
 from fieldtwin.scenarios.judging.runner import ByChance
 from fieldtwin.scenarios.language.about import result_of
@@ -89,12 +90,18 @@ def longest_s(scenario: Scenario) -> float:
     return total_s
 
 
-def schedule(campaign: Campaign, scenario: Scenario, seed: int) -> tuple[dict[str, Any], ...]:
-    """Return the faults that a seed chooses."""
-    wanted, length_s = campaign.random_faults, campaign.length_s(scenario)
+def schedule(campaign: Campaign, seed: int) -> tuple[dict[str, Any], ...]:
+    """Return the faults that a seed chooses. Guided faults are known only after a run, so it is made again."""
+    scenario, wanted = campaign.check(), campaign.random_faults
     if wanted is None:
         return ()
-    return random_schedule(group_of(scenario), seed, length_s, wanted)
+    length_s = campaign.length_s(scenario)
+    drawn = random_schedule(group_of(scenario), seed, length_s, wanted)
+    guide = guide_of(group_of(scenario), seed, length_s, wanted)
+    if guide is None:
+        return drawn
+    run_virtual(scenario, seed, by_chance=ByChance(drawn, length_s), guide=guide)
+    return (*drawn, *guide.chosen)
 
 
 def run_seed(
@@ -109,12 +116,17 @@ def run_seed(
     `trace` is a file for every event, limited by `most_trace_bytes`.
     """
     scenario = campaign.check()
-    by_chance = None
-    if campaign.random_faults is not None:
-        chosen = schedule(campaign, scenario, seed) if faults is None else tuple(faults)
-        by_chance = ByChance(chosen, campaign.length_s(scenario))
+    by_chance, guide, wanted = None, None, campaign.random_faults
+    if wanted is not None:
+        group, length_s = group_of(scenario), campaign.length_s(scenario)
+        if faults is None:
+            faults = random_schedule(group, seed, length_s, wanted)
+            guide = guide_of(group, seed, length_s, wanted)
+        by_chance = ByChance(tuple(faults), length_s)
     seen = CoverageCollector()
-    result = run_virtual(scenario, seed, trace, by_chance, most_trace_bytes=most_trace_bytes, watch=seen.listen)
+    result = run_virtual(
+        scenario, seed, trace, by_chance, guide=guide, most_trace_bytes=most_trace_bytes, watch=seen.listen
+    )
     result = replace(result, coverage=seen.coverage.text())
     if by_chance is None:
         return result

@@ -10,12 +10,10 @@ from heapq import heappop, heappush
 
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
-from fieldtwin.results.trace import Trace, TraceEvent, TraceKind
+from fieldtwin.results.trace import Trace, TraceEvent, TraceKind, state_of
 from fieldtwin.run.campaigns.coverage import MOST_OF_KIND, Coverage, Kind, element
 
 NO_FAULT = ""
-SMALL = range(-1, 32)
-"""Whole numbers that count as states: a counter or a measured value has more of them."""
 MOST_VARIABLES = 32
 """Largest number of variables whose states are combined with faults and tags, in the order of their first change."""
 MOST_VALUES = 32
@@ -58,8 +56,8 @@ class CoverageCollector:
         return self._faults.values() or (NO_FAULT,)
 
     def _state(self, event: TraceEvent) -> None:
-        value, variable = event.data.get("value"), event.where
-        if isinstance(value, float) or (isinstance(value, int) and value not in SMALL) or value is None:
+        value, variable = state_of(event), event.where
+        if value is None:
             return
         self._advance(event.t_ns)
         values = self._values.get(variable)

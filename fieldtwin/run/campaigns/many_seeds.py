@@ -121,7 +121,7 @@ class Shrunk:
 
 def shrunk(options: VirtualOptions, found: SeedResult, jobs: int, further: FurtherRuns) -> Shrunk:
     """Return the fewest faults with which the run of `found`'s seed still fails in the same way; `jobs` runs at a time."""
-    run = VirtualRun(replace(options, seed=found.seed))
+    run = _known_faults(options, found.seed)
     small = shrunk_run(
         run.faults,
         partial(_with_faults, options, found.seed),
@@ -130,6 +130,16 @@ def shrunk(options: VirtualOptions, found: SeedResult, jobs: int, further: Furth
         further,
     )
     return Shrunk(*small, run.scripted)
+
+
+def _known_faults(options: VirtualOptions, seed: int) -> VirtualRun:
+    """Return a run with this seed whose `faults` are complete: with guided faults it is made again, because they are known only
+    afterwards.
+    """
+    run = VirtualRun(replace(options, seed=seed))
+    if options.random_faults is not None and options.random_faults.guided:
+        run.run()
+    return run
 
 
 def _with_faults(options: VirtualOptions, seed: int, faults: Sequence[dict[str, Any]]) -> SeedResult:
@@ -151,7 +161,7 @@ def causes_of(
 
 def _fails_with(options: VirtualOptions, shape: frozenset[str], found: SeedResult) -> bool:
     """Return whether the run of a seed still fails in the same way with its faults of this shape only."""
-    faults = VirtualRun(replace(options, seed=found.seed)).faults
+    faults = _known_faults(options, found.seed).faults
     return same_failure(found.errors, _with_faults(options, found.seed, of_shape(faults, shape)).errors)
 
 

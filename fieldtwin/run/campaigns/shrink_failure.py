@@ -41,7 +41,7 @@ def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int, further: F
     """Return the fewest random faults with which the seed of `found` still breaks the same rules; `jobs` runs at a time."""
     assert found.seed is not None
     seed, wanted = found.seed, broken_by(found)
-    faults = schedule(campaign, campaign.check(), seed)
+    faults = schedule(campaign, seed)
     run = partial(slim_run, campaign, seed)
     small = shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result)), jobs, further)
     return ShrunkSeed(seed, *small)
@@ -63,7 +63,7 @@ def causes_of(
 def _fails_with(campaign: Campaign, shape: frozenset[str], found: ScenarioResult) -> bool:
     """Return whether the run of a seed still breaks the same rules with its faults of this shape only."""
     assert found.seed is not None
-    faults = of_shape(schedule(campaign, campaign.check(), found.seed), shape)
+    faults = of_shape(schedule(campaign, found.seed), shape)
     return same_failure(broken_by(found), broken_by(slim_run(campaign, found.seed, faults)))
 
 

@@ -6,7 +6,7 @@ and no scan stopped; and once every fault has been over for a minute, all device
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,7 @@ class RunChecker:
         """Prepare the checks. `by_chance`: random faults, in addition to those of the steps."""
         steps = enumerate(scenario.form.steps, 1)
         faults = by_chance + tuple({"id": f"step {n}", **step.fault} for n, step in steps if step.fault is not None)
-        placed = group.place(faults)
+        self._group, placed = group, group.place(faults)
         self._checks = {
             name: SystemCheck(
                 member.system,
@@ -41,6 +41,11 @@ class RunChecker:
         }
         self._benches: Mapping[str, VirtualBench] = {}
         self._where = scenario.line("judge")
+
+    def add_faults(self, faults: Iterable[Mapping[str, Any]]) -> None:
+        """Add faults that were chosen during the run."""
+        for name, placed in self._group.place(faults).items():
+            self._checks[name].faults = (*self._checks[name].faults, *placed)
 
     def attach(self, benches: Mapping[str, VirtualBench]) -> None:
         """Begin to check the events of the benches. A single system has the name ``""``."""

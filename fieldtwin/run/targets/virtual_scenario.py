@@ -24,6 +24,7 @@ from fieldtwin.results.trace_about import TraceAbout, write_results
 from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.run_checks import RunChecker
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
+from fieldtwin.run.virtual.guided_faults import GuidedFaults
 from fieldtwin.run.virtual.trace_description import begin_description, described_checks
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
 from fieldtwin.scenarios.language.about import result_of
@@ -40,10 +41,11 @@ def run_virtual(
     progress: Progress | None = None,
     most_trace_bytes: int | None = None,
     watch: Callable[[Trace], None] | None = None,
+    guide: GuidedFaults | None = None,
 ) -> ScenarioResult:
     """Run the scenario. `seed` takes precedence over the scenario's own seed and the prototype file's. `by_chance`: random
-    faults of a campaign. `most_trace_bytes` limits the trace file (see `open_sink`). `watch` gets the trace before its
-    first event, to listen to it.
+    faults of a campaign; `guide` chooses further ones during the run. `most_trace_bytes` limits the trace file (see
+    `open_sink`). `watch` gets the trace before its first event, to listen to it.
     """
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
@@ -62,6 +64,8 @@ def run_virtual(
         sink = open_sink(trace_file, most_trace_bytes) if trace_file is not None else None
         trace = Trace(sink=sink)
         trace.listen(collector.feed)
+        if guide is not None:
+            guide.listen(trace)
         if watch is not None:
             watch(trace)
         if progress is not None:
@@ -80,7 +84,10 @@ def run_virtual(
                         profiles=scenario.profiles,
                         title=scenario.form.scenario,
                     )
-                return await _judged(ScenarioRunner(scenario, running.bench, by_chance), judge, running)
+                async with Nursery() as nursery:
+                    if guide is not None:
+                        nursery.start(guide.run(running.bench, optional=True), "guided faults")
+                    return await _judged(ScenarioRunner(scenario, running.bench, by_chance), judge, running, guide)
 
         try:
             with seeded(chosen), sealed():
@@ -108,7 +115,9 @@ def run_virtual(
     )
 
 
-async def _judged(runner: ScenarioRunner, judge: RunChecker | None, running: VirtualSystems) -> ScenarioResult:
+async def _judged(
+    runner: ScenarioRunner, judge: RunChecker | None, running: VirtualSystems, guide: GuidedFaults | None
+) -> ScenarioResult:
     """Run the scenario. If it requests `judge: run`, `judge` makes the checks of a run in addition."""
     if judge is None:
         return await runner.run()
@@ -116,6 +125,8 @@ async def _judged(runner: ScenarioRunner, judge: RunChecker | None, running: Vir
     async with Nursery() as nursery:
         nursery.start(judge.watch(), "judge")
         result = await runner.run()
+    if guide is not None:
+        judge.add_faults(guide.chosen)
     return await judge.finish(result)
 
 

@@ -5,8 +5,8 @@ The last part of a run has no fault, so that recovery can be observed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
@@ -44,12 +44,14 @@ class RandomFaults:
     `mean_s`: mean seconds between two faults. `kinds`: names of faults; empty: all that a gateway can detect, without
     faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault affects that register or object
     only); in a group they are prefixed by the name of their system, and what the systems share has a name too. Empty:
-    every device.
+    every device. `guided`: the begins of the faults depend on the states of the programs (see
+    `fieldtwin.run.virtual.guided_faults`).
     """
 
     mean_s: float = MEAN_S
     kinds: tuple[str, ...] = ()
     aims: tuple[str, ...] = ()
+    guided: bool = False
 
     def check(self, group: SystemGroup) -> None:
         """Raise `UsageError` for a fault or an aim that does not exist, and for kinds that fit no aim."""
@@ -83,7 +85,7 @@ class RandomFaults:
         alone).
         """
         aims = tuple(aim.removeprefix(prefix) for aim in self.aims if aim.startswith(prefix))
-        return RandomFaults(self.mean_s, self.kinds, aims or (("",) if self.aims else ()))
+        return replace(self, aims=aims or (("",) if self.aims else ()))
 
 
 ANY = RandomFaults()
@@ -141,42 +143,77 @@ def _can_aim(system: System, name: str, device: str, tag: str) -> bool:
     return True
 
 
+@dataclass(frozen=True, slots=True)
+class FaultChoice:
+    """A target of random faults. `kinds` are the names of the faults that can take effect there; `tag` is empty for a whole
+    device.
+    """
+
+    member: GroupMember
+    device: str
+    tag: str
+    kinds: tuple[str, ...]
+
+    def only(self, kinds: Collection[str]) -> FaultChoice:
+        """Return this target with these kinds of faults only."""
+        return replace(self, kinds=tuple(kind for kind in self.kinds if kind in kinds))
+
+
+def fault_choices(member: GroupMember, wanted: RandomFaults) -> list[FaultChoice]:
+    """Return the targets of random faults in one system of a group, in the order of its file."""
+    found = _choices(member.system, wanted.under(member.prefix))
+    return [FaultChoice(member, device, tag, tuple(names)) for device, tag, names in found if names]
+
+
 def random_schedule(
     group: SystemGroup, seed: int, duration_s: float, wanted: RandomFaults = ANY
 ) -> tuple[dict[str, Any], ...]:
     """Return faults in the form of a fault file; the same for the same systems, seed, duration and choice.
 
-    Each system's faults are drawn with its own seed. The faults of the shared resources follow.
+    Each system's faults are drawn with its own seed. The faults of the shared resources follow. The faults of systems are left
+    out if they are guided, because they are then chosen during the run.
     """
-    last_s = duration_s - min(CALM_S, duration_s / 2)
-    found = [fault for member in group.members.values() for fault in _of_member(member, seed, last_s, wanted)]
+    end_s, found = last_s(duration_s), list[dict[str, Any]]()
+    if not wanted.guided:
+        found += [fault for member in group.members.values() for fault in _of_member(member, seed, end_s, wanted)]
     if not wanted.aims or set(wanted.aims) & set(group.shared):
         random = Random(f"faults {seed} {' '.join(group.shared)}")
-        found += group.random_shared_faults(random, wanted.kinds, wanted.mean_s, last_s)
+        found += group.random_shared_faults(random, wanted.kinds, wanted.mean_s, end_s)
     return tuple(sorted(found, key=lambda fault: float(fault["from"])))
 
 
-def _of_member(member: GroupMember, seed: int, last_s: float, wanted: RandomFaults) -> Iterator[dict[str, Any]]:
-    system, number = member.system, 0
+def last_s(duration_s: float) -> float:
+    """Return the time in seconds at which the last random fault of a run must have ended."""
+    return duration_s - min(CALM_S, duration_s / 2)
+
+
+def _of_member(member: GroupMember, seed: int, end_s: float, wanted: RandomFaults) -> Iterator[dict[str, Any]]:
+    number = 0
     random = Random(f"faults {seed} {member.name}".strip())
-    choices = [choice for choice in _choices(system, wanted.under(member.prefix)) if choice[2]]
+    choices = fault_choices(member, wanted)
     at_s = random.expovariate(1 / wanted.mean_s)
-    while at_s < last_s and number < MOST and choices:
-        device, tag, names = random.choice(choices)
-        until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_S))
-        fault: dict[str, Any] = {
-            "id": f"{member.name}-f{number + 1}".removeprefix("-"),
-            "name": random.choice(names),
-            "device": member.prefix + device,
-            "from": round(at_s, 3),
-            "until": round(until_s, 3),
-        }
-        of_values = FAULTS[fault["name"]].kind is InjectionPoint.VALUE
-        if tag or of_values:
-            fault["register"] = tag or random.choice(_struck(system, fault["name"], device))
-        if random.random() < 0.5 and not of_values and not only_sends(FAULTS[fault["name"]]):
-            fault["probability"] = round(random.uniform(0.1, 1.0), 2)
+    while at_s < end_s and number < MOST and choices:
+        choice = random.choice(choices)
+        fault = drawn_fault(choice, f"{member.name}-f{number + 1}".removeprefix("-"), at_s, end_s, random)
         if fault["until"] > fault["from"]:
             number += 1
             yield fault
         at_s += random.expovariate(1 / wanted.mean_s)
+
+
+def drawn_fault(choice: FaultChoice, id: str, at_s: float, end_s: float, random: Random) -> dict[str, Any]:
+    """Return a fault at this target that begins at `at_s` and ends at `end_s` or before, in seconds of the run."""
+    until_s = min(end_s, at_s + random.uniform(SHORTEST_S, LONGEST_S))
+    fault: dict[str, Any] = {
+        "id": id,
+        "name": random.choice(choice.kinds),
+        "device": choice.member.prefix + choice.device,
+        "from": round(at_s, 3),
+        "until": round(until_s, 3),
+    }
+    of_values = FAULTS[fault["name"]].kind is InjectionPoint.VALUE
+    if choice.tag or of_values:
+        fault["register"] = choice.tag or random.choice(_struck(choice.member.system, fault["name"], choice.device))
+    if random.random() < 0.5 and not of_values and not only_sends(FAULTS[fault["name"]]):
+        fault["probability"] = round(random.uniform(0.1, 1.0), 2)
+    return fault

@@ -27,6 +27,7 @@ from fieldtwin.results.trace_about import CheckAbout, TraceAbout, write_results
 from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
+from fieldtwin.run.virtual.guided_faults import guide_of
 from fieldtwin.run.virtual.system_check import SystemCheck
 from fieldtwin.run.virtual.trace_description import begin_description
 from fieldtwin.scenarios.bench import Bench
@@ -106,8 +107,12 @@ class VirtualRun:
         if options.random_faults is not None:
             options.random_faults.check(self.group)
             self.faults += random_schedule(self.group, self.seed, options.duration_s, options.random_faults)
-        placed = self.group.place(self.faults)
-        self.checks = {name: SystemCheck(m.system, placed.get(name, ())) for name, m in self.group.members.items()}
+        self._guide = guide_of(self.group, self.seed, options.duration_s, options.random_faults)
+        placed, disturbed = self.group.place(self.faults), None if self._guide is None else True
+        self.checks = {
+            name: SystemCheck(m.system, placed.get(name, ()), disturbed=disturbed)
+            for name, m in self.group.members.items()
+        }
         self.elapsed_s = 0.0
         self.errors: list[str] = []
         self.trace = Trace(0)  # nothing reads its events; the hash, the listeners and a trace file get all of them
@@ -142,6 +147,8 @@ class VirtualRun:
             file = self.options.trace
             self.trace = Trace(0, open_sink(file, self.options.most_trace_bytes) if file else None)
             stack.callback(self.trace.close)
+            if self._guide is not None:
+                self._guide.listen(self.trace)
             if watch is not None:
                 watch(self.trace)
             stack.callback(loop.close)
@@ -185,6 +192,8 @@ class VirtualRun:
             async with Nursery() as nursery:
                 for name, check in self.checks.items():
                     check.watch_invariants(running.systems[name], nursery)
+                if self._guide is not None:
+                    nursery.start(self._guide.run(running.bench), "guided faults")
                 await self._through(running.bench, loop, lambda: self._judge(running))
                 for name, check in self.checks.items():
                     await check.settle(running.systems[name])
@@ -218,6 +227,10 @@ class VirtualRun:
         await asyncio.sleep(0)
 
     def _ended(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
+        if self._guide is not None:
+            self.faults += tuple(self._guide.chosen)
+            for name, faults in self.group.place(self._guide.chosen).items():
+                self.checks[name].faults = (*self.checks[name].faults, *faults)
         error = None if main.cancelled() else main.exception()
         if isinstance(error, FileInvalid | UsageError) and not self._judged:
             raise error

@@ -142,27 +142,27 @@ class DecisionReader:
 
     def __init__(self, inspection: Inspection, decisions: Decisions, hidden: frozenset[str]) -> None:
         self._inspection, self._decisions, self._hidden = inspection, decisions, hidden
-        self._variables: dict[tuple[str, int, str], tuple[_Variables, Callable[[Any], tuple[Any, ...]]]] = {}
-        """By decision: its variables, and the function that reads them from a program."""
+        self._found: dict[tuple[str, int, str], tuple[Decision, _Variables, _Reader]] = {}
+        """The decisions that were read, with their variables, and the function that reads these from a program."""
 
     def read(self, body: Any, key: tuple[str, int, str]) -> Decided | None:
         """Return the decision for a file, a line and a variable, with the present values; None without such a statement."""
-        decision = self._decisions.get(key)
-        if decision is None:
-            return None
-        found = self._variables.get(key)
+        found = self._found.get(key)
         if found is None:
-            found = self._variables[key] = self._found(decision)
-        variables, read = found
-        return Decided(decision, variables, read(body))
+            decision = self._decisions.get(key)
+            if decision is None:
+                return None
+            found = self._found[key] = (decision, *self._variables(decision))
+        decision, variables, values_of = found
+        return Decided(decision, variables, values_of(body))
 
-    def _found(self, decision: Decision) -> tuple[_Variables, Callable[[Any], tuple[Any, ...]]]:
+    def _variables(self, decision: Decision) -> tuple[_Variables, _Reader]:
         shown = [path for path in decision.reads if path.partition(".")[0].lower() not in self._hidden]
         found = [(path, *attribute) for path in shown if (attribute := self._inspection.attribute(path)) is not None]
         return tuple([(path, kind) for path, _, kind in found]), reader([attribute for _, attribute, _ in found])
 
 
-def reader(attributes: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+def reader(attributes: list[str]) -> _Reader:
     """Return a function that reads these attributes of an object, with one call for all of them."""
     if len(attributes) > 1:
         return attrgetter(*attributes)
@@ -172,6 +172,8 @@ def reader(attributes: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 _Variables = tuple[tuple[str, ty.Type], ...]
 """The paths and types of variables."""
+_Reader = Callable[[Any], tuple[Any, ...]]
+"""A function that returns the values of some attributes of an object."""
 
 
 class Decided(msgspec.Struct, frozen=True, gc=False):

@@ -89,6 +89,8 @@ class StProgram(Program):
         self.st_read = reader([attribute for _, attribute in same])
         """Reads the values of `st_outputs`, all at once, because a large program has hundreds."""
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
+        self.st_places: dict[int | tuple[str, int], SourceLine] = {}
+        """The lines that assigned outputs so far; all changes by one line share its object."""
         self.st_show()
 
     def execute(self, scan: ScanInfo) -> None:
@@ -149,9 +151,13 @@ class StProgram(Program):
         declaration."""
         found = self.st_variables.get(name)
         line = getattr(self.st_holder(found), line_of(found.attribute), 0) if found is not None else 0
-        if isinstance(line, tuple):
-            return SourceLine(*line)
-        return SourceLine(self.source_path, line) if line else None
+        if not line:
+            return None
+        place = self.st_places.get(line)
+        if place is None:
+            place = SourceLine(*line) if isinstance(line, tuple) else SourceLine(self.source_path, line)
+            self.st_places[line] = place
+        return place
 
     def decided(self, name: str, place: SourceLine) -> Decided | None:
         found = self.st_variables.get(name)

@@ -204,6 +204,15 @@ class InternalVariable:
     value: Scalar | str
 
 
+@dataclass(frozen=True, slots=True)
+class VariableReader:
+    """Reads one variable of a program. `type` is its IEC type, or the kind of its tag."""
+
+    type: str
+    read: Callable[[], Scalar | str | None]
+    unit: str = ""
+
+
 class Described(Protocol):
     """Something that can be described as data for JSON."""
 
@@ -337,6 +346,22 @@ class Program(ABC):
                 if member == wanted:
                     return InternalVariable(path, kind, value)
         return None
+
+    def reader(self, path: str) -> VariableReader | None:
+        """Return what reads a variable by its path, whether or not it is a tag; None if the program has no such variable."""
+        declared = self.variables.get(path)
+        if declared is not None:
+            kind = declared.kind.value
+            return VariableReader(kind, lambda: self.__dict__[path], declared.unit) if kind != "message" else None
+        found = self.internal(path)
+        if found is None:
+            return None
+        unit = "ns" if found.type in ("TIME", "LTIME") else ""
+        return VariableReader(found.type, lambda: self._internal_value(path), unit)
+
+    def _internal_value(self, path: str) -> Scalar | str | None:
+        found = self.internal(path)
+        return found.value if found is not None else None
 
     def retained(self) -> dict[str, Any]:
         """Return the values that a warm start needs, by variable: numbers, strings, and lists and maps of them."""

@@ -215,6 +215,10 @@ class Scan:
             settling.disturbed()
         return settling.settled
 
+    def execute_always(self) -> None:
+        """From now on skip no scan."""
+        self._settling = Settling((), _state_of)
+
     def programs_changed(self) -> None:
         """Execute the logic of the next scan in any case, because programs of this task were replaced."""
         self._settling.disturbed()

@@ -120,6 +120,8 @@ class CyclicTask:
         """A description of the task that was still running when this one became due, for messages. A runner of several tasks
         sets it; empty if there was none.
         """
+        self.began_ns = 0
+        """The time (monotonic ns) at which the last scan began."""
         self.ended_ns = 0
         """The time (monotonic ns) at which the last scan ended."""
         self._guard = guard
@@ -152,7 +154,7 @@ class CyclicTask:
         """Run the scan that is due. Afterwards `deadline_ns` is the next deadline, or the state is STOPPED."""
         if self.state is not _RUNNING:
             raise Bug("a scan of a task that does not run", got=self.state.value)
-        began_ns = self._now_ns()
+        began_ns = self.began_ns = self._now_ns()
         late_ns = began_ns - self.deadline_ns
         if (self.paused and not self.steps) or self._scan.waiting:
             self._scan.hold(began_ns)

@@ -21,6 +21,11 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
               {"number": ...}: replace the programs as prepared, between two scans, all or none (fieldtwin.plc.runtime.online)
     about     of each program: variables, states with transitions, and the text of its source; this changes only when programs
               are replaced or restarted
+    trace_begin
+              {"names": [...], "before": n, "after": n, "when": ...}: record variables after each scan in a ring, if wanted around
+              the first scan in which a condition in Structured Text is TRUE (fieldtwin.plc.runtime.variable_trace)
+    trace_read
+              {"number": ..., "since": row}: the next rows of a trace: number, scan, time and values; `trace_end` removes it
     stop      set the outputs to their safe values, then end the process
 
 The actions of users (force to restart, and apply_change) are recorded before they are carried out; each of these commands takes
@@ -54,6 +59,7 @@ from fieldtwin.plc.runtime.online.changes import OnlineChanges
 from fieldtwin.plc.runtime.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.plc.runtime.tag_view import TagView
+from fieldtwin.plc.runtime.tracing import Traces
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 
 MAX_STEPS = 10_000
@@ -69,6 +75,7 @@ class PlcProcess:
         self._view = TagView(image, self._runner)
         self._acts = Acts(config.audit_path)
         self._changing = OnlineChanges(self._runner, self._note)
+        self._traces = Traces(self._runner, monotonic_ns)
         self._loop = asyncio.new_event_loop()
         self._server = ControlServer(
             {
@@ -88,6 +95,9 @@ class PlcProcess:
                 "prepare_change": self._changing.prepare,
                 "apply_change": self._changing.apply,
                 "about": self._about,
+                "trace_begin": self._traces.begin,
+                "trace_read": self._traces.read,
+                "trace_end": self._traces.end,
             }
         )
         self._realtime = RealtimeReport((), ())

@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec
+from fieldtwin.gateway.core.image.layout import RegionLayout
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram, created_again
 from fieldtwin.plc.cycle.forces import Forces, checked
@@ -104,6 +105,9 @@ class TaskRunner:
         self._stepped = 0
         self._ended: StopReason | None = None
         self._between: Callable[[], None] | None = None
+        self._every_scan = False
+        self.on_scan: Callable[[TaskEntry], None] | None = None
+        """A function that is called after each scan, also of a paused PLC. It must not raise an exception."""
         self._assemble(self._loaded(), cold=config.cold)
         self.sources = self._read_sources()
 
@@ -163,7 +167,8 @@ class TaskRunner:
                 self.outputs,
                 outputs_first=config.outputs_first,
                 starts=self.starts.all,
-                may_skip=len(specs) == 1,  # programs of one file share global variables, also those of different tasks
+                # programs of one file share global variables, also those of different tasks
+                may_skip=len(specs) == 1 and not self._every_scan,
             )
             cycle_ms = _EVENT_MS if spec.single else spec.interval_ms
             timing = TaskConfig(cycle_ms, spec.late_ms or config.late_ms, config.stop_after, spec.name)
@@ -230,6 +235,12 @@ class TaskRunner:
             action, self._between = self._between, None
             action()
 
+    def execute_every_scan(self) -> None:
+        """From now on execute the logic of each scan, also if that changes nothing, because a debugger looks at it."""
+        self._every_scan = True
+        for entry in self.entries:
+            entry.scan.execute_always()
+
     def programs_changed(self, read: Sequence[ProgramSource]) -> None:
         """Continue with programs that were replaced in place. `read` are their files."""
         names = {source.program for source in read}
@@ -257,6 +268,8 @@ class TaskRunner:
                 return
         entry.task.run_once()
         self._ran = entry
+        if self.on_scan is not None:
+            self.on_scan(entry)
         if entry.task.state is _STOPPED:
             self._on_stopped(entry)
             return
@@ -382,6 +395,11 @@ class TaskRunner:
         self.retained.close()
 
     # -- user actions -------------------------------------------------------------------------------------------------
+
+    @property
+    def regions(self) -> Sequence[RegionLayout]:
+        """Return the layouts of INPUTS and OUTPUTS."""
+        return self._image.layout.regions
 
     @property
     def error(self) -> FieldtwinError | None:

@@ -40,7 +40,7 @@ class Inspection:
     def names(self, body: Any) -> Iterator[str]:
         """Return the path of every variable of `body`; an array of simple values has one path."""
         for name, kind in self._variables:
-            yield from self._below(name, kind, _of(body, name))
+            yield from self.below(name, kind, _of(body, name))
 
     def find(self, body: Any, path: str) -> InternalVariable | None:
         """Return the variable with this path in `body`, and None for a path that names no variable, or one with members."""
@@ -64,25 +64,58 @@ class Inspection:
             found = self._member(found, step[1]) if step[1] else _element(found, step[2])
         return found
 
+    def assigning(self, owner: Typed, step: str) -> Callable[[Any], None] | None:
+        """Return the function that assigns a part of `owner`, such as ``.PT`` or ``[3]``.
+
+        Return None for a part that only its block may set, such as ``.Q`` of a timer, and for a reference.
+        """
+        kind, value = owner
+        found = self.within(owner, step)
+        if found is None or isinstance(found[0], ty.Pointer | ty.Interface | ty.MessagesIn | ty.MessagesOut):
+            return None
+        if isinstance(kind, ty.Array):
+            *outer, last = _indices(kind, step.strip("[]"))
+            holder = _at(kind, value, outer)
+            return lambda new: holder.__setitem__(last - kind.ranges[len(outer)][0], new)
+        if isinstance(kind, ty.Block) and kind.standard is not None and step[1:].lower() not in kind.inputs:
+            return None
+        attribute = self._member_attribute(kind, step[1:])
+        return (lambda new: setattr(value, attribute[0], new)) if attribute is not None else None
+
     def attribute(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes of a path without indices, such as ``v_delay.ET``, and the type of its value.
 
         None for other paths, and for a variable with members.
         """
+        found = self.code(path) if "[" not in path else None
+        return None if found is None or isinstance(found[1], ty.Struct | ty.Block | ty.Array) else found
+
+    def code(self, path: str) -> tuple[str, ty.Type] | None:
+        """Return the Python attributes and indices of a path, such as ``v_levels[2]``, and its type; None for an unknown path."""
         name, rest = first_name(path)
         top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
-        if top is None or "[" in rest:
-            return None
-        attributes, kind = [f"v_{name.lower()}"], top[1]
-        for member in rest.split(".")[1:]:
-            found = self._member_attribute(kind, member)
-            if found is None:
+        return self.code_within(f"v_{name.lower()}", top[1], rest) if top is not None else None
+
+    def code_within(self, code: str, kind: ty.Type, rest: str) -> tuple[str, ty.Type] | None:
+        """Return the Python code and the type of a part of a variable, whose own `code` and `kind` are given, as `code` does."""
+        at = 0
+        while at < len(rest):
+            step = _STEP.match(rest, at)
+            if step is None:
                 return None
-            attributes.append(found[0])
-            kind = found[1]
-        if isinstance(kind, ty.Struct | ty.Block | ty.Array):
-            return None
-        return ".".join(attributes), kind
+            at = step.end()
+            if step[1]:
+                member = self._member_attribute(kind, step[1])
+                if member is None:
+                    return None
+                code, kind = f"{code}.{member[0]}", member[1]
+            else:
+                indices = _indices(kind, step[2])
+                if not isinstance(kind, ty.Array) or not indices:
+                    return None
+                code += "".join(f"[{i - low}]" for i, (low, _) in zip(indices, kind.ranges, strict=True))
+                kind = kind.of
+        return code, kind
 
     def _member_attribute(self, kind: ty.Type, member: str) -> tuple[str, ty.Type] | None:
         key = member.lower()
@@ -94,13 +127,14 @@ class Inspection:
             return {**kind.inputs, **kind.outputs}.get(key)
         return next(((f"v_{key}", of) for name, of in self._blocks[kind.name.lower()] if name.lower() == key), None)
 
-    def _below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
+    def below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
+        """Return the path of a variable, or of each of its parts."""
         if isinstance(kind, ty.Struct | ty.Block):
             for member, of, inside in self.members(kind, value):
-                yield from self._below(f"{name}.{member}", of, inside)
+                yield from self.below(f"{name}.{member}", of, inside)
         elif isinstance(kind, ty.Array) and isinstance(kind.of, ty.Struct | ty.Block | ty.Array):
             for index, element in elements(kind, value):
-                yield from self._below(f"{name}{index}", kind.of, element)
+                yield from self.below(f"{name}{index}", kind.of, element)
         else:
             yield name
 
@@ -135,18 +169,29 @@ def first_name(path: str) -> tuple[str, str]:
     return path[:end], path[end:]
 
 
+def last_step(rest: str) -> tuple[str, str]:
+    """Return the rest of a path without its last member or index, and this; both empty if it is not the rest of a path."""
+    steps = list(_STEP.finditer(rest))
+    return (rest[: steps[-1].start()], steps[-1][0]) if steps else ("", "")
+
+
 def _of(body: Any, name: str) -> Any:
     return getattr(body, f"v_{name.lower()}")
 
 
 def _element(found: Typed, index: str) -> Typed | None:
     kind, value = found
+    at = _indices(kind, index)
+    return (kind.of, _at(kind, value, at)) if isinstance(kind, ty.Array) and at else None
+
+
+def _indices(kind: ty.Type, index: str) -> tuple[int, ...]:
+    """Return the indices of an element; empty for those that the array does not have."""
     at = tuple(int(part) for part in index.split(","))
     if not isinstance(kind, ty.Array) or len(at) != len(kind.ranges):
-        return None
-    if not all(low <= i <= high for i, (low, high) in zip(at, kind.ranges, strict=True)):
-        return None
-    return kind.of, _at(kind, value, at)
+        return ()
+    inside = all(low <= i <= high for i, (low, high) in zip(at, kind.ranges, strict=True))
+    return at if inside else ()
 
 
 def elements(kind: ty.Array, value: Any) -> Iterator[tuple[str, Any]]:
@@ -156,7 +201,7 @@ def elements(kind: ty.Array, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _at(kind: ty.Array, value: Any, at: Sequence[int]) -> Any:
-    for i, (low, _) in zip(at, kind.ranges, strict=True):
+    for i, (low, _) in zip(at, kind.ranges, strict=False):
         value = value[i - low]
     return value
 

@@ -23,6 +23,7 @@ from fieldtwin.plc.program import (
     ScanInfo,
     SourceLine,
     Variable,
+    VariableReader,
     message_input,
     message_output,
 )
@@ -35,11 +36,12 @@ from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVari
 from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of, reader
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
-from fieldtwin.plc.st.inspection import Inspection
+from fieldtwin.plc.st.inspection import Inspection, shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.syntax.errors import invalid
+from fieldtwin.plc.st.variable_paths import VariablePaths
 
 WRITES = "st_writes"
 """The message input through which servers write variables: a JSON object with values by name (`StProgram.put`)."""
@@ -51,7 +53,7 @@ class StProgram(Program):
 
     st_unit: CompiledUnit
     st_declared: CompiledProgram
-    st_inspection: Inspection
+    st_paths: VariablePaths
     st_decisions: DecisionReader
     st_instance: str = ""
     """The program of a configuration whose connections are used, if it has any."""
@@ -178,10 +180,18 @@ class StProgram(Program):
             raise UsageError(f"{name} cannot be forced to that", expected=e.expected, got=repr(value)) from e
 
     def internal_names(self) -> Iterator[str]:
-        return self.st_inspection.names(self.st_body)
+        return self.st_paths.internal_names(self.st_body, self.st_resource.globals)
 
     def internal(self, path: str) -> InternalVariable | None:
-        return self.st_inspection.find(self.st_body, path)
+        return self.st_paths.internal(path, self.st_body, self.st_resource.globals)
+
+    def reader(self, path: str) -> VariableReader | None:
+        found = self.st_paths.reading(path)
+        if found is None:
+            return None
+        kind, read = found
+        unit = "ns" if ty.is_kind(kind, "duration") else ""
+        return VariableReader(str(kind), lambda: shown_value(kind, read(self.st_body, self.st_resource.globals)), unit)
 
     # -- online change ----------------------------------------------------------------------------------------------------
 
@@ -341,7 +351,7 @@ def _class_of(
         "st_unit": unit,
         "st_declared": found,
         "st_instance": instance,
-        "st_inspection": Inspection(unit, [(v.name, v.kind) for v in hidden]),
+        "st_paths": VariablePaths(unit, found, hidden),
         "st_decisions": decisions,
         "st_internal": internal,
         "source_path": found.path,

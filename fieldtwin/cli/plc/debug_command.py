@@ -62,8 +62,8 @@ def debug(
     The editor speaks the Debug Adapter Protocol: breakpoints, steps over lines, variables, watches. Without SOURCE, the launch
     request of the editor names it as `program`.
     """
+    from fieldtwin.run.debug.adapter import Adapter
     from fieldtwin.run.debug.messages import Messages
-    from fieldtwin.run.debug.session import Session
 
     def launch(given: dict[str, Any]) -> Debuggee:
         named = source or str(given.get("program", ""))
@@ -72,13 +72,13 @@ def debug(
         return _debuggee(named, dialect, libraries, duration_s, seed, sources)
 
     if port is None:
-        Session(Messages(sys.stdin.buffer, sys.stdout.buffer), launch).serve()
+        Adapter(Messages(sys.stdin.buffer, sys.stdout.buffer), launch).serve()
         return 0
     with socket.create_server(("127.0.0.1", port)) as server:
         stderr.print(f"waiting for an editor on 127.0.0.1:{server.getsockname()[1]}", markup=False)
         connection, _ = server.accept()
     with connection, connection.makefile("rb") as reading, connection.makefile("wb") as writing:
-        Session(Messages(reading, writing), launch).serve()
+        Adapter(Messages(reading, writing), launch).serve()
     return 0
 
 

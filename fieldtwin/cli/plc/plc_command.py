@@ -15,6 +15,7 @@ from fieldtwin.cli.plc.check_command import check
 from fieldtwin.cli.plc.debug_command import debug
 from fieldtwin.cli.plc.diagram_command import diagram
 from fieldtwin.cli.plc.prove_command import prove
+from fieldtwin.cli.plc.trace_command import trace
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
@@ -57,6 +58,7 @@ command.add_command(check)
 command.add_command(debug)
 command.add_command(diagram)
 command.add_command(prove)
+command.add_command(trace)
 
 
 def _emit(value: Any) -> int:

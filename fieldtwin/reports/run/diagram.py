@@ -8,7 +8,7 @@ their own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.tags import show_value
@@ -43,7 +43,12 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
     unseen = [n for n in window.check.names if "." in n and n not in window.tags and n not in window.states]
     never = el("text", "never published", cls="sub", x=LEFT + 5, y=15.0)
     lanes += [Lane(22.0, [*label(n), never], ()) for n in unseen]
-    times = _times(window)
+    return stacked(axis, lanes, title, lambda height: _failure(axis, window, height))
+
+
+def stacked(axis: TimeAxis, lanes: Sequence[Lane], title: str, over: Callable[[float], list[Markup]]) -> Markup:
+    """Return a drawing of lanes below each other under one time axis. `over` gets its height and returns the marks over it."""
+    times = _times(axis)
     top, parts = 30.0, []
     for number, lane in enumerate(lanes):
         stripe = el("rect", cls=f"stripe{number % 2}", x=0.0, y=0.0, width=WIDTH, height=lane.height)
@@ -56,7 +61,7 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
         el("title", title),
         parts,
         _ticks(axis, times),
-        _failure(axis, window, height),
+        over(height),
         cls="timing", viewBox=f"0 0 {WIDTH:.0f} {height:.0f}", role="img", xmlns="http://www.w3.org/2000/svg",
     )  # fmt: skip
 
@@ -227,14 +232,16 @@ def _tooltip(exchange: DecodedExchange) -> str:
 # -- axis and failure -----------------------------------------------------------------------------------------------
 
 
-def _times(window: Window) -> dict[int, str]:
-    """Return the round times of the window, each with its text, about eight."""
-    wanted = window.span_ns / 8
+def _times(axis: TimeAxis) -> dict[int, str]:
+    """Return the round times of the axis, each with its text, about eight."""
+    wanted = axis.span_ns / 8
     magnitude = 10 ** math.floor(math.log10(wanted))
     step = int(next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= wanted))
-    first = -(-window.start_ns // step) * step
+    first = -(-axis.start_ns // step) * step
     digits = max(0, 9 - int(math.log10(step) + 1e-9))
-    return {t_ns: f"{t_ns / NS_PER_S:.{digits}f} s" for t_ns in range(first, window.end_ns + 1, max(1, step))}
+    return {
+        t_ns: f"{t_ns / NS_PER_S:.{digits}f} s" for t_ns in range(first, axis.start_ns + axis.span_ns + 1, max(1, step))
+    }
 
 
 def _grid(axis: TimeAxis, times: Iterable[int], lane: Lane) -> list[Markup]:

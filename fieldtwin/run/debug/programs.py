@@ -10,6 +10,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.dialects import Dialect
 from fieldtwin.plc.st.unit_tests.suite import load_suite
+from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 Output = Callable[[str], None]
@@ -49,9 +50,18 @@ def unit_tests(path: Path, dialect: Dialect, libraries: tuple[Path, ...]) -> Deb
     return Debuggee([suite.unit], run, {test.program: test.name for test in suite.tests})
 
 
+class _EachScan(VirtualRun):
+    """A run in virtual time that executes every scan, so that none passes by a breakpoint."""
+
+    def attach(self, running: VirtualSystems) -> None:
+        super().attach(running)
+        for system in running.systems.values():
+            system.run.plc.execute_every_scan()
+
+
 def virtual_run(options: VirtualOptions, units: list[CompiledUnit]) -> Debuggee:
     """Return the programs of a system, which runs in virtual time with its emulated devices. Raises `FileInvalid`."""
-    made = VirtualRun(options)
+    made = _EachScan(options)
 
     def run(say: Output) -> bool:
         made.run(lambda elapsed_s: say(f"{elapsed_s:g} s of {options.duration_s:g} s"))

@@ -130,7 +130,7 @@ class _Result:
 
 
 def _packed(unit: CompiledUnit) -> _Packed:
-    rest = replace(unit, code=(), programs=(), blocks={}, globals={}, source=SourceUnit(), python=unit.python)
+    rest = replace(unit, code=(), programs=(), blocks={}, globals={}, source=SourceUnit(), environment=None)
     programs = [replace(program, variables=()) for program in unit.programs]
     variables = [(at, v) for at, program in enumerate(unit.programs) for v in program.variables]
     return _Packed(

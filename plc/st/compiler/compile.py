@@ -73,6 +73,8 @@ class CompiledUnit:
     global_symbols: tuple[Symbol, ...] = ()
     places: tuple[t.Pos, ...] = ()
     """The position in the source of each line of `python`."""
+    environment: Environment | None = field(default=None, compare=False, repr=False)
+    """The declarations, for expressions that are compiled later; None if the unit was compiled in a different process."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -165,6 +167,7 @@ class _Unit:
             {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
             tuple(dict.fromkeys(self.env.globals.values())),
             tuple(lines.places()),
+            self.env,
         )
 
     def _names(self) -> Iterator[tuple[str, str]]:

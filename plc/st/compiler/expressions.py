@@ -177,7 +177,8 @@ class Expressions:
                 name = selector.name.lower()
                 members = kind.fields if isinstance(kind, ty.Struct) else {}
                 if isinstance(kind, ty.Block):
-                    members = {**kind.inputs, **kind.outputs, **kind.publics}
+                    inner = self.env.inner.get(kind.name.lower(), {})
+                    members = {**inner, **kind.inputs, **kind.outputs, **kind.publics}
                 kind = members[name][1] if name in members else property_type(self, kind, name)
         return self._followed(kind, ref.pos)
 

@@ -3,7 +3,7 @@ writes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
@@ -214,6 +214,8 @@ class Environment:
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
     missing: dict[str, Missing] = field(default_factory=dict)
     """The declarations that were not imported, because a part of them is not supported."""
+    inner: Mapping[str, Mapping[str, tuple[str, ty.Type]]] = field(default_factory=dict)
+    """By block in lower case: variables that only the expressions of a debugger may select from outside of the block."""
     symbols: dict[str, dict[str, Symbol]] = field(default_factory=dict)
     """By POU: its variables; by method with its POU before it: all variables that it sees."""
     recorded: dict[int, tuple[ty.Type, ...]] = field(default_factory=dict)

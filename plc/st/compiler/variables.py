@@ -146,7 +146,8 @@ def _member(x: Compiling, value: Value, ref: t.Ref, member: t.Member) -> Value:
         code = f"{value.code}.m_{name}"
         return Value(code, kind.fields[name][1], None, True, value.writable, reference, value.is_input)
     if isinstance(kind, ty.Block):
-        for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.publics, True)):
+        inner = x.env.inner.get(kind.name.lower(), {})
+        for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.publics, True), (inner, False)):
             if name in members:
                 attribute = members[name][0] if kind.standard else f"v_{name}"
                 reference = f"_v.MemberReference({value.code}, {attribute!r})"

@@ -6,11 +6,10 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from debug_editor import Open, ProcessEditor
 
 SOURCE = """TYPE States : (IDLE, RUN); END_TYPE
 FUNCTION Twice : INT
@@ -41,85 +40,6 @@ END_TEST
 """
 
 
-class Editor:
-    """A client of the protocol."""
-
-    def __init__(self, *arguments: str) -> None:
-        command = [sys.executable, "-m", "fieldtwin", "plc", "debug", *arguments]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        self.sequence = 0
-        self.events: list[dict[str, Any]] = []
-
-    def read(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        length = 0
-        while line := self.process.stdout.readline().strip():
-            name, _, value = line.partition(b":")
-            if name.lower() == b"content-length":
-                length = int(value)
-        assert length, self.process.stderr.read().decode() if self.process.stderr else ""
-        found: dict[str, Any] = json.loads(self.process.stdout.read(length))
-        return found
-
-    def send(self, data: bytes) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(b"Content-Length: %d\r\n\r\n" % len(data) + data)
-        self.process.stdin.flush()
-
-    def request(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Return the response. Events that come before it are kept."""
-        self.sequence += 1
-        self.send(
-            json.dumps({"seq": self.sequence, "type": "request", "command": command, "arguments": arguments}).encode()
-        )
-        while (message := self.read())["type"] == "event":
-            self.events.append(message)
-        assert (message["request_seq"], message["command"]) == (self.sequence, command)
-        return message
-
-    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Return the body of a response to a request that succeeds."""
-        answer = self.request(command, **arguments)
-        assert answer["success"], answer
-        body: dict[str, Any] = answer.get("body", {})
-        return body
-
-    def wait(self, event: str) -> dict[str, Any]:
-        """Return the body of the next event of this kind; those before it are dropped."""
-        while True:
-            message = self.events.pop(0) if self.events else self.read()
-            assert message["type"] == "event"
-            if message["event"] == event:
-                return message.get("body", {})
-
-    def begin(self, lines: dict[Path, list[int]], **launch: Any) -> None:
-        self.ask("initialize", adapterID="fieldtwin")
-        self.ask("launch", **launch)
-        self.wait("initialized")
-        for path, wanted in lines.items():
-            self.ask("setBreakpoints", source={"path": str(path)}, breakpoints=[{"line": line} for line in wanted])
-        self.ask("setExceptionBreakpoints", filters=["errors"])
-        self.ask("configurationDone")
-
-    def place(self) -> tuple[str, int]:
-        frame = self.ask("stackTrace", threadId=1)["stackFrames"][0]
-        return frame["name"], frame["line"]
-
-    def value(self, path: str) -> str:
-        return str(self.ask("evaluate", expression=path, frameId=1)["result"])
-
-    def ends(self) -> int:
-        self.ask("disconnect")
-        return self.process.wait(20)
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
-
-
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     (tmp_path / "counter.st").write_text(SOURCE)
@@ -127,28 +47,12 @@ def project(tmp_path: Path) -> Path:
     return tmp_path
 
 
-Open = Callable[..., Editor]
-
-
 @pytest.fixture
-def opened() -> Iterator[Open]:
-    made: list[Editor] = []
-
-    def one(*arguments: str) -> Editor:
-        made.append(Editor(*arguments))
-        return made[-1]
-
-    yield one
-    for each in made:
-        each.close()
-
-
-@pytest.fixture
-def editor(opened: Open, project: Path) -> Editor:
+def editor(opened: Open, project: Path) -> ProcessEditor:
     return opened(str(project / "counter.test.st"))
 
 
-def test_a_breakpoint_stops_with_the_call_stack_and_the_variables(editor: Editor, project: Path) -> None:
+def test_a_breakpoint_stops_with_the_call_stack_and_the_variables(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.st": [4]})
     stopped = editor.wait("stopped")
     assert (stopped["reason"], stopped["description"]) == ("breakpoint", "at 0.000 s")
@@ -164,7 +68,7 @@ def test_a_breakpoint_stops_with_the_call_stack_and_the_variables(editor: Editor
     assert editor.ends() == 0
 
 
-def test_members_elements_and_global_variables_are_listed(editor: Editor, project: Path) -> None:
+def test_members_elements_and_global_variables_are_listed(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.test.st": [7]})
     editor.wait("stopped")
     scopes = editor.ask("scopes", frameId=1)["scopes"]
@@ -183,11 +87,11 @@ def test_members_elements_and_global_variables_are_listed(editor: Editor, projec
     assert [editor.value(path) for path in ("c.last[2]", "C.TIMER.et", "limit")] == ["4", "T#1s500ms", "7"]
     wrong = editor.request("evaluate", expression="c.nothing", frameId=1)
     assert not wrong["success"]
-    assert "no variable 'c.nothing' here" in wrong["message"]
+    assert wrong["message"].startswith("c.nothing: in Counter, a member 'nothing' is not declared")
     assert editor.ends() == 0
 
 
-def test_steps_go_over_into_and_out_of_calls(editor: Editor, project: Path) -> None:
+def test_steps_go_over_into_and_out_of_calls(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.st": [12]})
     editor.wait("stopped")
     seen = [editor.place()]
@@ -201,7 +105,7 @@ def test_steps_go_over_into_and_out_of_calls(editor: Editor, project: Path) -> N
     assert editor.ends() == 0
 
 
-def test_a_step_over_a_call_executes_the_whole_line(editor: Editor, project: Path) -> None:
+def test_a_step_over_a_call_executes_the_whole_line(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.test.st": [4]})  # a call with an argument: several instructions in one line
     editor.wait("stopped")
     seen = []
@@ -213,7 +117,9 @@ def test_a_step_over_a_call_executes_the_whole_line(editor: Editor, project: Pat
     assert editor.ends() == 0
 
 
-def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(editor: Editor, project: Path) -> None:
+def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(
+    editor: ProcessEditor, project: Path
+) -> None:
     editor.ask("initialize")
     editor.ask("launch")
     source = {"path": str(project / "counter.st")}
@@ -231,7 +137,7 @@ def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(ed
     assert editor.ends() == 0
 
 
-def test_the_result_of_the_tests_is_shown(editor: Editor) -> None:
+def test_the_result_of_the_tests_is_shown(editor: ProcessEditor) -> None:
     editor.begin({})
     assert editor.wait("output")["output"] == "passed  counts  1.5 s\n"
     assert editor.wait("exited") == {"exitCode": 0}
@@ -289,7 +195,7 @@ def test_an_endless_program_is_paused_and_ended(project: Path, opened: Open) -> 
     assert editor.ends() == 0
 
 
-def test_requests_at_the_wrong_time_and_bad_messages_are_answered(editor: Editor) -> None:
+def test_requests_at_the_wrong_time_and_bad_messages_are_answered(editor: ProcessEditor) -> None:
     assert "not supported: fly" in editor.request("fly")["message"]
     assert "the program is not stopped" in editor.request("continue")["message"]
     assert "the arguments of setBreakpoints" in editor.request("setBreakpoints")["message"]
@@ -304,10 +210,14 @@ def test_the_programs_of_a_system_stop_in_virtual_time(opened: Open) -> None:
     editor = opened("lab_vehicle", "--for", "5s")
     program = Path(__file__).parents[3] / "profiles" / "systems" / "vehicle.st"
     editor.begin({program: [45]})
-    assert editor.wait("stopped")["reason"] == "breakpoint"
+    stopped = editor.wait("stopped")
+    assert stopped["reason"] == "breakpoint"
     assert editor.place() == ("Vehicle", 45)
     assert editor.value("driving") == "FALSE"
-    editor.ask("setBreakpoints", source={"path": str(program)}, breakpoints=[])
+    # nothing changes, but no scan passes by the breakpoint
+    editor.breakpoints(program, {"line": 45, "hitCondition": "40"})
+    assert (stopped["description"], editor.goes_on()["description"]) == ("at 1000.230 s", "at 1001.030 s")  # 40 x 20 ms
+    editor.breakpoints(program)
     editor.ask("continue", threadId=1)
     assert editor.wait("exited") == {"exitCode": 0}
     assert editor.ends() == 0

@@ -1,0 +1,81 @@
+"""The debug adapter: a process that an editor starts, or that waits for one, and the program that the editor debugs with it.
+
+A launched program runs in a thread of this process, and a stop lets it wait. So this thread may then read its variables.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from queue import SimpleQueue
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.plc.debug.session import Session
+from fieldtwin.plc.debug.tracer import Resume, Tracer
+from fieldtwin.run.debug.messages import Messages
+from fieldtwin.run.debug.programs import Debuggee
+
+ENDING_S = 5.0
+"""How long the end of a session waits for its program, in seconds."""
+Launch = Callable[[dict[str, Any]], Debuggee]
+"""Reads and compiles the program for the arguments of a launch request. Raises `FieldtwinError`."""
+
+
+class Adapter(Session):
+    """The session with one editor. `serve` returns when the editor has ended it."""
+
+    def __init__(self, messages: Messages, launch: Launch) -> None:
+        self._commands: SimpleQueue[Resume] = SimpleQueue()
+        super().__init__(messages.send, Tracer(self.stopped, self.logged, self._commands.get), self._commands.put)
+        self._messages, self._launch = messages, launch
+        self._debuggee = Debuggee([], lambda say: True)
+        self._thread: threading.Thread | None = None
+        self._ended = False
+
+    def serve(self) -> None:
+        """Answer requests until the editor disconnects."""
+        while not self._ended and (request := self._messages.receive()) is not None:
+            self.answer(request)
+        self._end_program()
+        if self._thread is not None:
+            self._thread.join(ENDING_S)
+
+    def _end_program(self) -> None:
+        """End the program, at once if it is stopped, else at its next line."""
+        self.tracer.ending = True
+        self._commands.put(Resume.CONTINUE)
+
+    def do_launch(self, given: dict[str, Any]) -> None:
+        if self._thread is not None:
+            raise UsageError("the program has been launched before")
+        self._debuggee = self._launch(given)
+        self.show(self._debuggee.units, self._debuggee.names)
+        if given.get("stopOnEntry") is True:
+            self.tracer.step_first()
+        if given.get("noDebug") is True:
+            self.tracer.files = frozenset()
+
+    def do_configurationDone(self, given: dict[str, Any]) -> None:
+        self._thread = threading.Thread(target=self._run, name="debugged program", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        well = False
+
+        def work() -> None:
+            nonlocal well
+            try:
+                well = self._debuggee.run(self.output)
+            except FieldtwinError as e:
+                self.output(str(e), "stderr")
+
+        self.tracer.run(work)
+        self.send("event", event="exited", body={"exitCode": 0 if well else 1})
+        self.send("event", event="terminated")
+
+    def do_terminate(self, given: dict[str, Any]) -> None:
+        self._end_program()
+
+    def do_disconnect(self, given: dict[str, Any]) -> None:
+        self._ended = True

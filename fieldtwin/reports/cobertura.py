@@ -5,7 +5,6 @@ A file is a class, and its lines are those with a statement or a branch. Transit
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -22,7 +21,7 @@ def write_cobertura(coverage: Coverage, path: Path, written_ms: int) -> None:
 
 
 def render_cobertura(coverage: Coverage, written_ms: int) -> bytes:
-    """Return the content of the file, UTF-8. The names of files are relative to the working directory, if they are in it."""
+    """Return the content of the file, UTF-8."""
     root = ET.Element("coverage", version=f"fieldtwin {__version__}", timestamp=str(written_ms), complexity="0")
     _rates(root, coverage, counts=True)
     ET.SubElement(ET.SubElement(root, "sources"), "source").text = "."
@@ -30,9 +29,8 @@ def render_cobertura(coverage: Coverage, written_ms: int) -> bytes:
     _rates(package, coverage)
     classes = ET.SubElement(package, "classes")
     for path in coverage.paths:
-        name = os.path.relpath(path) if Path(path).resolve().is_relative_to(Path.cwd()) else path
         part = coverage.of(path)
-        element = ET.SubElement(classes, "class", name=clean(Path(path).stem), filename=clean(name), complexity="0")
+        element = ET.SubElement(classes, "class", name=clean(Path(path).stem), filename=clean(path), complexity="0")
         _rates(element, part)
         ET.SubElement(element, "methods")
         _lines(ET.SubElement(element, "lines"), part)

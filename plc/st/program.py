@@ -34,6 +34,7 @@ from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
+from fieldtwin.plc.st.coverage.recording import active_recording
 from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of, reader
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection, shown_value
@@ -406,8 +407,12 @@ def load_source(
     *,
     takes_writes: bool = False,
 ) -> type[StProgram]:
-    """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`."""
-    return program_class(compile_source(path, dialect, libraries), name, takes_writes=takes_writes)
+    """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them, with probes for coverage if a
+    recording is active. Raises `FileInvalid`.
+    """
+    recording = active_recording()
+    compiled = compile_source if recording is None else recording.compiled
+    return program_class(compiled(path, dialect, libraries), name, takes_writes=takes_writes)
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:

@@ -33,7 +33,7 @@ Together = dict[Any, Any]
 class Context:
     """The interface through which compiled code uses the running scan."""
 
-    __slots__ = ("first_scan", "instances", "left", "lookup", "now_ns")
+    __slots__ = ("executed", "first_scan", "instances", "left", "lookup", "now_ns")
 
     def __init__(self) -> None:
         self.left = MAX_STEPS
@@ -43,6 +43,8 @@ class Context:
         self.instances = 0
         """The number of instances that variables of an interface type can refer to."""
         self.lookup: Callable[[str], TagValue] | None = None
+        self.executed: Callable[[Any], None] | None = None
+        """The function that probes for coverage call. Code without probes does not use it."""
 
     @property
     def scan_ns(self) -> int:
@@ -75,6 +77,8 @@ class Resource:
 
     def __init__(self, unit: CompiledUnit, context: Context | None = None) -> None:
         self.context = context or Context()
+        if unit.record is not None:
+            self.context.executed = unit.record
         self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS, **NAMES}
         self._files = unit.files
         with self._initialising():

@@ -104,7 +104,7 @@ def test_junit_and_html_have_the_tests(project: Path) -> None:
     assert failure is not None
     assert failure.get("message") == "1: the limit: ASSERT_EQ(Clamp(11), 9)"
     page = Path("r.html").read_text()
-    assert "Structured Text in unit tests" in page
+    assert "Executed Structured Text" in page
     assert "branches: ELSE of line 3, THEN 2 of line 3" in page
     assert "Errors on the buses" not in page
 
@@ -125,10 +125,9 @@ def test_a_unit_test_has_no_target(project: Path) -> None:
     assert "a unit test runs without a system" in str(done.exception)
 
 
-def test_coverage_needs_unit_tests(project: Path) -> None:
-    Path("idle.scenario.yaml").write_text(
-        "scenario: idle\nsystem: lab_vehicle\nsteps:\n  - wait: {until: \"quality(drive.statusword) == 'good'\", within: 5s}\n"
-    )
-    done = run("idle.scenario.yaml", "--coverage", "c.xml")
+def test_coverage_needs_a_program_in_structured_text(project: Path) -> None:
+    Path("plc/clamp.test.st").write_text("TEST 'a' ASSERT_TRUE(TRUE); END_TEST")
+    Path("plc/clamp.st").unlink()
+    done = run("plc", "--coverage", "c.xml")
     assert isinstance(done.exception, UsageError)
-    assert "--coverage needs unit tests" in str(done.exception)
+    assert "--coverage needs programs in Structured Text" in str(done.exception)

@@ -26,21 +26,13 @@ from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.plain_result import plain_result
+from fieldtwin.cli.test.st_coverage import CoverageOptions, coverage_of, recorded, show_coverage
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
-from fieldtwin.cli.test.unit_tests import (
-    UnitTestOptions,
-    coverage_of,
-    is_unit_test,
-    load_suites,
-    run_suites,
-    show_coverage,
-)
+from fieldtwin.cli.test.unit_tests import UnitTestOptions, is_unit_test, load_suites, run_suites
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stderr, stdout
-from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.source_files import TEST_SUFFIX
 from fieldtwin.scenarios.language.file_name import SUFFIX
 
@@ -88,6 +80,7 @@ class _WithCommand(GroupedCommand):
 @group("Unit tests in Structured Text", units=UnitTestOptions)
 @group("Profiles and templates", sources=TemplateSearchOptions)
 @group("Output", junit=JunitOptions)
+@group("Output", logic=CoverageOptions)
 @group(
     "Output",
     click.option(
@@ -120,6 +113,7 @@ def command(
     units: UnitTestOptions,
     sources: TemplateSearchOptions,
     junit: JunitOptions,
+    logic: CoverageOptions,
     html: str | None,
     trace: str | None,
     traces: Path | None,
@@ -188,6 +182,7 @@ def command(
         at.can,
         controller,
     )
+    recording = logic.recording(target, campaign=bool(campaign.seeds), html=html is not None)
     shown = Progress(Path(progress)) if progress else None
     results: list[ScenarioResult] = []
     seeds: list[ScenarioResult] = []
@@ -208,7 +203,8 @@ def command(
                 if interrupted:
                     break
                 continue
-            result = run_scenario(scenario, where, file, retries, shown)
+            with recorded(recording):
+                result = run_scenario(scenario, where, file, retries, shown)
             result = replace(result, system=scenario.system)
             results.append(waive(result, waived, datetime.now(UTC).date()))
             if not as_json:
@@ -219,7 +215,8 @@ def command(
         results.append(waive(unit_test, waived, datetime.now(UTC).date()))
         if not as_json:
             _show(results[-1])
-    covered = coverage_of(suites)
+    covered = coverage_of(suites, recording)
+    logic.write(covered)
     draws = html is not None and not campaign.seeds
     machines = _machines([one.system for one in scenarios]) if draws else {}
     system = scenarios[0].system if scenarios else None
@@ -236,10 +233,6 @@ def command(
         served=(),
         logic=covered,
     )
-    if covered is not None and units.coverage is not None:
-        from fieldtwin.reports.cobertura import write_cobertura
-
-        write_cobertura(covered, units.coverage, WallClock().utc_ns() // NS_PER_MS)
     if junit.junit is not None:
         from fieldtwin.reports.junit import Flavour, write_junit
 

@@ -9,19 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.markup import escape
-from rich.table import Table
 
 from fieldtwin.cli.option_groups import option
-from fieldtwin.console import stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.source_files import SUFFIXES, is_test_file
 from fieldtwin.plc.st.dialects import DIALECTS, dialect_of
 
 if TYPE_CHECKING:
-    from fieldtwin.plc.st.coverage.places import Coverage
     from fieldtwin.plc.st.unit_tests.run import AssertionResult, TestResult
     from fieldtwin.plc.st.unit_tests.suite import Suite
     from fieldtwin.results.model import CheckResult, ScenarioResult
@@ -32,7 +27,7 @@ TARGET = "unit test"
 
 @dataclass(frozen=True)
 class UnitTestOptions:
-    """The dialect and the libraries of the tested programs, and the file for their coverage, None for none."""
+    """The dialect and the libraries of the tested programs."""
 
     dialect: str = option(
         "--dialect",
@@ -46,11 +41,6 @@ class UnitTestOptions:
         type=click.Path(path_type=Path, exists=True),
         multiple=True,
         help="A file or folder whose declarations unit tests may use, besides the files in their folder. Can be repeated.",
-    )
-    coverage: Path | None = option(
-        "--coverage",
-        type=click.Path(dir_okay=False, path_type=Path),
-        help="Write the coverage of statements and branches by unit tests as Cobertura XML.",
     )
 
     def words(self) -> tuple[str, ...]:
@@ -68,8 +58,6 @@ def load_suites(paths: list[Path], options: UnitTestOptions) -> list[Suite]:
     """Read and compile the files of unit tests. Raises `FileInvalid`."""
     from fieldtwin.plc.st.unit_tests.suite import load_suite
 
-    if options.coverage is not None and not paths:
-        raise UsageError("--coverage needs unit tests in Structured Text", expected="files that end in .test.st")
     return [load_suite(path, dialect_of(options.dialect), options.libraries) for path in paths]
 
 
@@ -82,35 +70,6 @@ def run_suites(suites: list[Suite], options: UnitTestOptions) -> Iterator[Scenar
             now_ns = WallClock().monotonic_ns()
             yield _as_result(result, suite.path, reproduce, round((now_ns - began_ns) / NS_PER_S, 3))
             began_ns = now_ns
-
-
-def coverage_of(suites: list[Suite]) -> Coverage | None:
-    """Return the coverage by all tests; None without tests."""
-    from fieldtwin.plc.st.coverage.places import Coverage
-
-    if not suites:
-        return None
-    found = Coverage()
-    for suite in suites:
-        found.add(suite.coverage())
-    return found
-
-
-def show_coverage(coverage: Coverage) -> None:
-    """Print a line for each file."""
-    from fieldtwin.plc.st.coverage.places import Kind, line_ranges
-
-    table = Table(box=None, pad_edge=False, show_edge=False, header_style="dim")
-    table.add_column("coverage", overflow="fold")
-    for kind in Kind:
-        table.add_column(kind.value, justify="right")
-    table.add_column("lines not executed", overflow="fold")
-    for path in coverage.paths:
-        of = coverage.of(path)
-        counts = [of.count(kind) for kind in Kind]
-        missed = line_ranges(place.line for place in of.missed(Kind.STATEMENT))
-        table.add_row(escape(path), *(f"{done}/{every}" if every else "" for done, every in counts), missed)
-    stdout.print(table)
 
 
 def _as_result(result: TestResult, path: Path, reproduce: str, took_s: float) -> ScenarioResult:

@@ -1,4 +1,4 @@
-"""The coverage of Structured Text by unit tests, as a table of the HTML report."""
+"""The coverage of Structured Text by scenarios and unit tests, as a table of the HTML report."""
 
 from __future__ import annotations
 

@@ -8,9 +8,10 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import CodeType
+from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
@@ -75,6 +76,8 @@ class CompiledUnit:
     """The position in the source of each line of `python`."""
     environment: Environment | None = field(default=None, compare=False, repr=False)
     """The declarations, for expressions that are compiled later; None if the unit was compiled in a different process."""
+    record: Callable[[Any], None] | None = None
+    """The function that the probes of a unit with probes call (`fieldtwin.plc.st.coverage.recording`); None without probes."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from pathlib import Path
 
 
 class Kind(Enum):
@@ -32,14 +33,19 @@ class Place:
 
 @dataclass
 class Coverage:
-    """For each place, whether it was executed. Coverages of several files of tests are added to each other."""
+    """For each place, whether it was executed. Coverages of several tests and scenarios are added to each other.
+
+    The names of files are relative to the working directory if they are in it, and absolute otherwise.
+    """
 
     executed: dict[Place, bool] = field(default_factory=dict)
 
     def add(self, places: Mapping[Place, bool]) -> None:
         """Add places. A place counts as executed if it was executed at least once."""
+        names = {path: _file_name(path) for path in {place.path for place in places}}
         for place, found in places.items():
-            self.executed[place] = found or self.executed.get(place, False)
+            named = replace(place, path=names[place.path])
+            self.executed[named] = found or self.executed.get(named, False)
 
     def of(self, path: str) -> Coverage:
         """Return the coverage of one file."""
@@ -58,6 +64,12 @@ class Coverage:
         """Return the places of a kind that were not executed, in the order of the source."""
         found = (place for place, executed in self.executed.items() if place.kind is kind and not executed)
         return sorted(found, key=lambda place: (place.path, place.line, place.column, place.name, place.pou))
+
+
+def _file_name(path: str) -> str:
+    """Return one name for a file that tests and systems name in different ways."""
+    found = Path(path).resolve()
+    return str(found.relative_to(Path.cwd())) if found.is_relative_to(Path.cwd()) else str(found)
 
 
 def line_ranges(lines: Iterable[int]) -> str:

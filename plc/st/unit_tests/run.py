@@ -6,7 +6,7 @@ block in a test executes it once, as a scan does; time passes with ADVANCE_TIME 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -72,7 +72,7 @@ class _Count:
 class _TestContext(Context):
     """The context of compiled code in a test: its time is that of the test."""
 
-    __slots__ = ("_advances", "counts", "executed", "finished")
+    __slots__ = ("_advances", "counts", "finished")
 
     def __init__(self, recorded: set[Any]) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class _TestContext(Context):
         self.counts: dict[int, _Count] = {}
         self.finished: set[int] = set()
         """The numbers of the cyclic tests that have ended."""
-        self.executed: Callable[[Any], None] = recorded.add
+        self.executed = recorded.add
         self._advances = 0
 
     def asserted(self, number: int, holds: bool, shown: tuple[Any, ...], of_test: int) -> None:

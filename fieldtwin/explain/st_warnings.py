@@ -93,6 +93,25 @@ _MEANINGS = {
         "VAR_OUTPUT of a PROGRAM keeps its initial value, or what the program assigns, unless a CONFIGURATION connects it.",
         "Connect it in a CONFIGURATION, use a variable for each element, or MESSAGES for texts.",
     ),
+    "ST111": (
+        "An input is bound to a tag that can have values which the variable cannot hold, such as an INT to an unsigned register; "
+        "such a value stops the task. Or an output is a subrange that is wider than the limits of its tag; the gateway refuses "
+        "such a value.",
+        "Declare the variable with a type that holds all values of the tag, such as UINT, or correct `range` in the profile.",
+    ),
+    "ST112": (
+        "The system file binds an input of the program to a tag, and no statement of the program uses the input.",
+        "Use the input, or remove it and its binding.",
+    ),
+    "ST113": (
+        "TIME and LTIME are bound as a number of ns. The profile states a different unit for the tag, such as ms, so the time is "
+        "wrong by a factor.",
+        "Bind an integer or REAL variable, and compute the time in the program: `T#1ms * ms`.",
+    ),
+    "ST114": (
+        "The system file allows writes to the tag (`writable`), and neither a program nor a server in the system file writes it.",
+        "Bind an output of a program to it, or remove it from `writable`.",
+    ),
 }
 
 ST_WARNINGS = tuple(

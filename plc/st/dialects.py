@@ -39,6 +39,10 @@ FINDINGS = {
     "ST108": "global variable that programs of several tasks write",
     "ST109": "addresses that overlap in other systems",
     "ST110": "input or output of a PROGRAM that cannot be a tag",
+    "ST111": "tag and variable with different ranges",
+    "ST112": "tag bound to an input that is not used",
+    "ST113": "time bound to a tag in a different unit",
+    "ST114": "writable tag that nothing writes",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

@@ -13,7 +13,6 @@ from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.plc.checking import Checked, checked
 from fieldtwin.cli.plc.sources import (
-    StSource,
     agreed_system,
     dialect_option,
     library_option,
@@ -63,17 +62,17 @@ def check(
 
     A warning marks a construct that only the dialect accepts (ST001 to ST008), or that is often a mistake (from ST101 on);
     `fieldtwin explain ST101` explains it. The comment `// fieldtwin: allow ST101: REASON`, in its line or the line above, accepts
-    it.
+    it. For a system, the bindings of its programs are checked too (ST111 to ST114); in the system file a comment begins with #.
     Parts of a PLCopen XML file that are not supported are listed too; they are errors only where a program uses them.
 
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
     """
     file = source_file(source, dialect, libraries)
-    programs = {file: {}} if file is not None else _programs_of(source, sources)
-    found = checked(programs, chosen_ids(as_errors))
+    ids = chosen_ids(as_errors)
+    found = checked({file: {}}, ids) if file is not None else _checked_system(source, sources, ids)
     if as_json:
-        click.echo(json.dumps(_as_json(found), indent=2))
+        click.echo(json.dumps(found.as_data(), indent=2))
         return 1 if found.errors else 0
     for error in found.errors:
         stdout.print(str(error), soft_wrap=True, markup=False)
@@ -86,14 +85,15 @@ def check(
     return 1 if found.errors else 0
 
 
-def _programs_of(system: str, sources: TemplateSearchOptions) -> dict[StSource, dict[str, str]]:
-    """Return the sources in Structured Text of a system, with the tasks of its programs. Raises `UsageError` if it has none."""
-    found = st_tasks(agreed_system(system, sources))
-    if not found:
+def _checked_system(name: str, sources: TemplateSearchOptions, as_errors: frozenset[str]) -> Checked:
+    """Check the programs of a system in Structured Text, and their bindings. Raises `UsageError` if it has none."""
+    system = agreed_system(name, sources)
+    programs = st_tasks(system)
+    if not programs:
         raise UsageError(
-            f"{system} has no program in Structured Text", hint="Python programs are checked by mypy or ruff"
+            f"{name} has no program in Structured Text", hint="Python programs are checked by mypy or ruff"
         )
-    return found
+    return checked(programs, as_errors, (system,))
 
 
 def _summary(found: Checked) -> str:
@@ -111,18 +111,3 @@ def _summary(found: Checked) -> str:
 def _counted(count: int, what: str) -> str:
     plural = "es" if what.endswith("s") else "s"
     return f"{count} {what}{'' if count == 1 else plural}"
-
-
-def _as_json(found: Checked) -> dict[str, object]:
-    return {
-        "kind": "fieldtwin plc check",
-        "version": 1,
-        "files": sorted({file for unit in found.units for file in unit.files}),
-        "not_imported": [
-            {"kind": m.kind, "name": m.name, "reason": m.reason, "path": m.pos.path, "line": m.pos.line}
-            for m in found.missing()
-        ],
-        "errors": [error.as_data() for error in found.errors],
-        "warnings": [warning.as_data() for warning in found.warnings],
-        "waived": [{**warning.as_data(), "reason": waiver.reason} for warning, waiver in found.waived],
-    }

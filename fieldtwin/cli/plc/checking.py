@@ -31,12 +31,43 @@ class Checked:
         """Return the declarations that were not imported and that no program uses."""
         return [each for unit in self.units for each in unit.missing]
 
+    def add(self, warnings: list[StWarning], waivers: list[Waiver], as_errors: frozenset[str]) -> None:
+        """Add warnings of files whose waivers are `waivers`. Those in `as_errors` (ids) are errors."""
+        from fieldtwin.plc.st.findings.waivers import without_waived
 
-def checked(programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset[str]) -> Checked:
-    """Check each source, with the tasks of its programs (`st_tasks`). The warnings `as_errors` (ids) become errors."""
+        left, waived = without_waived(warnings, waivers)
+        left.sort(key=lambda one: (one.path, one.line, one.column, one.id))
+        self.waived.extend(waived)
+        self.errors.extend(warning.as_error() for warning in left if warning.id in as_errors)
+        self.warnings.extend(warning for warning in left if warning.id not in as_errors)
+
+    def as_data(self) -> dict[str, object]:
+        """Return data for JSON."""
+        return {
+            "kind": "fieldtwin plc check",
+            "version": 1,
+            "files": sorted({file for unit in self.units for file in unit.files}),
+            "not_imported": [
+                {"kind": m.kind, "name": m.name, "reason": m.reason, "path": m.pos.path, "line": m.pos.line}
+                for m in self.missing()
+            ],
+            "errors": [error.as_data() for error in self.errors],
+            "warnings": [warning.as_data() for warning in self.warnings],
+            "waived": [{**warning.as_data(), "reason": waiver.reason} for warning, waiver in self.waived],
+        }
+
+
+def checked(
+    programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset[str], systems: Iterable[System] = ()
+) -> Checked:
+    """Check each source, with the tasks of its programs (`st_tasks`), and the bindings of the programs of `systems`.
+
+    The warnings `as_errors` (ids) become errors.
+    """
+    from fieldtwin.cli.plc.bindings import findings_about_bindings
     from fieldtwin.plc.st.findings.find import findings
     from fieldtwin.plc.st.findings.tasks import written_by_several_tasks
-    from fieldtwin.plc.st.findings.waivers import waivers_of, without_waived
+    from fieldtwin.plc.st.findings.waivers import waivers_in_yaml, waivers_of
     from fieldtwin.plc.st.project import compile_source
 
     found = Checked([], [], [], [])
@@ -52,15 +83,17 @@ def checked(programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset
             one for one in (*findings(unit.source), *written_by_several_tasks(unit.source, tasks)) if one.path in own
         ]
         waivers = [waiver for file in sorted(own) for waiver in waivers_of(file)]
-        warnings, waived = without_waived((*unit.warnings, *about), waivers)
-        warnings.sort(key=lambda one: (one.path, one.line, one.column, one.id))
-        found.waived.extend(waived)
-        found.errors.extend(warning.as_error() for warning in warnings if warning.id in as_errors)
-        found.warnings.extend(warning for warning in warnings if warning.id not in as_errors)
+        found.add([*unit.warnings, *about], waivers, as_errors)
+    for system in systems:
+        found.add(list(findings_about_bindings(system)), waivers_in_yaml(system.file.path), as_errors)
     return found
 
 
-def warnings_of(systems: Iterable[System]) -> list[str]:
-    """Return the warnings and findings about the programs of systems, each once, without their errors."""
-    found = [warning for system in systems for warning in checked(st_tasks(system), frozenset()).warnings]
-    return list(dict.fromkeys(map(str, found)))
+def checked_systems(systems: Iterable[System], as_errors: frozenset[str]) -> Checked:
+    """Check the programs of systems and their bindings, each source and each system file once."""
+    by_file = {system.file.path: system for system in systems}
+    programs: dict[StSource, dict[str, str]] = {}
+    for system in by_file.values():
+        for source, tasks in st_tasks(system).items():
+            programs.setdefault(source, {}).update(tasks)
+    return checked(programs, as_errors, by_file.values())

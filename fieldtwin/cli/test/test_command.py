@@ -25,6 +25,8 @@ from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import TemplateSearchOptions
+from fieldtwin.cli.test.findings import TARGET as CHECK_OF_PROGRAMS
+from fieldtwin.cli.test.findings import FindingOptions
 from fieldtwin.cli.test.plain_result import plain_result
 from fieldtwin.cli.test.st_coverage import CoverageOptions, coverage_of, recorded, show_coverage
 from fieldtwin.cli.test.target_options import TargetOptions
@@ -78,6 +80,7 @@ class _WithCommand(GroupedCommand):
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
 @group("Unit tests in Structured Text", units=UnitTestOptions)
+@group("Findings about programs", about=FindingOptions)
 @group("Profiles and templates", sources=TemplateSearchOptions)
 @group("Output", junit=JunitOptions)
 @group("Output", logic=CoverageOptions)
@@ -111,6 +114,7 @@ def command(
     waivers: str | None,
     campaign: CampaignOptions,
     units: UnitTestOptions,
+    about: FindingOptions,
     sources: TemplateSearchOptions,
     junit: JunitOptions,
     logic: CoverageOptions,
@@ -138,7 +142,6 @@ def command(
                       a campaign: rules that must always hold are checked under
                       random faults
     """
-    from fieldtwin.cli.plc.checking import warnings_of
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
     from fieldtwin.results.model import Report, key_of
     from fieldtwin.run.targets.progress import Progress
@@ -166,8 +169,9 @@ def command(
     scenarios = [load_scenario(path, folders) for path in paths]
     suites = load_suites(unit_tests, units)
     show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
-    show_warnings(warnings_of(one.system for one in scenarios))
+    findings = about.check(one.system for one in scenarios)
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
+    known += [one.name for one in findings]
     known += [test.name for suite in suites for test in suite.tests]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
     where = ScenarioTarget(
@@ -184,7 +188,9 @@ def command(
     )
     recording = logic.recording(target, campaign=bool(campaign.seeds), html=html is not None)
     shown = Progress(Path(progress)) if progress else None
-    results: list[ScenarioResult] = []
+    results = [waive(one, waived, datetime.now(UTC).date()) for one in findings]
+    for one in () if as_json else results:
+        _show(one)
     seeds: list[ScenarioResult] = []
     campaigns: list[CampaignResult] = []
     interrupted = False
@@ -370,9 +376,12 @@ def _show(result: object) -> None:
     for check in result.checks:
         if check.verdict is not Verdict.PASSED:
             if check.number not in result.reason.partition(":")[0].split():  # not repeated from the headline
-                table.add_row(f"  {check.number}", escape(check.text))
+                waived = f" ({check.reason})" if result.target == CHECK_OF_PROGRAMS and check.reason else ""
+                table.add_row(f"  {check.number}", escape(check.text + waived))
             if check.expected:
                 table.add_row("  expected", escape(check.expected))
+            if result.target == CHECK_OF_PROGRAMS:
+                continue
             table.add_row("  got", escape(check.got))
             table.add_row("  at", f"{(check.t_ns or 0) / 1e9:.3f} s, {escape(check.where)}")
     if table.row_count:

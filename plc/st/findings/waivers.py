@@ -2,7 +2,7 @@
 
     after(IN := run); // fieldtwin: allow ST105: the timer is reset by hand
 
-A waiver counts for its own line and for the line below it.
+In a system file, the comment begins with #. A waiver counts for its own line and for the line below it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from fieldtwin.plc.st.dialects import FINDINGS, WARNINGS, StWarning
 
 _TOKEN = re.compile(r"""'(?:\$.|[^'$\n])*'|"(?:\$.|[^"$\n])*"|(?P<comment>//[^\n]*|\(\*.*?\*\)|/\*.*?\*/)""", re.DOTALL)
 """Strings, in which a waiver is only text, and comments."""
+_YAML_TOKEN = re.compile(r"""'[^'\n]*'|"(?:\\.|[^"\\\n])*"|(?:^|(?<=\s))(?P<comment>#[^\n]*)""", re.MULTILINE)
+"""The same for a file in YAML, where a comment begins with # after a space."""
 _WAIVER = re.compile(
     r"\bfieldtwin:[ \t]*allow[ \t]+(\w+)[ \t]*(?::[ \t]*([^\n]*?))?[ \t]*(?:\*\)|\*/|$)", re.IGNORECASE | re.MULTILINE
 )
@@ -36,10 +38,19 @@ class Waiver:
 
 def waivers_of(path: str) -> list[Waiver]:
     """Return the waivers in the text of a file that was compiled before."""
+    return _waivers(path, _TOKEN)
+
+
+def waivers_in_yaml(path: str) -> list[Waiver]:
+    """Return the waivers in the text of a system file that was read before."""
+    return _waivers(path, _YAML_TOKEN)
+
+
+def _waivers(path: str, tokens: re.Pattern[str]) -> list[Waiver]:
     text = Path(path).read_text("utf-8-sig", errors="replace")
     return [
         Waiver(found[1].upper(), found[2] or "", path, 1 + text.count("\n", 0, token.start() + found.start()))
-        for token in _TOKEN.finditer(text)
+        for token in tokens.finditer(text)
         if token["comment"]
         for found in _WAIVER.finditer(token[0])
     ]

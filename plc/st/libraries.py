@@ -28,11 +28,10 @@ class Library:
     """The files, for their warnings and for what was not imported from them."""
 
     def add(self, unit: t.SourceUnit) -> None:
-        """Add the declarations of a file; PROGRAMs are left out."""
+        """Add the declarations of a file."""
         self.units.append(unit)
         for pou in unit.pous:
-            if pou.kind != "PROGRAM":
-                self._name(pou.name, pou)
+            self._name(pou.name, pou)
         for declared in unit.types:
             self._name(declared.name, declared)
             for value, _ in declared.values if isinstance(declared, t.EnumDecl) else ():

@@ -47,7 +47,7 @@ class Calls(Expressions):
             return self._user_function(call, signature)
         if not call.ref.selectors:
             self.env.refuse_missing(name, call.pos)
-        own = self.symbols.get(name)
+        own = self.symbols.get(name) or self.env.globals.get(name)
         if not call.ref.selectors and (own is None or not isinstance(own.type, ty.Block)):
             standard = FUNCTIONS.find(name.upper())
             if standard is not None:
@@ -55,6 +55,9 @@ class Calls(Expressions):
             if name.upper() in _OF_ADDRESSES:
                 message = "addresses as numbers and memory of a controller are not supported"
                 self.env.fail(call.pos, message, got=call.ref.name)
+            if name in self.env.classes and self.env.classes[name].kind == "PROGRAM":
+                hint = "declare a FUNCTION_BLOCK; the dialects codesys and twincat call programs"
+                self.env.fail(call.pos, f"{call.ref.name} is a PROGRAM and cannot be called", hint=hint)
             known = (
                 [s.name for s in self.env.functions.values()]
                 + FUNCTIONS.names()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from fieldtwin.plc.st.compiler.configurations.called import AS_BLOCK
 from fieldtwin.plc.st.compiler.configurations.located import KINDS
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import area_of
@@ -62,7 +63,8 @@ def _block(program: t.Pou) -> t.Pou:
             t.VarBlock(program.pos, "VAR_INPUT", frozenset(), tuple(_quality(inputs[name]) for name in asked))
         )
     changed: t.Pou = _reading(program, set(asked))
-    return replace(changed, kind="FUNCTION_BLOCK", blocks=tuple(blocks))
+    modifiers = changed.modifiers | {AS_BLOCK}
+    return replace(changed, kind="FUNCTION_BLOCK", blocks=tuple(blocks), modifiers=modifiers)
 
 
 def _unlocated(block: t.VarBlock) -> list[t.VarBlock]:

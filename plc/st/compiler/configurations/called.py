@@ -1,7 +1,7 @@
 """Calls of programs, an addition of CODESYS and TwinCAT to the standard: ``Pumps();`` executes the PROGRAM Pumps.
 
 There, a PROGRAM is the only instance of itself, and every POU can call it and read its variables. So a program that others call
-becomes a function block with one global instance of the same name. It is no program of the system any more: it runs when it is
+becomes a function block with one global instance of the same name. The system cannot run it as a program any more: it runs when it is
 called.
 """
 
@@ -58,7 +58,7 @@ def _uses(pou: t.Pou, outer: frozenset[str]) -> Iterator[tuple[t.Ref, bool]]:
     `outer` are the names that the owner of a method declares.
     """
     own = outer | {v.name.lower() for block in pou.blocks for v in block.variables}
-    own |= {each.name.lower() for each in (*pou.methods, *pou.actions)}
+    own |= {method.name.lower() for method in pou.methods} | {action.name.lower() for action in pou.actions}
     parts = tuple(nodes((pou.body, pou.actions, pou.chart, tuple(v.initial for b in pou.blocks for v in b.variables))))
     calls = {id(node.ref) for node in parts if isinstance(node, t.Call)}
     for node in parts:

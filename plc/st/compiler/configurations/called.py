@@ -1,8 +1,7 @@
 """Calls of programs, an addition of CODESYS and TwinCAT to the standard: ``Pumps();`` executes the PROGRAM Pumps.
 
 There, a PROGRAM is the only instance of itself, and every POU can call it and read its variables. So a program that others call
-becomes a function block with one global instance of the same name. The system cannot run it as a program any more: it runs when it is
-called.
+becomes a function block with one global instance of the same name. The system cannot run it as a program any more.
 """
 
 from __future__ import annotations

@@ -129,30 +129,31 @@ def test_a_short_state_gets_more_faults_than_at_random_times(plant: str) -> None
 
 
 def test_a_kind_without_an_effect_is_replaced(plant: str) -> None:
-    """A repeated or divided reply makes no tag bad, and a silence does."""
-    wanted = replace(GUIDED, mean_s=20.0, kinds=("duplicate", "silence", "split"))
+    """Of these kinds only a silence makes a tag bad. At random times it would be a sixth of the faults."""
+    wanted = replace(GUIDED, mean_s=20.0, kinds=("coalesce", "duplicate", "pause", "reorder", "silence", "split"))
     names = [
         fault["name"]
-        for seed in range(4)
+        for seed in range(6)
         for fault in made(VirtualOptions(plant, LENGTH_S, seed=seed, random_faults=wanted))[0].faults
     ]
-    assert names.count("silence") > 0.45 * len(names)
+    assert names.count("silence") > 0.28 * len(names)
 
 
 def invoke(*words: str) -> Result:
     return CliRunner().invoke(cli, words, standalone_mode=False)
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.long
+@pytest.mark.timeout(300)
 def test_shards_and_any_number_of_processes_give_the_same_runs(plant: str) -> None:
-    words = ("simulate", plant, "--for", "5min", "--faults", "guided", "--fault-every", "20s", "--seeds", "1..4")
-    assert invoke(*words, "--ledger", "all.jsonl").return_value == 0
+    words = ("simulate", plant, "--for", "5min", "--faults", "guided", "--fault-every", "20s", "--seeds", "1..2")
+    assert invoke(*words, "--jobs", "2", "--ledger", "all.jsonl").return_value == 0
     for part in ("1/2", "2/2"):
-        assert invoke(*words, "--shard", part, "--jobs", "2", "--ledger", f"shard-{part[0]}.jsonl").return_value == 0
+        assert invoke(*words, "--shard", part, "--ledger", f"shard-{part[0]}.jsonl").return_value == 0
     joined = ("campaign", "merge", "shard-2.jsonl", "all.jsonl", "shard-1.jsonl", "-o", "joined.jsonl", "--json")
     [campaign] = json.loads(invoke(*joined).output)
-    assert (campaign["runs"], campaign["different"]) == (4, [])
-    assert len({entry.sha256 for entry in Ledger(Path("joined.jsonl")).entries}) == 4
+    assert (campaign["runs"], campaign["different"]) == (2, [])
+    assert len({entry.sha256 for entry in Ledger(Path("joined.jsonl")).entries}) == 2
 
 
 def test_random_and_guided_faults_are_different_campaigns(plant: str) -> None:
@@ -162,7 +163,8 @@ def test_random_and_guided_faults_are_different_campaigns(plant: str) -> None:
     assert what(GUIDED) != what(replace(GUIDED, guided=False))
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.long
+@pytest.mark.timeout(300)
 def test_a_failure_by_guided_faults_is_shrunk_to_a_scenario_that_is_confirmed(plant: str) -> None:
     done = invoke(
         *("test", "change.scenario.yaml", "--seeds", "1..2", "--faults", "guided", "--fault-every", "20s"),

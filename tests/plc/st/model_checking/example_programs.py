@@ -183,6 +183,37 @@ VAR_TEMP word : STRING; END_VAR
   was := on;
 END_PROGRAM
 """
+CODESYS = """
+FUNCTION Doubled : INT VAR_INPUT n : INT; END_VAR Doubled := 2 * n; END_FUNCTION
+FUNCTION_BLOCK Meter
+VAR n, limit : INT; END_VAR
+METHOD FB_init : BOOL
+VAR_INPUT bInitRetains : BOOL; bInCopyCode : BOOL; start : INT; END_VAR
+  limit := start;
+END_METHOD
+METHOD Add : REFERENCE TO Meter
+VAR_INPUT by : INT; END_VAR
+  n := n + by;
+  Add REF= THIS^;
+END_METHOD
+METHOD Full : BOOL Full := n > limit; END_METHOD
+END_FUNCTION_BLOCK
+TYPE Point : STRUCT x, y : INT; END_STRUCT; END_TYPE
+FUNCTION Made : Point VAR_INPUT n : INT; END_VAR Made.x := n; Made.y := n - 1; END_FUNCTION
+PROGRAM Part
+VAR_INPUT on : BOOL; END_VAR
+VAR count : INT; END_VAR
+  IF on THEN count := count + 1; END_IF
+END_PROGRAM
+PROGRAM Codesys
+VAR_INPUT by : INT; on : BOOL; END_VAR
+VAR one : Meter(first); first : INT := Doubled(20); full : BOOL; a, b, c : INT; many : ARRAY[1..2] OF Meter[(1), (2)]; END_VAR
+  full := by > 3 AND_THEN one.Full() OR_ELSE many[2].Full();
+  a := b := Made(by).y;
+  Part(on := on);
+  c := Part.count;
+END_PROGRAM
+"""
 EXAMPLES = {
     "integers": INTEGERS, "failing": FAILING, "parts": PARTS, "times": TIMES, "reals": REALS, "alarms": ALARMS, "chart": CHART,
     "classes": CLASSES, "texts": TEXTS,

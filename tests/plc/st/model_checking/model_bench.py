@@ -9,6 +9,7 @@ from typing import Any
 import z3
 
 from fieldtwin.plc.st.compiler.compile import compile_text
+from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.model_checking.solving import Scan, float_of
 from fieldtwin.plc.st.model_checking.state import Leaf, leaves
 from fieldtwin.plc.st.model_checking.transition import Builder, Transition
@@ -17,9 +18,9 @@ from fieldtwin.plc.st.program import StProgram, program_class
 INTERVAL_NS = (1_000_000, 3_600_000_000_000)
 
 
-def model_of(text: str, name: str = "") -> tuple[Transition, type[StProgram]]:
+def model_of(text: str, name: str = "", dialect: str = "standard") -> tuple[Transition, type[StProgram]]:
     """Return the model of a program without properties, and its class."""
-    kind = program_class(compile_text(text), name)
+    kind = program_class(compile_text(text, "", dialect_of(dialect)), name)
     return Builder(kind(), INTERVAL_NS).build([], []), kind
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from example_programs import EXAMPLES
+from example_programs import CODESYS, EXAMPLES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from model_bench import INTERVAL_NS, kept, model_of, model_states, program_states, same
@@ -97,6 +97,10 @@ def check_many(transition: Transition, kind: type[StProgram], examples: int) -> 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_model_and_program_agree(name: str) -> None:
     check_many(*model_of(EXAMPLES[name]), 12)
+
+
+def test_model_and_program_agree_in_the_dialect_codesys() -> None:
+    check_many(*model_of(CODESYS, dialect="codesys"), 12)
 
 
 @pytest.mark.long

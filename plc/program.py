@@ -15,6 +15,7 @@ another program. No function of this module blocks.
 
 from __future__ import annotations
 
+import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -233,18 +234,19 @@ class SourceLine(msgspec.Struct, frozen=True, gc=False):
         """Return a text such as ``pump.st:14``; the path alone if the line is not known, "" if neither is known."""
         path, line = self.path, self.line
         if self.code is not None:
-            path = _within_its_import_path(self.code.co_filename)
+            path = within_import_path(self.code.co_filename)
             lines = [place[0] for place in self.code.co_positions()]
             line = (lines[self.instruction // 2] if self.instruction // 2 < len(lines) else None) or 0
         return f"{path}:{line}" if line else path
 
 
-def _within_its_import_path(path: str) -> str:
+def within_import_path(path: str) -> str:
     """Return the path of a module's file relative to its entry of `sys.path`, such as ``plc/control.py``.
 
-    A place is recorded in traces, which must not differ between two computers or folders.
+    A place is recorded in traces and in errors, which must not differ between two computers or folders.
     """
-    folders = [entry for entry in sys.path if entry and path.startswith(entry.rstrip("/") + "/")]
+    entries = [os.path.abspath(entry) for entry in sys.path if entry]  # the folder of a system can be a relative entry
+    folders = [entry for entry in entries if path.startswith(entry.rstrip("/") + "/")]
     return path[len(max(folders, key=len).rstrip("/")) + 1 :] if folders else path
 
 
@@ -421,4 +423,5 @@ __all__ = [
     "var_local",
     "var_output",
     "var_retain",
+    "within_import_path",
 ]

@@ -36,6 +36,7 @@ from fieldtwin.plc.program import (
     ScanStuck,
     ScanTooLong,
     Variable,
+    within_import_path,
 )
 
 _BAD = int(Quality.BAD)
@@ -454,6 +455,6 @@ def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
         path, line = made.source_path, 0
     if isinstance(error, ScanStuck | ScanTooLong):
         reason = error.message if isinstance(error, ScanTooLong) else str(error)
-        return ProgramStuck(bound.name, f"the scan did not end: {reason}", path=path, line=line)
+        return ProgramStuck(bound.name, f"the scan did not end: {reason}", path=within_import_path(path), line=line)
     text = error.message if isinstance(error, FieldtwinError) else str(error)
-    return ProgramFailed(bound.name, f"{type(error).__name__}: {text}", path=path, line=line)
+    return ProgramFailed(bound.name, f"{type(error).__name__}: {text}", path=within_import_path(path), line=line)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,12 +14,12 @@ from fieldtwin.console import stderr, stdout
 if TYPE_CHECKING:
     from fieldtwin.results.model import ScenarioResult
     from fieldtwin.run.campaigns.causes import Cause
-    from fieldtwin.run.campaigns.many_seeds import SeedResult, Shrunk
-    from fieldtwin.run.campaigns.shrink import FurtherRuns
+    from fieldtwin.run.campaigns.many_seeds import SeedResult, SeedRuns
+    from fieldtwin.run.campaigns.reruns import FaultyWork, Shrunk
+    from fieldtwin.run.places.place import Place
     from fieldtwin.run.virtual.run import VirtualOptions
 
-FAILED = TypeVar("FAILED")
-SMALL = TypeVar("SMALL")
+RESULT = TypeVar("RESULT")
 SEEDS_SHOWN = 10
 SEARCH_INTERRUPTED = "interrupted: the search for causes has not ended; repeat a seed to search its cause"
 
@@ -59,46 +59,54 @@ def seeds_text(seeds: Sequence[int]) -> str:
 
 
 def find_causes(
-    failed: Sequence[int],
+    place: Place,
+    work: FaultyWork[RESULT],
+    failed: Mapping[int, RESULT],
     seeds: int,
-    causes: Callable[[FurtherRuns], Iterable[Cause[FAILED, SMALL]]],
-    written: Callable[[Cause[FAILED, SMALL]], FoundCause],
+    written: Callable[[Cause[int, Shrunk[RESULT]]], FoundCause],
 ) -> tuple[list[FoundCause], bool]:
-    """Return the causes of the failed ones of `seeds` seeds, and whether Ctrl-C ended the search early.
+    """Return the causes of failed runs of `seeds` seeds, and whether Ctrl-C ended the search early.
 
-    `written` writes the scenario of a cause and confirms it, as soon as the cause is found.
+    The search uses the workers of `place`. `failed` has the results by seed. `written` writes the scenario of a cause and
+    confirms it, as soon as the cause is found.
     """
+    from fieldtwin.run.campaigns.reruns import SearchStopped, open_search
     from fieldtwin.run.campaigns.shrink import FurtherRuns
 
-    further, found = FurtherRuns(seeds), list[FoundCause]()
+    further, found, stopped = FurtherRuns(seeds), list[FoundCause](), list[str]()
 
     def search() -> None:
-        stderr.print(shrinking_text(failed, further.most), markup=False)
-        found.extend(map(written, causes(further)))
+        stderr.print(shrinking_text(list(failed), further.most), markup=False)
+        try:
+            with open_search(place, work, further) as opened:
+                found.extend(map(written, opened.causes(failed)))
+        except SearchStopped as e:
+            stopped.append(str(e))
 
     interrupted = ends_early(search)
     known = {seed for one in found for seed in one.seeds}
     left = [seed for seed in failed if seed not in known]
     if left and not interrupted:
-        stderr.print(not_compared_text(left), markup=False)
+        text = stopped_text(left, stopped[0]) if stopped else not_compared_text(left)
+        stderr.print(text, soft_wrap=True, markup=False)
     return found, interrupted
 
 
 def simulated_causes(
-    options: VirtualOptions, failed: Sequence[SeedResult], seeds: int, jobs: int
+    place: Place, work: SeedRuns, failed: Sequence[SeedResult], seeds: int
 ) -> tuple[list[FoundCause], bool]:
     """Return the causes of failed runs of `fieldtwin simulate`, and whether Ctrl-C ended the search early."""
     from fieldtwin.run.campaigns.causes import shape_text
-    from fieldtwin.run.campaigns.many_seeds import causes_of
 
-    def written(cause: Cause[SeedResult, Shrunk]) -> FoundCause:
-        scenario, lines = _written(options, cause.runs[0], cause.small)
-        check, alike = next(iter(cause.runs[0].errors), ""), tuple(one.seed for one in cause.runs)
-        return FoundCause(check, shape_text(cause.small.faults), alike, scenario, tuple(lines))
+    by_seed = {result.seed: result for result in failed}
 
-    return find_causes(
-        [one.seed for one in failed], seeds, lambda further: causes_of(options, failed, jobs, further), written
-    )
+    def written(cause: Cause[int, Shrunk[SeedResult]]) -> FoundCause:
+        first = by_seed[cause.runs[0]]
+        scenario, lines = _written(work.options, first, cause.small)
+        check, faults = next(iter(first.errors), ""), shape_text(cause.small.faults)
+        return FoundCause(check, faults, tuple(cause.runs), scenario, tuple(lines))
+
+    return find_causes(place, work, by_seed, seeds, written)
 
 
 def shrinking_text(seeds: Sequence[int], most: int) -> str:
@@ -111,6 +119,14 @@ def not_compared_text(seeds: Sequence[int]) -> str:
     return f"not grouped by cause, because the numbers of causes and further runs are limited: {seeds_text(seeds)}"
 
 
+def stopped_text(seeds: Sequence[int], reason: str) -> str:
+    """Return a sentence about the failed seeds that have no cause because the search could not continue."""
+    return (
+        f"the search for causes stopped, and these have no cause: {seeds_text(seeds)}: {reason}; "
+        "run these seeds again, without --ledger, to search their causes"
+    )
+
+
 def show_causes(found: Sequence[FoundCause]) -> None:
     """Print each cause, its example and its scenario."""
     for cause in found:
@@ -119,20 +135,22 @@ def show_causes(found: Sequence[FoundCause]) -> None:
             stdout.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _written(options: VirtualOptions, failed: SeedResult, small: Shrunk) -> tuple[str, list[str]]:
+def _written(options: VirtualOptions, failed: SeedResult, small: Shrunk[SeedResult]) -> tuple[str, list[str]]:
     """Write the shrunk schedule as a scenario. Return its path, and sentences about it.
 
     Nothing is written if the seed does not fail again with the same faults.
     """
     from fieldtwin.run.campaigns.confirming import confirm_run
     from fieldtwin.run.campaigns.shrink import as_scenario
+    from fieldtwin.run.virtual.run import VirtualRun
     from fieldtwin.scenarios.language.file_name import SUFFIX
 
     if small.result.ok:
         return "", [f"seed {failed.seed} does not fail again with the same faults, so no scenario is written"]
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}{SUFFIX}")
     title = f"what failed with seed {failed.seed}"
-    acts = [(one.at_s, {"send": {"period_s": one.period_s}}) for one in small.scripted]
+    commands = VirtualRun(replace(options, seed=failed.seed)).scripted
+    acts = [(one.at_s, {"send": {"period_s": one.period_s}}) for one in commands]
     text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)
     write_text(path, text)
     told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)

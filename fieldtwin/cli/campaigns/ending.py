@@ -27,14 +27,14 @@ def interrupted_text(ended: int, wanted: int) -> str:
     return f"interrupted: {ended} of {wanted} seeds have ended; with --ledger the same command continues"
 
 
-def repeats_text(repeats: Repeats[Any]) -> str:
+def repeats_text(repeats: Repeats[int, Any]) -> str:
     """Return how many seeds ran again on a different worker."""
     return f"{repeats.count} on a different worker, {len(repeats.different)} with a different result"
 
 
-def different_texts(seeds: Collection[int], repeats: Repeats[Any]) -> list[str]:
+def different_texts(seeds: Collection[int], repeats: Repeats[int, Any]) -> list[str]:
     """Return a sentence for each of these seeds, which have different results, with the workers of those that just ran."""
-    workers = {one.seed: f" on {one.worker} and on {two.worker}" for one, two in repeats.different}
+    workers = {one.unit: f" on {one.worker} and on {two.worker}" for one, two in repeats.different}
     return [
         f"seed {seed} has different results{workers.get(seed, '')}; the same seed must give the same run, so this is a defect: "
         "compare the traces of both computers (fieldtwin simulate --seed ... --trace FILE)"

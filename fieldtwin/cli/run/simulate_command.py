@@ -123,7 +123,7 @@ def command(
                 "--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run"
             )
         with runs.place() as place:
-            return run_many(options, runs.chosen(), place, as_json, runs.ledger, reports, runs.jobs or 1)
+            return run_many(options, runs.chosen(), place, as_json, runs.ledger, reports)
     if given := runs.given or reports.given:
         raise UsageError(f"{given} needs --seeds", expected="--seeds 1..200")
     return run_one(options, as_json) if compare is None else _run_against(options, compare, as_json)

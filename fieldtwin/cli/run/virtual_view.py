@@ -88,17 +88,17 @@ def run_many(
     as_json: bool,
     ledger_path: Path | None,
     reports: CampaignReports,
-    jobs: int,
 ) -> int:
     """Run once for each seed and return the exit status: 0 if all passed, 130 if Ctrl-C ended the campaign early.
 
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
-    with their recorded result, also in `reports`. `jobs`: number of processes that reduce the faults of failed seeds.
+    with their recorded result, also in `reports`.
     """
     from fieldtwin.run.campaigns.coverage import joined
     from fieldtwin.run.campaigns.ledger import Ledger, entry_of
     from fieldtwin.run.campaigns.many_seeds import SeedRuns, what_runs
-    from fieldtwin.run.places.place import Repeats
+    from fieldtwin.run.places.place import Repeats, run_units
+    from fieldtwin.run.places.sample import sample_of
 
     began_ns = WallClock().monotonic_ns()
     ledger = Ledger(ledger_path) if ledger_path is not None else None
@@ -109,27 +109,27 @@ def run_many(
     entries: list[LedgerEntry] = []
     results: list[SeedResult] = []
     work = SeedRuns(options)
-    repeats = Repeats(work)
+    repeats = Repeats(work, sample_of(left))
 
-    def record(one: Ended[SeedResult]) -> None:
-        entry = entry_of(what, hours, one.result, system, again(one.seed), one.worker)
+    def record(one: Ended[int, SeedResult]) -> None:
+        entry = entry_of(what, hours, one.result, system, again(one.unit), one.worker)
         if ledger is not None:
             ledger.record(entry)
         entries.append(entry)
 
     with CampaignView(system, len(left)) as view:
 
-        def ended(one: Ended[SeedResult]) -> None:
+        def ended(one: Ended[int, SeedResult]) -> None:
             results.append(one.result)  # first, because Ctrl-C may come while the entry is written
             record(one)
             cause = None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed"
-            view.ended(one.seed, hours, cause, one.result.coverage)
+            view.ended(one.unit, hours, cause, one.result.coverage)
 
-        interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
+        interrupted = ends_early(lambda: run_units(place, work, left, ended, repeats))
     results.sort(key=lambda result: result.seed)
     for _, second in repeats.different:
         record(second)
-    different = {first.seed for first, _ in repeats.different}
+    different = {first.unit for first, _ in repeats.different}
     if ledger is not None:
         different |= ledger.different_of(what, seeds)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
@@ -147,7 +147,7 @@ def run_many(
         work,
         {r.seed: r.sha256 for r in finished},
         system,
-        (lambda: simulated_causes(options, finished, len(left), jobs)) if has_faults else None,
+        (lambda: simulated_causes(place, work, finished, len(left))) if has_faults else None,
         interrupted=interrupted,
     )
     if reports.given:

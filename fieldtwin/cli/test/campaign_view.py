@@ -27,8 +27,10 @@ from fieldtwin.run.campaigns.coverage import Coverage
 from fieldtwin.run.campaigns.ledger import Ledger, LedgerEntry
 from fieldtwin.run.campaigns.merging import Runs
 from fieldtwin.run.campaigns.reporting import campaign_of
-from fieldtwin.run.campaigns.shrink_failure import ShrunkSeed, causes_of, confirm, scenario_of
-from fieldtwin.run.places.place import Ended, Place, Repeats
+from fieldtwin.run.campaigns.reruns import Shrunk
+from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of
+from fieldtwin.run.places.place import Ended, Place, Repeats, run_units
+from fieldtwin.run.places.sample import sample_of
 from fieldtwin.scenarios.language.file_name import SUFFIX, case_of
 
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
@@ -71,27 +73,27 @@ def run_scenario_campaign(
     done = {entry.seed for entry in before}
     left = [seed for seed in seeds if seed not in done]
     campaign.check()
-    repeats = Repeats(work)
+    repeats = Repeats(work, sample_of(left))
     results: list[ScenarioResult] = []
     entries: list[LedgerEntry] = []
 
-    def record(one: Ended[ScenarioResult]) -> None:
+    def record(one: Ended[int, ScenarioResult]) -> None:
         entries.append(scenario_entry(what, one, WallClock().utc_ns() / 1e9))
         if ledger is not None:
             ledger.record(entries[-1])
 
     with CampaignView(case_of(path), len(left)) as view:
 
-        def ended(one: Ended[ScenarioResult]) -> None:
+        def ended(one: Ended[int, ScenarioResult]) -> None:
             results.append(one.result)  # first, because Ctrl-C may come while the entry is written
             record(one)
             passed = one.result.verdict is Verdict.PASSED
             cause = None if passed else one.result.why or one.result.verdict.value
-            view.ended(one.seed, one.result.simulated_s / 3600, cause, one.result.coverage)
+            view.ended(one.unit, one.result.simulated_s / 3600, cause, one.result.coverage)
 
-        interrupted = ends_early(lambda: place.run(work, left, ended, repeats))
+        interrupted = ends_early(lambda: run_units(place, work, left, ended, repeats))
     results.sort(key=lambda result: result.seed or 0)
-    different = {first.seed for first, _ in repeats.different}
+    different = {first.unit for first, _ in repeats.different}
     for _, second in repeats.different:
         record(second)
     if ledger is not None:
@@ -109,7 +111,7 @@ def run_scenario_campaign(
         work,
         {result.seed or 0: result.trace_hash for result in failed},
         case_of(path),
-        (lambda: _causes(campaign, failed, len(results), options.jobs or 1)) if has_faults else None,
+        (lambda: _causes(place, work, failed, len(results))) if has_faults else None,
         interrupted=interrupted,
     )
     if show is not None:
@@ -140,7 +142,7 @@ def run_scenario_campaign(
     )
 
 
-def _repeats_checks(different: Collection[int], repeats: Repeats[ScenarioResult]) -> list[CheckResult]:
+def _repeats_checks(different: Collection[int], repeats: Repeats[int, ScenarioResult]) -> list[CheckResult]:
     """Return the check that seeds which ran again on a different worker had the same trace; none if there is nothing to check."""
     if not repeats.count and not different:
         return []
@@ -194,25 +196,20 @@ def _show_whole(whole: ScenarioResult) -> None:
 
 
 def _causes(
-    campaign: Campaign, failed: Sequence[ScenarioResult], seeds: int, jobs: int
+    place: Place, work: ScenarioRuns, failed: Sequence[ScenarioResult], seeds: int
 ) -> tuple[list[FoundCause], bool]:
     """Return the causes of failed runs, each with its scenario, and whether Ctrl-C ended the search early."""
+    by_seed = {result.seed or 0: result for result in failed}
 
-    def written(cause: Cause[ScenarioResult, ShrunkSeed]) -> FoundCause:
-        scenario, lines, confirmed = _written(campaign, cause.small)
-        check = next(iter(broken_by(cause.runs[0])), "")
-        return FoundCause(
-            check, shape_text(cause.small.faults), tuple(_seeds(cause.runs)), scenario, tuple(lines), confirmed
-        )
+    def written(cause: Cause[int, Shrunk[ScenarioResult]]) -> FoundCause:
+        scenario, lines, confirmed = _written(work.campaign, cause.small)
+        check = next(iter(broken_by(by_seed[cause.runs[0]])), "")
+        return FoundCause(check, shape_text(cause.small.faults), tuple(cause.runs), scenario, tuple(lines), confirmed)
 
-    return find_causes(_seeds(failed), seeds, lambda further: causes_of(campaign, failed, jobs, further), written)
-
-
-def _seeds(results: Sequence[ScenarioResult]) -> list[int]:
-    return [result.seed for result in results if result.seed is not None]
+    return find_causes(place, work, by_seed, seeds, written)
 
 
-def _written(campaign: Campaign, small: ShrunkSeed) -> tuple[str, list[str], ScenarioResult | None]:
+def _written(campaign: Campaign, small: Shrunk[ScenarioResult]) -> tuple[str, list[str], ScenarioResult | None]:
     """Write the shrunk schedule as a scenario and run it. Return its path, sentences about it, and its result if it is
     confirmed.
     """

@@ -156,6 +156,15 @@ class ScenarioRuns:
     def run_traced(self, seed: int, trace: Path, most_bytes: int) -> ScenarioResult:
         return run_seed(self.campaign, seed, trace=trace, most_trace_bytes=most_bytes)
 
+    def faults_of(self, seed: int) -> Sequence[dict[str, Any]]:
+        return schedule(self.campaign, seed)
+
+    def run_with(self, seed: int, faults: Sequence[dict[str, Any]]) -> ScenarioResult:
+        return slim_run(self.campaign, seed, faults)
+
+    def errors_of(self, result: ScenarioResult) -> Sequence[str]:
+        return broken_by(result)
+
     def unfinished(self, seed: int, reason: str) -> ScenarioResult:
         text = f"the run did not finish: {reason}"
         scenario = self.campaign.check()
@@ -181,7 +190,7 @@ def what_tests(campaign: Campaign) -> str:
     return fingerprint(*texts_of(group_of(scenario)), campaign.path.read_text(encoding="utf-8"), repr(options))
 
 
-def scenario_entry(what: str, ended: Ended[ScenarioResult], ended_s: float) -> LedgerEntry:
+def scenario_entry(what: str, ended: Ended[int, ScenarioResult], ended_s: float) -> LedgerEntry:
     """Return the line of the ledger for a run. `what` is the campaign's fingerprint, `ended_s` the time since 1970 in seconds."""
     result = ended.result
     checks = [check for check in result.checks if not check.vacuous]
@@ -189,7 +198,7 @@ def scenario_entry(what: str, ended: Ended[ScenarioResult], ended_s: float) -> L
     return LedgerEntry(
         what,
         __version__,
-        ended.seed,
+        ended.unit,
         result.simulated_s / 3600,
         passed,
         len(checks),

@@ -22,7 +22,7 @@ _OF_ONE_RUN = ("id", "from", "until", "probability")
 
 @dataclass(frozen=True, slots=True)
 class Cause(Generic[FAILED, SMALL]):
-    """Failed runs with the same cause, in the order of the campaign. `small` is the shrunk schedule of the first."""
+    """Failed runs with the same cause, in the order of the campaign. `small` is the shrunk schedule of the first run."""
 
     small: SMALL
     runs: Sequence[FAILED]

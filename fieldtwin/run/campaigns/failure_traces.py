@@ -18,7 +18,7 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.results.trace_about import TraceAbout, about_path, read_about, write_about
-from fieldtwin.run.places.place import Ended, Place, Repeats, SeedWork
+from fieldtwin.run.places.place import Ended, Place, SeedWork, run_units
 
 RESULT = TypeVar("RESULT")
 MOST_TRACES = 8
@@ -83,8 +83,7 @@ class TraceRuns(Generic[RESULT]):
         return PackedTrace(reason=f"its run for the trace did not finish: {reason}")
 
     def hash_of(self, result: PackedTrace) -> str:
-        """Return an empty text: the traces are compared with the runs of the campaign, and not with further runs."""
-        return ""
+        return result.sha256
 
     def portable(self) -> tuple[TraceRuns[RESULT], tuple[Path, ...]]:
         work, files = self.work.portable()
@@ -150,11 +149,11 @@ def fetch(
     reason of the traces that are missing.
     """
 
-    def ended(one: Ended[PackedTrace]) -> None:
-        kept.keep(one.seed, hashes[one.seed], one.result, folder / f"{stem}-seed{one.seed}.jsonl")
+    def ended(one: Ended[int, PackedTrace]) -> None:
+        kept.keep(one.unit, hashes[one.unit], one.result, folder / f"{stem}-seed{one.unit}.jsonl")
 
     again = TraceRuns(work)
     try:
-        place.run(again, list(hashes), ended, Repeats(again))
+        run_units(place, again, list(hashes), ended)
     except FieldtwinError as e:
         kept.missing |= {seed: str(e) for seed in hashes if seed not in kept.files and seed not in kept.missing}

@@ -5,19 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
-from fieldtwin.run.campaigns.shrink import FurtherRuns, same_failure, shrunk_run
 from fieldtwin.run.places.bundle import files_of, profile_folders, relative
-from fieldtwin.run.processes.topside import Scripted
-from fieldtwin.run.processes.workers import each
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.twin.site.data_files import find_recording
 
@@ -104,34 +99,6 @@ def _by_name(faults: Sequence[dict[str, Any]]) -> tuple[tuple[str, int, int], ..
     return tuple((name, len(struck), sum(struck)) for name, struck in of.items())
 
 
-@dataclass(frozen=True, slots=True)
-class Shrunk:
-    """The fewest faults with which a run still fails in the same way: `faults`.
-
-    `minimal`: all of them are necessary. `result`: the result with them. `without`: the result without any fault; the
-    same as `result` if none is necessary. `scripted`: the commands of the run.
-    """
-
-    faults: list[dict[str, Any]]
-    minimal: bool
-    result: SeedResult
-    without: SeedResult
-    scripted: list[Scripted]
-
-
-def shrunk(options: VirtualOptions, found: SeedResult, jobs: int, further: FurtherRuns) -> Shrunk:
-    """Return the fewest faults with which the run of `found`'s seed still fails in the same way; `jobs` runs at a time."""
-    run = _known_faults(options, found.seed)
-    small = shrunk_run(
-        run.faults,
-        partial(_with_faults, options, found.seed),
-        lambda result: same_failure(found.errors, result.errors),
-        jobs,
-        further,
-    )
-    return Shrunk(*small, run.scripted)
-
-
 def _known_faults(options: VirtualOptions, seed: int) -> VirtualRun:
     """Return a run with this seed whose `faults` are complete: with guided faults it is made again, because they are known only
     afterwards.
@@ -140,29 +107,6 @@ def _known_faults(options: VirtualOptions, seed: int) -> VirtualRun:
     if options.random_faults is not None and options.random_faults.guided:
         run.run()
     return run
-
-
-def _with_faults(options: VirtualOptions, seed: int, faults: Sequence[dict[str, Any]]) -> SeedResult:
-    return run_seed(replace(options, seed=seed, random_faults=None, fault_file=None, faults=tuple(faults)))
-
-
-def causes_of(
-    options: VirtualOptions, failed: Sequence[SeedResult], jobs: int, further: FurtherRuns
-) -> Iterator[Cause[SeedResult, Shrunk]]:
-    """Yield the causes of the failed runs (see `fieldtwin.run.campaigns.causes.causes`)."""
-    return causes(
-        failed,
-        lambda one: one.errors,
-        lambda one: shrunk(options, one, jobs, further),
-        lambda small, others: each(jobs, partial(_fails_with, options, shape_of(small.faults)), others),
-        further,
-    )
-
-
-def _fails_with(options: VirtualOptions, shape: frozenset[str], found: SeedResult) -> bool:
-    """Return whether the run of a seed still fails in the same way with its faults of this shape only."""
-    faults = _known_faults(options, found.seed).faults
-    return same_failure(found.errors, _with_faults(options, found.seed, of_shape(faults, shape)).errors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +124,15 @@ class SeedRuns:
 
     def run_traced(self, seed: int, trace: Path, most_bytes: int) -> SeedResult:
         return run_seed(replace(self.options, seed=seed, trace=trace, most_trace_bytes=most_bytes))
+
+    def faults_of(self, seed: int) -> Sequence[dict[str, Any]]:
+        return _known_faults(self.options, seed).faults
+
+    def run_with(self, seed: int, faults: Sequence[dict[str, Any]]) -> SeedResult:
+        return run_seed(replace(self.options, seed=seed, random_faults=None, fault_file=None, faults=tuple(faults)))
+
+    def errors_of(self, result: SeedResult) -> Sequence[str]:
+        return result.errors
 
     def unfinished(self, seed: int, reason: str) -> SeedResult:
         return SeedResult(seed, False, (f"the run did not finish: {reason}",), 0, 0, 0, "")

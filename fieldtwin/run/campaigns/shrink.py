@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from typing import Any, TypeVar
-
-from fieldtwin.run.processes.workers import Workers, run_all
 
 T = TypeVar("T")
 RESULT = TypeVar("RESULT")
@@ -70,30 +67,34 @@ def smallest(
 
 def shrunk_run(
     items: Sequence[T],
-    run: Callable[[Sequence[T]], RESULT],
+    results_of: Callable[[Sequence[Sequence[T]]], Sequence[RESULT]],
     fails: Callable[[RESULT], bool],
-    jobs: int = 1,
-    further: FurtherRuns | None = None,
+    further: FurtherRuns,
+    parallel: Callable[[], int] = lambda: 1,
 ) -> tuple[list[T], bool, RESULT, RESULT]:
-    """Return the `smallest` part of `items` whose `run` still `fails`, whether all its items are necessary, and two results.
+    """Return the `smallest` part of `items` whose run still `fails`, whether all its items are necessary, and two results.
 
-    They are the results of the run with that part and of the run without any item. Each part is run once. `jobs` parts are run
-    at a time, in processes if there are several; the result is the same with any number. `further` limits the number of tests
-    if it has fewer runs left than `MOST_RUNS`.
+    They are the results of the run with that part and of the run without any item. `results_of` returns the results of several
+    parts; each part is run once. `parallel` returns how many parts are run at a time, before each step; the result is the same
+    with any number. `further` limits the number of tests if it has fewer runs left than `MOST_RUNS`.
     """
     seen: dict[str, RESULT] = {}
 
     def ended(parts: Sequence[Sequence[T]]) -> list[RESULT]:
         keys = [repr(list(part)) for part in parts]
         new = {key: part for key, part in zip(keys, parts, strict=True) if key not in seen}
-        seen.update(zip(new, run_all(workers, run, new.values()), strict=True))
+        if new:
+            seen.update(zip(new, results_of(list(new.values())), strict=True))
         return [seen[key] for key in keys]
 
     def first_of(parts: Sequence[Sequence[T]]) -> int | None:
-        for begin in range(0, len(parts), jobs):
-            for n, result in enumerate(ended(parts[begin : begin + jobs]), begin):
+        begin = 0
+        while begin < len(parts):
+            some = parts[begin : begin + parallel()]
+            for n, result in enumerate(ended(some), begin):
                 if fails(result):
                     return n
+            begin += len(some)
         return None
 
     tests = 0
@@ -104,12 +105,10 @@ def shrunk_run(
         tests += len(parts) if found is None else found + 1
         return found
 
-    most = MOST_RUNS if further is None else min(MOST_RUNS, further.left)
-    with Workers(jobs) if jobs > 1 else nullcontext() as workers:
-        left, minimal = smallest(items, lambda part: counted([part]) is not None, most, counted)
-        result, without = ended([left, ()])
-    if further is not None:
-        further.used(tests)
+    most = min(MOST_RUNS, further.left)
+    left, minimal = smallest(items, lambda part: counted([part]) is not None, most, counted)
+    result, without = ended([left, ()])
+    further.used(tests)
     return left, minimal, result, without
 
 

@@ -1,19 +1,15 @@
-"""The failing seed of a campaign, shrunk: the fewest random faults that break the same rule, as a scenario that is confirmed."""
+"""The scenario of a failed seed with the fewest random faults that break the same rule, which is run to confirm it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.results.model import ScenarioResult, Verdict
-from fieldtwin.run.campaigns.campaign import Campaign, broken_by, schedule, slim_run
-from fieldtwin.run.campaigns.causes import Cause, causes, of_shape, shape_of
-from fieldtwin.run.campaigns.shrink import FurtherRuns, as_scenario, same_failure, shrunk_run
-from fieldtwin.run.processes.workers import each
+from fieldtwin.run.campaigns.campaign import Campaign, broken_by
+from fieldtwin.run.campaigns.reruns import Shrunk
+from fieldtwin.run.campaigns.shrink import as_scenario, same_failure
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.judging.fault_effects import fault_id
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
@@ -22,52 +18,7 @@ _KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")
 """Keys of a scenario that are copied unchanged into the scenario that is shrunk from it."""
 
 
-@dataclass(frozen=True)
-class ShrunkSeed:
-    """The fewest faults with which a seed still breaks the same rule.
-
-    `minimal`: all of them are necessary. `result`: the run with them. `without`: the run without
-    random faults.
-    """
-
-    seed: int
-    faults: list[dict[str, Any]]
-    minimal: bool
-    result: ScenarioResult
-    without: ScenarioResult
-
-
-def shrink_seed(campaign: Campaign, found: ScenarioResult, jobs: int, further: FurtherRuns) -> ShrunkSeed:
-    """Return the fewest random faults with which the seed of `found` still breaks the same rules; `jobs` runs at a time."""
-    assert found.seed is not None
-    seed, wanted = found.seed, broken_by(found)
-    faults = schedule(campaign, seed)
-    run = partial(slim_run, campaign, seed)
-    small = shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result)), jobs, further)
-    return ShrunkSeed(seed, *small)
-
-
-def causes_of(
-    campaign: Campaign, failed: Sequence[ScenarioResult], jobs: int, further: FurtherRuns
-) -> Iterator[Cause[ScenarioResult, ShrunkSeed]]:
-    """Yield the causes of the failed runs (see `fieldtwin.run.campaigns.causes.causes`)."""
-    return causes(
-        failed,
-        broken_by,
-        lambda one: shrink_seed(campaign, one, jobs, further),
-        lambda small, others: each(jobs, partial(_fails_with, campaign, shape_of(small.faults)), others),
-        further,
-    )
-
-
-def _fails_with(campaign: Campaign, shape: frozenset[str], found: ScenarioResult) -> bool:
-    """Return whether the run of a seed still breaks the same rules with its faults of this shape only."""
-    assert found.seed is not None
-    faults = of_shape(schedule(campaign, found.seed), shape)
-    return same_failure(broken_by(found), broken_by(slim_run(campaign, found.seed, faults)))
-
-
-def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:
+def scenario_of(campaign: Campaign, small: Shrunk[ScenarioResult], folder: Path) -> str:
     """Return a scenario file for `folder`: the faults, the effects of the steps at their times, and the broken rule."""
     scenario = campaign.check()
     form, raw = scenario.form, scenario.file.data
@@ -120,7 +71,7 @@ def _acts(scenario: Scenario, result: ScenarioResult) -> list[tuple[float, dict[
     return acts
 
 
-def confirm(path: Path, campaign: Campaign, small: ShrunkSeed) -> ScenarioResult | None:
+def confirm(path: Path, campaign: Campaign, small: Shrunk[ScenarioResult]) -> ScenarioResult | None:
     """Run the scenario in `path`; return its result if it breaks the rule that the seed broke, else None."""
     result = run_virtual(load_scenario(path, campaign.profiles))
     confirmed = result.verdict is not Verdict.PASSED and same_failure(broken_by(small.result), broken_by(result))

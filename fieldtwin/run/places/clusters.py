@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
@@ -97,6 +98,8 @@ def _existing(address: str) -> Iterator[Client]:
 def _client(address: Any, name: str) -> Client:
     from distributed import Client
 
+    # it would log tracebacks when the scheduler is lost, which the campaign reports itself
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as e:

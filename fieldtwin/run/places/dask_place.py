@@ -1,7 +1,7 @@
 """The workers of a Dask cluster as a place for the units of a campaign.
 
 Dask's scheduler distributes the units and gives those of a lost worker to a different one. This module keeps a bounded number of
-units with the scheduler, counts each seed once, and runs a sample of the seeds again on a different worker.
+units with the scheduler, counts each unit once, and runs a sample of the seeds again on a different worker.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Generic, Self
@@ -23,8 +24,7 @@ from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError, U
 from fieldtwin.run.places.bundle import bundle
 from fieldtwin.run.places.dask_worker import Answer, CampaignParcel, CampaignPlugin, run_unit
 from fieldtwin.run.places.environment import NotReproducible, local_environment
-from fieldtwin.run.places.place import Ended, Repeats, SeedWork, T, unit_limit_s
-from fieldtwin.run.places.sample import sample_of
+from fieldtwin.run.places.place import UNIT, Ended, Repeats, T, UnitWork, unit_limit_s
 
 IN_FLIGHT_PER_THREAD = 2
 """Units with the scheduler for each thread of a worker, so that no thread waits for its next unit."""
@@ -57,77 +57,107 @@ class DaskPlace:
         self._client = None
         self._open.close()
 
-    def run(
-        self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]
-    ) -> None:
-        if not seeds:
-            return
+    @contextmanager
+    def open(self, work: UnitWork[UNIT, T]) -> Iterator[_ClusterWork[UNIT, T]]:
         portable, files = work.portable()
         parcel = CampaignParcel(bundle(files), pickle.dumps(portable), local_environment(), unit_limit_s(work))
         if self._client is None:
             self._client = self._open.enter_context(self._connect())
-        with _registered(self._client, parcel) as campaign:
-            units = _Units(self, self._client, campaign, work, seeds, on_ended, repeats)
-            try:
-                units.run()
-            finally:
-                units.cancel()
+        with self._registered(self._client, parcel) as campaign:
+            yield _ClusterWork(self, self._client, campaign, work)
 
+    @contextmanager
+    def _registered(self, client: Client, parcel: CampaignParcel) -> Iterator[str]:
+        """Bring the work to all workers, and remove it from them at the end, with the processes that run its units."""
+        name = f"fieldtwin-{uuid.uuid4().hex}"
+        if client.status != "running":
+            raise self.without_scheduler()
+        try:
+            client.register_plugin(CampaignPlugin(name, parcel))
+        except ModuleNotFoundError as e:
+            raise _without_fieldtwin(e) from e
+        except (OSError, TimeoutError) as e:
+            raise self.without_scheduler() from e
+        try:
+            yield name
+        finally:
+            with contextlib.suppress(
+                Exception
+            ):  # workers and scheduler may be gone, which the campaign has noticed by itself
+                client.unregister_worker_plugin(name)
 
-@contextmanager
-def _registered(client: Client, parcel: CampaignParcel) -> Iterator[str]:
-    """Bring the campaign to all workers, and remove it from them at the end, with the processes that run its units."""
-    name = f"fieldtwin-{uuid.uuid4().hex}"
-    try:
-        client.register_plugin(CampaignPlugin(name, parcel))
-    except ModuleNotFoundError as e:
-        raise _without_fieldtwin(e) from e
-    try:
-        yield name
-    finally:
-        with contextlib.suppress(
-            Exception
-        ):  # workers and scheduler may be gone, which the campaign has noticed by itself
-            client.unregister_worker_plugin(name)
+    def without_scheduler(self) -> ConnectionLost:
+        return ConnectionLost("the scheduler is gone", where=self.name, hint=LEDGER_HINT)
 
 
 @dataclass(frozen=True, slots=True)
-class _Unit(Generic[T]):
+class _ClusterWork(Generic[UNIT, T]):
+    """Work that all workers have under the name `campaign`."""
+
+    place: DaskPlace
+    client: Client
+    campaign: str
+    work: UnitWork[UNIT, T]
+
+    def threads(self) -> dict[str, int]:
+        """Return the number of threads of each worker, by its address. Raises `ConnectionLost`."""
+        if self.client.status != "running":
+            raise self.place.without_scheduler()
+        try:
+            workers = self.client.scheduler_info(n_workers=-1)["workers"]
+        except (OSError, TimeoutError) as e:
+            raise self.place.without_scheduler() from e
+        return {address: about["nthreads"] for address, about in workers.items()}
+
+    def parallel_units(self) -> int:
+        return max(1, sum(self.threads().values()))
+
+    def run(
+        self,
+        units: Sequence[UNIT],
+        on_ended: Callable[[Ended[UNIT, T]], None],
+        repeats: Repeats[UNIT, T] | None = None,
+    ) -> None:
+        given = _Units(self, units, on_ended, repeats)
+        try:
+            given.run()
+        finally:
+            given.cancel()
+
+
+@dataclass(frozen=True, slots=True)
+class _Unit(Generic[UNIT, T]):
     """A unit with the scheduler. `first`: the earlier run that this one repeats. `submits` counts how often it was submitted."""
 
-    seed: int
-    first: tuple[Ended[T], str] | None = None
+    unit: UNIT
+    first: tuple[Ended[UNIT, T], str] | None = None
     submits: int = 1
 
 
-class _Units(Generic[T]):
-    """The units of a running campaign."""
+class _Units(Generic[UNIT, T]):
+    """Units of open work, until each of them has ended."""
 
     def __init__(
         self,
-        place: DaskPlace,
-        client: Client,
-        campaign: str,
-        work: SeedWork[T],
-        seeds: Sequence[int],
-        on_ended: Callable[[Ended[T]], None],
-        repeats: Repeats[T],
+        opened: _ClusterWork[UNIT, T],
+        units: Sequence[UNIT],
+        on_ended: Callable[[Ended[UNIT, T]], None],
+        repeats: Repeats[UNIT, T] | None,
     ) -> None:
-        self._place, self._client, self._campaign, self._work = place, client, campaign, work
-        self._left, self._on_ended, self._repeats = iter(seeds), on_ended, repeats
-        self._sample = sample_of(seeds)
-        self._units: dict[Future, _Unit[T]] = {}
-        self._repeat_later: list[_Unit[T]] = []
+        self._opened, self._work = opened, opened.work
+        self._left, self._on_ended, self._repeats = iter(units), on_ended, repeats
+        self._units: dict[Future, _Unit[UNIT, T]] = {}
+        self._repeat_later: list[_Unit[UNIT, T]] = []
         self._ended: SimpleQueue[Future] = SimpleQueue()
         self._threads: dict[str, int] = {}
 
     def run(self) -> None:
         """Run all units. Raises `NotReproducible`, `Unreachable`, and the errors of the units."""
-        without_worker_s = 0.0
+        place, without_worker_s = self._opened.place, 0.0
         since_look = 0
         while True:
             if since_look >= len(self._threads):
-                self._look_at_workers()
+                self._threads = self._opened.threads()
                 since_look = 0
             self._submit_repeats()
             self._submit_units()
@@ -139,31 +169,19 @@ class _Units(Generic[T]):
             except Empty:
                 since_look = len(self._threads)
                 without_worker_s = 0.0 if self._threads else without_worker_s + POLL_S
-            if without_worker_s >= self._place.wait_s:
-                raise Unreachable(f"no worker for {self._place.wait_s:g} s", where=self._place.name, hint=LEDGER_HINT)
+            if without_worker_s >= place.wait_s:
+                raise Unreachable(f"no worker for {place.wait_s:g} s", where=place.name, hint=LEDGER_HINT)
 
     def cancel(self) -> None:
         """Withdraw the units that have not ended."""
         with contextlib.suppress(Exception):  # the scheduler may be gone, and then there is nothing to withdraw
-            self._client.cancel(list(self._units), force=True)
+            self._opened.client.cancel(list(self._units), force=True)
         self._units.clear()
-
-    def _look_at_workers(self) -> None:
-        if self._client.status != "running":
-            raise self._without_scheduler()
-        try:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        except (OSError, TimeoutError) as e:
-            raise self._without_scheduler() from e
-        self._threads = {address: about["nthreads"] for address, about in workers.items()}
-
-    def _without_scheduler(self) -> ConnectionLost:
-        return ConnectionLost("the scheduler is gone", where=self._place.name, hint=LEDGER_HINT)
 
     def _submit_units(self) -> None:
         room = min(MAX_IN_FLIGHT, max(1, IN_FLIGHT_PER_THREAD * sum(self._threads.values())))
-        while len(self._units) < room and (seed := next(self._left, None)) is not None:
-            self._submit(_Unit(seed))
+        for unit in islice(self._left, max(0, room - len(self._units))):
+            self._submit(_Unit(unit))
 
     def _submit_repeats(self) -> None:
         """Submit the repetitions for which a different worker is available than in their first run."""
@@ -176,19 +194,19 @@ class _Units(Generic[T]):
             else:
                 self._repeat_later.append(unit)
 
-    def _submit(self, unit: _Unit[T], workers: Sequence[str] | None = None) -> None:
+    def _submit(self, unit: _Unit[UNIT, T], workers: Sequence[str] | None = None) -> None:
         # the workers are a preference: a unit for workers that have all gone must not wait for ever
-        future = self._client.submit(
+        future = self._opened.client.submit(
             run_unit,
-            self._campaign,
-            unit.seed,
+            self._opened.campaign,
+            unit.unit,
             pure=False,
             workers=workers,
             allow_other_workers=workers is not None,
         )
         self._wait_for(future, unit)
 
-    def _wait_for(self, future: Future, unit: _Unit[T]) -> None:
+    def _wait_for(self, future: Future, unit: _Unit[UNIT, T]) -> None:
         self._units[future] = unit
         future.add_done_callback(self._ended.put)
 
@@ -206,36 +224,37 @@ class _Units(Generic[T]):
         except ModuleNotFoundError as e:
             raise _without_fieldtwin(e) from e
         except Exception as e:
-            raise Bug(f"a worker could not run seed {unit.seed}: {type(e).__name__}: {e}") from e
+            raise Bug(f"a worker could not run seed {unit.unit}: {type(e).__name__}: {e}") from e
         else:
             self._take_answer(unit, answer)
 
-    def _take_answer(self, unit: _Unit[T], answer: Answer) -> None:
+    def _take_answer(self, unit: _Unit[UNIT, T], answer: Answer) -> None:
         if answer.data is None:
             self._unfinished(unit, answer.lost, answer.worker)
             return
         finished, result = pickle.loads(answer.data)
         if not finished:
             raise result
-        ended = Ended(unit.seed, result, answer.worker)
+        ended = Ended(unit.unit, result, answer.worker)
+        repeats = self._repeats
         if unit.first is None:
             self._on_ended(ended)
-            if unit.seed in self._sample and self._work.hash_of(result):
-                self._repeat_later.append(_Unit(unit.seed, (ended, answer.address)))
+            if repeats is not None and unit.unit in repeats.sample and self._work.hash_of(result):
+                self._repeat_later.append(_Unit(unit.unit, (ended, answer.address)))
             return
         first, address = unit.first
-        if address != answer.address:  # otherwise no other worker was left
-            self._repeats.add(first, ended)
+        if repeats is not None and address != answer.address:  # otherwise no other worker was left
+            repeats.add(first, ended)
 
-    def _lost(self, unit: _Unit[T]) -> None:
+    def _lost(self, unit: _Unit[UNIT, T]) -> None:
         if unit.submits < MOST_SUBMITS:
             self._submit(replace(unit, submits=unit.submits + 1))
         else:
             self._unfinished(unit, f"its workers ended while it ran, {MOST_SUBMITS} times", "")
 
-    def _unfinished(self, unit: _Unit[T], reason: str, worker: str) -> None:
+    def _unfinished(self, unit: _Unit[UNIT, T], reason: str, worker: str) -> None:
         if unit.first is None:
-            self._on_ended(Ended(unit.seed, self._work.unfinished(unit.seed, reason), worker))
+            self._on_ended(Ended(unit.unit, self._work.unfinished(unit.unit, reason), worker))
 
 
 def _without_fieldtwin(error: ModuleNotFoundError) -> NotReproducible:

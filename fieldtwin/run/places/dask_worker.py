@@ -1,6 +1,6 @@
 """The part of a campaign that runs in the workers of a Dask cluster.
 
-A plugin brings the campaign to each worker once, also to workers that are added later. Its units then need the seed only.
+A plugin brings the campaign to each worker once, also to workers that are added later. Its units are then small.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 from distributed import Worker, WorkerPlugin, get_worker
 
@@ -60,11 +61,11 @@ class CampaignPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no 
             if self._folder is not None:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
-    def run(self, seed: int) -> Answer:
+    def run(self, unit: Any) -> Answer:
         """Run a unit. Raises `NotReproducible` if this worker's software differs from the software of the campaign."""
         name, address = str(self._worker.name), str(self._worker.address)
         try:
-            return Answer(name, address, self._ready(name).run(pickle.dumps(seed)))
+            return Answer(name, address, self._ready(name).run(pickle.dumps(unit)))
         except UnitLost as e:
             return Answer(name, address, None, str(e))
 
@@ -82,8 +83,8 @@ class CampaignPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no 
             return self._processes
 
 
-def run_unit(campaign: str, seed: int) -> Answer:
+def run_unit(campaign: str, unit: Any) -> Answer:
     """Run a unit of the campaign whose plugin has this name."""
     plugin = get_worker().plugins[campaign]
     assert isinstance(plugin, CampaignPlugin)
-    return plugin.run(seed)
+    return plugin.run(unit)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Generic, Self
 
-from fieldtwin.run.places.place import Ended, Repeats, SeedWork, T, unit_limit_s
+from fieldtwin.run.places.place import UNIT, Ended, Repeats, T, UnitWork, unit_limit_s
 from fieldtwin.run.places.unit_processes import UnitLost, UnitProcesses
 
 
@@ -31,40 +32,49 @@ class LocalPlace:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """Do nothing: each campaign ends its processes itself."""
 
-    def run(
-        self, work: SeedWork[T], seeds: Sequence[int], on_ended: Callable[[Ended[T]], None], repeats: Repeats[T]
-    ) -> None:
+    @contextmanager
+    def open(self, work: UnitWork[UNIT, T]) -> Iterator[_LocalWork[UNIT, T]]:
         processes = UnitProcesses(pickle.dumps(work), Path.cwd(), unit_limit_s(work))
         pool = ThreadPoolExecutor(self.jobs)  # a process ends with the thread that started it, so the threads stay
         try:
-            self._in(pool, partial(_unit, processes, work), seeds, on_ended)
+            yield _LocalWork(work, self.jobs, processes, pool)
         finally:
             processes.close()
             pool.shutdown(cancel_futures=True)
 
-    def _in(
+
+@dataclass(frozen=True, slots=True)
+class _LocalWork(Generic[UNIT, T]):
+    """Work with its processes, and a thread for each of them."""
+
+    work: UnitWork[UNIT, T]
+    jobs: int
+    processes: UnitProcesses
+    pool: ThreadPoolExecutor
+
+    def parallel_units(self) -> int:
+        return self.jobs
+
+    def run(
         self,
-        pool: ThreadPoolExecutor,
-        unit: Callable[[int], Ended[T]],
-        seeds: Sequence[int],
-        on_ended: Callable[[Ended[T]], None],
+        units: Sequence[UNIT],
+        on_ended: Callable[[Ended[UNIT, T]], None],
+        repeats: Repeats[UNIT, T] | None = None,
     ) -> None:
-        left, waiting = iter(seeds), set[Future[Ended[T]]]()
+        left, waiting = iter(units), set[Future[Ended[UNIT, T]]]()
         while True:
-            while len(waiting) < 2 * self.jobs and (seed := next(left, None)) is not None:
-                waiting.add(pool.submit(unit, seed))
+            waiting |= {self.pool.submit(self._ended, unit) for unit in islice(left, 2 * self.jobs - len(waiting))}
             if not waiting:
                 return
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
                 on_ended(future.result())
 
-
-def _unit(processes: UnitProcesses, work: SeedWork[T], seed: int) -> Ended[T]:
-    try:
-        finished, result = pickle.loads(processes.run(pickle.dumps(seed)))
-    except UnitLost as e:
-        return Ended(seed, work.unfinished(seed, str(e)))
-    if not finished:
-        raise result
-    return Ended(seed, result)
+    def _ended(self, unit: UNIT) -> Ended[UNIT, T]:
+        try:
+            finished, result = pickle.loads(self.processes.run(pickle.dumps(unit)))
+        except UnitLost as e:
+            return Ended(unit, self.work.unfinished(unit, str(e)))
+        if not finished:
+            raise result
+        return Ended(unit, result)

@@ -3,8 +3,8 @@
 A unit that crashes or takes too long ends this process only. A cluster's worker has threads, sockets and a clock, which a run in
 virtual time excludes, and it lives longer than one version of a user's Python program.
 
-Messages are pickles, each after its length in bytes. The process receives the work and then seeds, and sends an answer for each
-seed. Both ends have the same version of fieldtwin, which a cluster's worker has checked.
+Messages are pickles, each after its length in bytes. The process receives the work and then units, and sends an answer for each
+unit. Both ends have the same version of fieldtwin, which a cluster's worker has checked.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ def main(argv: list[str]) -> None:
         write_message(answers, _answer(work, pickle.loads(request)))
 
 
-def _answer(work: Any, seed: int) -> bytes:
+def _answer(work: Any, unit: Any) -> bytes:
     """Return the pickle of whether the unit ended, and of its result or its error."""
     try:
-        answer = pickle.dumps((True, work.run(seed)))
+        answer = pickle.dumps((True, work.run(unit)))
     except FieldtwinError as e:
         answer = pickle.dumps((False, e))
     except Exception as e:
-        answer = pickle.dumps((False, Bug(f"seed {seed} ended with {type(e).__name__}: {e}")))
+        answer = pickle.dumps((False, Bug(f"the run of seed {unit} ended with {type(e).__name__}: {e}")))
     if len(answer) <= MAX_RESULT_BYTES:
         return answer
     reason = f"its result has {len(answer)} bytes, and at most {MAX_RESULT_BYTES} are sent"
-    return pickle.dumps((True, work.unfinished(seed, reason)))
+    return pickle.dumps((True, work.unfinished(unit, reason)))
 
 
 if __name__ == "__main__":

@@ -35,14 +35,14 @@ class UnitProcesses:
         self._lock = Lock()
         self._closed = False
 
-    def run(self, seed: bytes) -> bytes:
-        """Return the pickled answer to the pickled seed. Raises `UnitLost`."""
+    def run(self, unit: bytes) -> bytes:
+        """Return the pickled answer to the pickled unit. Raises `UnitLost`."""
         reason = ""
         for _ in range(MOST_TRIES):
             process = self._take()
             late = Event()
             with _limited(process, self._limit_s, late):
-                answer = _ask(process, seed)
+                answer = _ask(process, unit)
             if answer is not None:
                 with self._lock:
                     self._idle.append(process)
@@ -112,10 +112,10 @@ def _limited(process: subprocess.Popen[bytes], limit_s: float, late: Event) -> I
         limit.cancel()
 
 
-def _ask(process: subprocess.Popen[bytes], seed: bytes) -> bytes | None:
+def _ask(process: subprocess.Popen[bytes], unit: bytes) -> bytes | None:
     """Return the answer of the process, None if it has ended."""
     try:
-        write_message(cast(BinaryIO, process.stdin), seed)
+        write_message(cast(BinaryIO, process.stdin), unit)
         return read_message(cast(BinaryIO, process.stdout))
     except OSError:
         return None

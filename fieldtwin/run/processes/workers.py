@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
-A = TypeVar("A")
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -41,19 +40,6 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.terminate()
         self._pool.shutdown(cancel_futures=True)
-
-
-def run_all(workers: Workers | None, work: Callable[[A], T], items: Iterable[A]) -> list[T]:
-    """Return the result of `work` for each item, in the order of the items; without workers in this process."""
-    if workers is None:
-        return [work(item) for item in items]
-    return [future.result() for future in [workers.submit(work, item) for item in items]]
-
-
-def each(jobs: int, work: Callable[[A], T], items: Iterable[A]) -> list[T]:
-    """Return the result of `work` for each item, in the order of the items; `jobs` processes at a time, none for 1."""
-    with Workers(jobs) if jobs > 1 else nullcontext() as workers:
-        return run_all(workers, work, items)
 
 
 def _ends_quietly() -> None:

@@ -20,7 +20,7 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, run_seed, verdict_of
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.places.local import LocalPlace
-from fieldtwin.run.places.place import Repeats
+from fieldtwin.run.places.place import run_units
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.language.form import load_scenario
@@ -185,7 +185,7 @@ def test_a_campaign_of_runs_finds_a_broken_invariant_and_confirms_its_scenario(f
 def run_campaign(campaign: Campaign, seeds: range, jobs: int) -> list[ScenarioResult]:
     results: list[ScenarioResult] = []
     work = ScenarioRuns(campaign)
-    LocalPlace(jobs).run(work, seeds, lambda ended: results.append(ended.result), Repeats(work))
+    run_units(LocalPlace(jobs), work, seeds, lambda ended: results.append(ended.result))
     return sorted(results, key=lambda result: result.seed or 0)
 
 

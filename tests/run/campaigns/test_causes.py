@@ -7,7 +7,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -79,7 +81,7 @@ def test_the_number_of_compared_runs_is_limited() -> None:
 def test_a_search_takes_only_the_runs_that_a_campaign_has_left() -> None:
     further = FurtherRuns(0)
     further.used(MOST_RUNS - 3)
-    left, minimal, _, _ = shrunk_run(range(12), echo, {3, 8}.issubset, further=further)
+    left, minimal, _, _ = shrunk_run(range(12), echo, {3, 8}.issubset, further)
     assert ({3, 8} < set(left), minimal, further.left) == (True, False, 0)
 
 
@@ -92,9 +94,9 @@ def test_a_shape_has_kinds_and_targets_only() -> None:
     assert (shape_text([one, later, other]), shape_text([])) == ("silence on sensor, silence on valve", "no fault")
 
 
-def echo(part: Sequence[int]) -> frozenset[int]:
-    """Return the items; it stands for a run, and a process can call it."""
-    return frozenset(part)
+def echo(parts: Sequence[Sequence[int]]) -> list[frozenset[int]]:
+    """Return the items of each part; they stand for the result of a run."""
+    return [frozenset(part) for part in parts]
 
 
 @given(st.sets(st.integers(0, 19), min_size=1, max_size=4), st.integers(1, 25), st.integers(1, 7))
@@ -115,11 +117,34 @@ def test_tests_of_several_parts_at_a_time_change_neither_result_nor_limit(
     assert smallest(range(20), fails, most_runs, first_of) == smallest(range(20), fails, most_runs)
 
 
-@pytest.mark.long
-def test_processes_find_the_same_faults_as_one() -> None:
-    alone = shrunk_run(range(12), echo, {3, 8}.issubset)
-    assert shrunk_run(range(12), echo, {3, 8}.issubset, jobs=2) == alone
-    assert alone == ([3, 8], True, frozenset({3, 8}), frozenset())
+@given(
+    st.sets(st.integers(0, 19), min_size=1, max_size=4),
+    st.lists(st.integers(1, 30), min_size=1, max_size=6),
+    st.integers(0, 80),
+)
+@settings(max_examples=80, deadline=None)
+def test_the_number_of_workers_changes_neither_the_schedule_nor_the_count_of_runs(
+    needed: set[int], workers: list[int], used: int
+) -> None:
+    def shrunk(parallel: Callable[[], int]) -> tuple[object, int]:
+        further = FurtherRuns(0)
+        further.used(used)
+        return shrunk_run(range(20), echo, needed.issubset, further, parallel), further.left
+
+    assert shrunk(partial(next, cycle(workers))) == shrunk(lambda: 1)
+
+
+def test_no_more_parts_run_at_a_time_than_there_are_workers_and_none_runs_twice() -> None:
+    asked: list[list[tuple[int, ...]]] = []
+
+    def results_of(parts: Sequence[Sequence[int]]) -> list[frozenset[int]]:
+        asked.append([tuple(part) for part in parts])
+        return echo(parts)
+
+    assert shrunk_run(range(12), results_of, {3, 8}.issubset, FurtherRuns(0), lambda: 4)[:2] == ([3, 8], True)
+    runs = [part for parts in asked for part in parts]
+    assert len(runs) == len(set(runs))
+    assert max(map(len, asked)) == 4
 
 
 @pytest.mark.long

@@ -7,19 +7,17 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
-from threading import Event
 from typing import Any
 
 import msgspec
 import pytest
 from click.testing import CliRunner, Result
-from distributed import Client
+from dask_cluster import Cluster, start_dask_threads
 from shed_site import write_shed
 from support import eventually, run
 
@@ -29,9 +27,9 @@ from fieldtwin.results.trace_about import read_about
 from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns
 from fieldtwin.run.campaigns.ledger import Ledger, LedgerEntry
 from fieldtwin.run.campaigns.many_seeds import SeedRuns
-from fieldtwin.run.places.clusters import place_named
 from fieldtwin.run.places.local import LocalPlace
-from fieldtwin.run.places.place import Ended, Place, Repeats, SeedWork
+from fieldtwin.run.places.place import Ended, Place, Repeats, SeedWork, run_units
+from fieldtwin.run.places.sample import sample_of
 from fieldtwin.run.virtual.fault_schedule import RandomFaults
 from fieldtwin.run.virtual.run import VirtualOptions
 
@@ -60,55 +58,9 @@ class Leaky(Program):
 FAULTS = RandomFaults(15.0)
 
 
-class Cluster:
-    """A scheduler with workers, all processes of this computer."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{free.getsockname()[1]}"
-        host, _, port = self.address.partition(":")
-        self._start("scheduler", "scheduler", "--host", host, "--port", port, "--no-dashboard")
-
-    def _start(self, name: str, *words: str, environment: dict[str, str] | None = None) -> None:
-        with (self._folder / f"{name}.log").open("wb") as log:
-            self._processes[name] = subprocess.Popen(
-                [sys.executable, "-m", "dask", *words],
-                cwd=self._folder,
-                env=os.environ | (environment or {}),
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
-
-    def add(self, *names: str, environment: dict[str, str] | None = None) -> None:
-        for name in names:
-            words = ["--nthreads", "1", "--name", name, "--no-dashboard", "--no-nanny", "--memory-limit", "0"]
-            words += ["--local-directory", str(self._folder)]
-            self._start(name, "worker", f"tcp://{self.address}", *words, environment=environment)
-
-    def kill(self, name: str) -> None:
-        self._processes[name].kill()
-
-    def place(self) -> Place:
-        return place_named(f"dask://{self.address}", None)
-
-    def close(self) -> None:
-        for process in self._processes.values():
-            process.kill()
-        for process in self._processes.values():
-            process.wait()
-
-
 @pytest.fixture(autouse=True, scope="module")
-def threads_that_stay() -> None:
-    """Start the threads that Dask keeps until this process ends, so that no test appears to have left them."""
-    called = Event()
-    with Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0", set_as_default=False) as client:
-        client.submit(int).add_done_callback(lambda future: called.set())
-        assert called.wait(30)
+def dask_threads() -> None:
+    start_dask_threads()
 
 
 @pytest.fixture
@@ -131,19 +83,19 @@ def runs(duration_s: float = 20.0) -> SeedRuns:
 
 
 def results(
-    place: Place, work: SeedWork[Any], seeds: range, heard: Callable[[Ended[Any]], None] = lambda ended: None
-) -> tuple[dict[int, Any], Repeats[Any]]:
+    place: Place, work: SeedWork[Any], seeds: range, heard: Callable[[Ended[int, Any]], None] = lambda ended: None
+) -> tuple[dict[int, Any], Repeats[int, Any]]:
     """Return the result of each seed, after a check that each came exactly once, and the repetitions."""
     found: dict[int, Any] = {}
-    repeats = Repeats(work)
+    repeats = Repeats(work, sample_of(seeds))
 
-    def ended(one: Ended[Any]) -> None:
-        assert one.seed not in found
-        found[one.seed] = one.result
+    def ended(one: Ended[int, Any]) -> None:
+        assert one.unit not in found
+        found[one.unit] = one.result
         heard(one)
 
     with place:
-        place.run(work, seeds, ended, repeats)
+        run_units(place, work, seeds, ended, repeats)
     assert sorted(found) == list(seeds)
     return found, repeats
 
@@ -159,7 +111,7 @@ def test_no_seed_is_lost_or_counted_twice_while_workers_are_killed_and_added(clu
     victims = dict(zip(random.sample(range(2, 25), 2), random.sample(names, 2), strict=True))
     count = 0
 
-    def heard(ended: Ended[Any]) -> None:
+    def heard(ended: Ended[int, Any]) -> None:
         nonlocal count
         count += 1
         ledger.add("shed", 1.0, ended.result)

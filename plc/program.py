@@ -90,8 +90,8 @@ class Variable:
 
     `initial` is its value before the first scan. `max_bytes` and `depth` apply to message outputs. The value of a `retain`
     variable is kept when the process ends. `limits` are shown to users, and a force must be within them. `words` are the names of
-    its values. `address` is the direct address of a located variable, such as ``%QX0.0``. An input without `needs_tag` keeps its
-    value while the system file binds it to no tag.
+    its values. `address` is the direct address of a `located` variable, such as ``%QX0.0``; "" if it is not known yet. An input
+    without `needs_tag` keeps its value while the system file binds it to no tag.
     """
 
     name: str
@@ -106,6 +106,7 @@ class Variable:
     words: tuple[tuple[int, str], ...] = ()
     address: str = ""
     needs_tag: bool = True
+    located: bool = False
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:

@@ -112,6 +112,11 @@ _MEANINGS = {
         "The system file allows writes to the tag (`writable`), and neither a program nor a server in the system file writes it.",
         "Bind an output of a program to it, or remove it from `writable`.",
     ),
+    "ST115": (
+        "A STRING is declared at %I* or %Q*. On a controller it gets the bytes of a device, but the system file can only bind "
+        "BOOL, numbers, times and enumerations. The variable keeps its initial value, or what the program assigns.",
+        "Use an array of BYTE, whose elements can be bound, or MESSAGES for texts.",
+    ),
 }
 
 ST_WARNINGS = tuple(

@@ -43,6 +43,7 @@ FINDINGS = {
     "ST112": "tag bound to an input that is not used",
     "ST113": "time bound to a tag in a different unit",
     "ST114": "writable tag that nothing writes",
+    "ST115": "STRING at an address, which cannot be a tag",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

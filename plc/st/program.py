@@ -40,6 +40,7 @@ from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.inspection import Inspection, shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
+from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.variable_paths import VariablePaths
@@ -69,9 +70,12 @@ class StProgram(Program):
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""
         inputs = [v for v in self.st_variables.values() if v.role == "input" and _tag_kind(v.kind) is not None]
-        self.st_inputs = [_Input(v) for v in inputs if not v.shared]
-        self.st_shared_inputs = [_Input(v) for v in inputs if v.shared]
+        self.st_inputs = [_Input(v) for v in inputs if not v.shared and not v.steps]
+        self.st_shared_inputs = [_Input(v) for v in inputs if v.shared and not v.steps]
         """The inputs that are global variables with an address."""
+        self.st_part_inputs = [_Input(v) for v in inputs if v.steps]
+        """The inputs that are parts of variables, and the other parts after them."""
+        self.st_parts = [v for v in self.st_variables.values() if v.role != "input" and v.steps]
         self.st_converted: list[tuple[str, str, Callable[[Any], Any]]] = []
         """The outputs and locals whose tags hold other values than the variables."""
         self.st_shared: list[tuple[str, str, Callable[[Any], Any] | None]] = []
@@ -79,15 +83,15 @@ class StProgram(Program):
         same: list[tuple[str, str]] = []
         for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
-                setattr(self.st_body, v.attribute, self.__dict__[v.name])
-            elif v.role != "input" and _tag_kind(v.kind) is not None and v.name in self.st_variables:
-                convert = _to_tag(v.kind)
+                setattr(self.st_body, str(v.attribute), self.__dict__[v.name])
+            elif v.role != "input" and _tag_kind(v.kind) is not None and v.name in self.st_variables and not v.steps:
+                attribute, convert = str(v.attribute), _to_tag(v.kind)
                 if v.shared:
-                    self.st_shared.append((v.name, v.attribute, convert))
+                    self.st_shared.append((v.name, attribute, convert))
                 elif convert is not None:
-                    self.st_converted.append((v.name, v.attribute, convert))
+                    self.st_converted.append((v.name, attribute, convert))
                 else:
-                    same.append((v.name, v.attribute))
+                    same.append((v.name, attribute))
         self.st_outputs = [name for name, _ in same]
         self.st_read = reader([attribute for _, attribute in same])
         """Reads the values of `st_outputs`, all at once, because a large program has hundreds."""
@@ -108,6 +112,8 @@ class StProgram(Program):
             getattr(body, connection(self.st_instance, into=True))()
         for item in self.st_inputs:
             item.put(body, namespace[item.name])
+        for item in self.st_part_inputs:
+            item.put(self.st_holder(item.variable), namespace[item.name])
         try:
             body.execute()
         except RecursionError as e:
@@ -134,26 +140,41 @@ class StProgram(Program):
         for name, attribute, convert in self.st_shared:
             value = getattr(self.st_resource.globals, attribute)
             namespace[name] = convert(value) if convert else value
+        for part in self.st_parts:
+            value, convert = self.st_value(part), _to_tag(part.kind)
+            namespace[part.name] = convert(value) if convert else value
 
     def st_holder(self, variable: ProgramVariable) -> Any:
-        """Return the object that holds a variable's value as the attribute `variable.attribute`."""
-        return self.st_resource.globals if variable.shared else self.st_body
+        """Return the object, or the list, that holds a variable's value as its attribute or element `variable.attribute`."""
+        return reached(self.st_resource.globals if variable.shared else self.st_body, variable.steps)
+
+    def st_value(self, variable: ProgramVariable) -> Any:
+        """Return the value of a variable as the program holds it."""
+        return value_of(self.st_holder(variable), variable.attribute)
+
+    def st_assign(self, variable: ProgramVariable, value: Any) -> None:
+        """Set a variable to a value as the program holds it."""
+        assign(self.st_holder(variable), variable.attribute, value)
 
     def put(self, name: str, value: Scalar) -> None:
         super().put(name, value)
         found = self.st_variables.get(name)
         if found is not None:
             convert = _from_tag(found.kind)
-            holder = self.st_holder(found)
-            setattr(holder, found.attribute, convert(value) if convert else value)
-            if found.role != "input":
-                setattr(holder, line_of(found.attribute), 0)
+            self.st_assign(found, convert(value) if convert else value)
+            if self.st_line(found):
+                setattr(self.st_holder(found), line_of(str(found.attribute)), 0)
+
+    def st_line(self, variable: ProgramVariable | None) -> Any:
+        """Return the line that last assigned a variable: its number, or its file and number; 0 if it is not known."""
+        if variable is None or isinstance(variable.attribute, int):
+            return 0
+        return getattr(self.st_holder(variable), line_of(variable.attribute), 0)
 
     def place(self, name: str) -> SourceLine | None:
         """Return the line that assigned the output; for an output with its initial value, the line of its
         declaration."""
-        found = self.st_variables.get(name)
-        line = getattr(self.st_holder(found), line_of(found.attribute), 0) if found is not None else 0
+        line = self.st_line(self.st_variables.get(name))
         if not line:
             return None
         place = self.st_places.get(line)
@@ -181,7 +202,9 @@ class StProgram(Program):
             raise UsageError(f"{name} cannot be forced to that", expected=e.expected, got=repr(value)) from e
 
     def internal_names(self) -> Iterator[str]:
-        return self.st_paths.internal_names(self.st_body, self.st_resource.globals)
+        shown = {v.name for v in self.st_parts}
+        names = self.st_paths.internal_names(self.st_body, self.st_resource.globals)
+        return (name for name in names if name not in shown)
 
     def internal(self, path: str) -> InternalVariable | None:
         return self.st_paths.internal(path, self.st_body, self.st_resource.globals)
@@ -210,7 +233,7 @@ class StProgram(Program):
             kept["_lookup"] = own["_lookup"]
         for v in new.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
-                setattr(new.st_body, v.attribute, own[v.name])
+                setattr(new.st_body, str(v.attribute), own[v.name])
         fresh = {**new.__dict__, **kept}
         self.__class__ = type(new)
         own.clear()
@@ -227,7 +250,7 @@ class StProgram(Program):
 
     def st_kept(self, v: ProgramVariable) -> Any:
         """Return what is retained of a variable, as data for JSON; None for nothing."""
-        value = getattr(self.st_holder(v), v.attribute)
+        value = self.st_value(v)
         return dump(value) if v.retain else retained_part(value)
 
     def retain_layout(self) -> Any:
@@ -240,17 +263,17 @@ class StProgram(Program):
         """Restore what `retained` returned: variables that are in `kept` take its values."""
         for v in self.st_retained:
             if v.name in kept:
-                holder = self.st_holder(v)
-                setattr(holder, v.attribute, load(getattr(holder, v.attribute), kept[v.name]))
+                self.st_assign(v, load(self.st_value(v), kept[v.name]))
         self.st_show()
 
 
 class _Input:
     """An input: how the value in the image is converted to the program's value."""
 
-    __slots__ = ("attribute", "convert", "name")
+    __slots__ = ("attribute", "convert", "name", "variable")
 
     def __init__(self, variable: ProgramVariable) -> None:
+        self.variable = variable
         self.name = variable.name
         self.attribute = variable.attribute
         self.convert = _from_tag(variable.kind)
@@ -258,7 +281,7 @@ class _Input:
     def put(self, holder: Any, value: Any) -> None:
         """Set the variable in `holder`. Without a `value`, it keeps the one that it has."""
         if value is not None:
-            setattr(holder, self.attribute, self.taken(value) if self.convert else value)
+            assign(holder, self.attribute, self.taken(value) if self.convert else value)
 
     def taken(self, value: Any) -> Any:
         """Return `value` as the program uses it. Raises `LogicError` for a value that the variable cannot hold."""
@@ -313,7 +336,7 @@ def program_class(
     if takes_writes:
         tags = {WRITES: message_input(), **tags}
     decided = DecisionReader(
-        Inspection(unit, [(v.name, v.kind) for v in found.variables]),
+        Inspection(unit, [(v.name, v.kind) for v in found.variables if not v.steps]),
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )
@@ -347,7 +370,8 @@ def _class_of(
     instance: str,
 ) -> type[StProgram]:
     """Return the class of program `found` with the variables `tags`. Those in `internal` could be tags as well."""
-    hidden = [v for v in found.variables if (_tag_kind(v.kind) is None or v.name in internal) and not v.shared]
+    own = [v for v in found.variables if not v.shared and not v.steps]
+    hidden = [v for v in own if _tag_kind(v.kind) is None or v.name in internal]
     body: dict[str, Any] = {
         "st_unit": unit,
         "st_declared": found,
@@ -383,6 +407,7 @@ def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:
         words=tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else (),
         address=v.location,
         needs_tag=not (v.optional or v.name.lower() in connected),
+        located=v.optional,
     )
 
 

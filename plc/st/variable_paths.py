@@ -24,8 +24,8 @@ class VariablePaths:
 
     def __init__(self, unit: CompiledUnit, program: CompiledProgram, hidden: Sequence[ProgramVariable]) -> None:
         self._hidden = Inspection(unit, [(v.name, v.kind) for v in hidden])
-        self._every = Inspection(unit, [(v.name, v.kind) for v in program.variables if not v.shared])
-        self._shared = {v.name.lower(): v for v in program.variables if v.shared}
+        self._every = Inspection(unit, [(v.name, v.kind) for v in program.variables if not v.shared and not v.steps])
+        self._shared = {v.name.lower(): v for v in program.variables if v.shared and not v.steps}
         self._globals = _globals_of(unit, program)
 
     def internal_names(self, body: Any, shared: Any) -> Iterator[str]:
@@ -86,7 +86,7 @@ class VariablePaths:
 def _globals_of(unit: CompiledUnit, program: CompiledProgram) -> dict[str, tuple[str, GlobalVariable]]:
     """Return the global variables that are not tags, and that no variable of the program hides, by name in lower case."""
     own = {v.name.lower() for v in program.variables}
-    shared = {v.attribute for v in program.variables if v.shared}
+    shared = {v.attribute for v in program.variables if v.shared and not v.steps}
     found = {}
     for key, of in unit.globals.items():
         of_list = key.rpartition(".")[0]

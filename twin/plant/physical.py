@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -34,13 +34,15 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_for
 from fieldtwin.plc.cycle.start import StartPolicy
-from fieldtwin.plc.program import Role
+from fieldtwin.plc.program import Role, Variable
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
 from fieldtwin.twin.plant.alarms import load_alarms
 from fieldtwin.twin.site.schema import StartForm
 from fieldtwin.twin.site.system import System
 
 MESSAGE_DEPTH = 16
+MAX_WARNINGS = 8
+"""How many unbound inputs of a program have a warning each; more have one together."""
 PLC_LOST_CYCLES = 50
 """The PLC's outputs are ignored when it has not published for this many cycles, and for at least `PLC_LOST_MS`."""
 PLC_LOST_MS = 500
@@ -127,12 +129,26 @@ def program_warnings(system: System) -> tuple[str, ...]:
     texts = [config for config in programs_of(system) if config.source.partition(":")[0].strip() != "python"]
     programs = [config.bind(folder).program for config in texts]
     unbound = [
-        f"input {v.name} ({v.address}) of program {config.name} is bound to no tag, so it keeps its initial value"
+        warning
         for config, program in zip(texts, programs, strict=True)
-        for v in program.variables.values()
-        if v.role is Role.INPUT and v.address and v.name not in config.inputs
+        for warning in _unbound(config, program.variables.values())
     ]
     return tuple(dict.fromkeys([*(warning for program in programs for warning in program.source_warnings), *unbound]))
+
+
+def _unbound(config: ProgramConfig, variables: Iterable[Variable]) -> Iterator[str]:
+    """Yield warnings about the located inputs of a program that are bound to no tag: one for each, or one for all of many."""
+    found = [v for v in variables if v.role is Role.INPUT and v.located and v.name not in config.inputs]
+    if len(found) > MAX_WARNINGS:
+        named = ", ".join(v.name for v in found[:MAX_WARNINGS])
+        yield (
+            f"the inputs {named} and {len(found) - MAX_WARNINGS} more of program {config.name} are bound to no tag, so they "
+            "keep their initial values"
+        )
+        return
+    for v in found:
+        address = v.address or "at an address without a number"
+        yield f"input {v.name} ({address}) of program {config.name} is bound to no tag, so it keeps its initial value"
 
 
 def _start_policy(form: StartForm) -> StartPolicy:

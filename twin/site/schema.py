@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from fieldtwin.twin.site.alarm_forms import AlarmForm
-from fieldtwin.twin.site.base_forms import Milliseconds, Name, Pause, SiteModel, TagName
+from fieldtwin.twin.site.base_forms import (
+    Milliseconds,
+    Name,
+    Pause,
+    SiteModel,
+    SourceName,
+    TagName,
+    VariableName,
+)
 from fieldtwin.twin.site.serve_forms import ServeForm
 
 
@@ -151,7 +159,7 @@ class WatchdogForm(SiteModel):
 class InputForm(SiteModel):
     """The source of a program's input, and the value that the program sees while that source is bad."""
 
-    tag: TagName = Field(examples=["meter.frequency"])
+    tag: SourceName = Field(examples=["meter.frequency"])
     if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
@@ -180,8 +188,8 @@ class ProgramForm(SiteModel):
     )
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
-    inputs: dict[Name, InputForm] = Field(default={})
-    outputs: dict[Name, TagName] = Field(default={})
+    inputs: dict[VariableName, InputForm] = Field(default={})
+    outputs: dict[VariableName, TagName] = Field(default={})
     invariants: dict[str, str] = Field(
         default={},
         max_length=64,

@@ -26,10 +26,12 @@ def is_line(attribute: str) -> bool:
 class Assignments(ast.NodeTransformer):
     """The pass that adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``.
 
-    `shared` are the outputs among the global variables. Code of several files assigns them, so their lines have the file `path`.
+    `shared` are the outputs among the global variables. Code of several files assigns them, so their lines have the file `path`,
+    and so do those of a function block (`with_path`), which may be in another file than the program.
     """
 
-    def __init__(self, outputs: frozenset[str], shared: frozenset[str], path: str) -> None:
+    def __init__(self, outputs: frozenset[str], shared: frozenset[str], path: str, *, with_path: bool) -> None:
+        self._with_path = {"self": with_path, GLOBALS: True}
         self._outputs = {"self": outputs, GLOBALS: shared}
         self._path = path
 
@@ -56,7 +58,7 @@ class Assignments(ast.NodeTransformer):
         for owner, name in found:
             target = ast.Attribute(ast.Name(owner, ast.Load()), line_of(name), ast.Store())
             place: ast.expr = ast.Constant(line)
-            if owner == GLOBALS:
+            if self._with_path[owner]:
                 place = ast.Tuple([ast.Constant(self._path), place], ast.Load())
             statement = ast.Assign([target], place, lineno=line, end_lineno=line)
             for node in ast.walk(statement):

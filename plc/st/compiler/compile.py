@@ -20,7 +20,12 @@ from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
 from fieldtwin.plc.st.compiler.configurations.called import with_called_programs
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
-from fieldtwin.plc.st.compiler.configurations.located import overlaps, shared_addresses, without_addresses
+from fieldtwin.plc.st.compiler.configurations.located import (
+    misplaced,
+    overlaps,
+    shared_addresses,
+    without_addresses,
+)
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.execution_control import with_execution_control
 from fieldtwin.plc.st.compiler.pous.blocks import Blocks
@@ -104,7 +109,7 @@ class _Unit:
         for warning in unit.warnings:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
-        unit = with_configured(with_called_programs(with_full_names(unit), dialect))
+        unit = with_configured(with_called_programs(with_full_names(unit), dialect), vendor=dialect.vendor)
         self.unit = without_edges(without_charts(without_addresses(unit)))
         self.unit = with_inherited(without_instance_variables(self.unit, dialect))
         if not dialect.vendor:
@@ -143,13 +148,15 @@ class _Unit:
                     self.blocks.write(pou)
                 elif pou.kind == "PROGRAM":
                     programs.append(self.programs.write(pou))
+        self.programs.configured.check()
         with self.env.errors.collect():
             refuse_recursion(self.env)
         self.variables.write_globals()
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
-        lines = SourceLines(self.out, self.path, self.programs.outputs, self.programs.shared_outputs)
+        outputs = {**self.programs.outputs, **self.blocks.outputs}
+        lines = SourceLines(self.out, self.path, outputs, self.programs.shared_outputs)
         code = lines.code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
@@ -196,16 +203,8 @@ class _Unit:
         """Check that addresses are where they are allowed, and that the variables of a POU, and the global ones, have different
         addresses. `unit` still has the addresses.
         """
-        for pou in unit.pous:
-            for block in pou.blocks:
-                for variable in block.variables if pou.kind != "PROGRAM" or block.kind != "VAR" else ():
-                    if variable.location:
-                        message = f"{variable.name} AT {variable.location}: an address in {block.kind} of a {pou.kind}"
-                        expected, hint = (
-                            "addresses in VAR of a PROGRAM or in VAR_GLOBAL",
-                            "bind an input to a tag in the system file",
-                        )
-                        self.env.collected(self.env.error(variable.pos, message, expected=expected, hint=hint))
+        for pos, message, expected in misplaced(unit):
+            self.env.collected(self.env.error(pos, message, expected=expected))
         if self.env.dialect.vendor:
             for pos, address, other in overlaps(unit, in_bytes=self.env.dialect.name == "twincat"):
                 message = f"{address} and {other} share bits in {self.env.dialect.name}, which is not supported"

@@ -13,6 +13,7 @@ from fieldtwin.plc.st.compiler.configurations.located import overlaps
 from fieldtwin.plc.st.dialects import StWarning
 from fieldtwin.plc.st.findings.calls import called_sometimes
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import area_of
 from fieldtwin.plc.st.syntax.walk import nodes
 from fieldtwin.plc.st.syntax.written import reference, text_of
 
@@ -160,6 +161,8 @@ def _unwritten_outputs(about: _About) -> Iterator[Finding]:
             written.update(_variable_of(a.value) for a in one.arguments if isinstance(a.value, t.Ref))
     for block in about.pou.blocks:
         for variable in block.variables if block.kind == "VAR_OUTPUT" else ():
+            if area_of(variable.location) == "I":
+                continue  # the process writes it
             if variable.name.lower() not in {*written, "eno"} and variable.initial is None:
                 yield "ST104", variable.pos, f"the output {variable.name} is never written"
 
@@ -236,6 +239,15 @@ def _no_tags(about: _About) -> Iterator[Finding]:
                 yield "ST110", v.pos, f"{v.name} cannot be a tag, so only a CONFIGURATION can connect it"
 
 
+def _texts_at_addresses(about: _About) -> Iterator[Finding]:
+    for v in (v for block in about.pou.blocks for v in block.variables if area_of(v.location) in ("I", "Q")):
+        kind: t.TypeSpec = v.type
+        while isinstance(kind, t.ArrayType):
+            kind = kind.of
+        if isinstance(kind, t.StringType):
+            yield "ST115", v.pos, f"{v.name} AT {v.location} is a STRING, which cannot be bound to a tag"
+
+
 _RULES: tuple[Callable[[_About], Iterator[Finding]], ...] = (
     _unused,
     _equal_reals,
@@ -245,4 +257,5 @@ _RULES: tuple[Callable[[_About], Iterator[Finding]], ...] = (
     _divisions,
     _unreachable,
     _no_tags,
+    _texts_at_addresses,
 )

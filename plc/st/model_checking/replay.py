@@ -86,8 +86,7 @@ class Replay:
             program.__dict__[name] = tag
             quality, reason = (Quality.GOOD, Reason.NONE) if good.get(name, True) else (Quality.BAD, Reason.TIMEOUT)
             known[name] = TagValue(tag, quality, reason, now_ns)
-            variable = program.st_variables[name]
-            setattr(program.st_holder(variable), variable.attribute, value)
+            program.st_assign(program.st_variables[name], value)
         program._lookup = known.__getitem__
         program.st_resource.begin(ScanInfo(now_ns, 0, False), program.tag)
 

@@ -40,6 +40,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
 from fieldtwin.plc.st.model_checking.state import Domain, Leaf, integer, leaves, objects
 from fieldtwin.plc.st.model_checking.terms import Relaxed
 from fieldtwin.plc.st.program import StProgram
+from fieldtwin.plc.st.runtime.parts import assign
 from fieldtwin.plc.st.syntax.tree import Pos
 
 _START = "_since_ns"
@@ -237,7 +238,7 @@ class Builder:
         for leaf, symbol in zip(self._leaves, symbols, strict=True):
             leaf.put(_earlier(symbol.value, passed) if leaf.is_time else symbol.value)
         for each, (_, holder, attribute) in zip(self._inputs[1:], self._input_places, strict=True):
-            setattr(holder, attribute, each.value)
+            assign(holder, attribute, each.value)
         try:
             scan.assumed = both(*(self._asked(interpreter, call) for call in assumptions))
             interpreter.failures.clear()

@@ -173,10 +173,10 @@ def _of_program(program: CompiledProgram) -> dict[str, _Declared]:
     """Return the variables of a program, without those that are global or carry messages, which are bound from outside."""
     return {
         v.name.lower(): _Declared(
-            v.name, {"input": "VAR_INPUT", "output": "VAR_OUTPUT"}.get(v.role, "VAR"), v.kind, v.attribute
+            v.name, {"input": "VAR_INPUT", "output": "VAR_OUTPUT"}.get(v.role, "VAR"), v.kind, str(v.attribute)
         )
         for v in program.variables
-        if not v.shared and not isinstance(v.kind, ty.MessagesIn | ty.MessagesOut)
+        if not v.shared and not v.steps and not isinstance(v.kind, ty.MessagesIn | ty.MessagesOut)
     }
 
 

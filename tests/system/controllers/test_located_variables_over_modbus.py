@@ -15,8 +15,14 @@ import pytest
 from procs import CHECKOUT, Fieldtwin, fieldtwin, wait_for
 from pymodbus.client import ModbusTcpClient
 
-PROJECT = """PROGRAM Main
+PROJECT = """FUNCTION_BLOCK Gain
+VAR_INPUT x : INT; END_VAR
+VAR factor AT %M* : INT; y AT %Q* : INT; offset AT %I* : INT; END_VAR
+  y := factor * x + offset;
+END_FUNCTION_BLOCK
+PROGRAM Main
 VAR
+  gain : Gain;
   lamp   AT %QX0.0  : BOOL;
   start  AT %QX99.7 : BOOL;
   spare  AT %IX2.3  : BOOL := TRUE;
@@ -33,12 +39,18 @@ VAR_INPUT sensor : REAL; END_VAR
   lamp := start;
   scans := scans + 1;
   twice := 2 * limit;
+  gain(x := 10);
 END_PROGRAM
 CONFIGURATION Config0
   RESOURCE Res0 ON PLC
     TASK fast(INTERVAL := T#20ms, PRIORITY := 0);
     PROGRAM inst WITH fast : Main;
   END_RESOURCE
+  VAR_CONFIG
+    inst.gain.factor AT %MW20 : INT := 3;
+    inst.gain.y AT %QW20 : INT;
+    inst.gain.offset AT %IW20 : INT := 1;
+  END_VAR
 END_CONFIGURATION
 """
 PLC = """plc:
@@ -158,3 +170,16 @@ def test_a_paused_plc_takes_no_writes(running: tuple[Fieldtwin, ModbusTcpClient]
         plc("go", by="test")
     wait_for(lambda: not client.write_register(1024 + 1023, 47).isError(), 5, "writes again")
     assert struct.unpack(">h", words(client, 2047, 1)) == (47,)
+
+
+@pytest.mark.long
+def test_the_variables_of_an_instance_have_the_registers_of_var_config(
+    running: tuple[Fieldtwin, ModbusTcpClient],
+) -> None:
+    run, client = running
+    assert client.read_input_registers(20, count=1).registers == [1]
+    assert struct.unpack(">h", words(client, 20, 1)) == (31,)
+    assert not client.write_register(1024 + 20, 5).isError()
+    assert struct.unpack(">h", words(client, 20, 1)) == (51,)
+    plc = run.control("p", "plc")
+    assert [row["value"] for row in plc("watch", tags=["main.gain.y", "main.gain.x"])["tags"]] == [51, 10]

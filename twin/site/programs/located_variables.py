@@ -52,7 +52,7 @@ def served_by_address(
             if served is None:
                 continue
             place = served.table, served.address
-            storage = (program.st_unit.path, v.attribute) if v.shared else (name, v.attribute)
+            storage = program.st_unit.path if v.shared else name, *v.steps, v.attribute
             before = found.get(place)
             if before is not None and before[1] != storage:
                 raise file.error(
@@ -87,7 +87,7 @@ def _served(
     if program.variables[v.name].role is Role.INPUT:
         bound = form.inputs.get(v.name)
         if bound is None:
-            return replace(served, constant=getattr(program.st_holder(v), v.attribute))
+            return replace(served, constant=program.st_value(v))
         return replace(served, tag=bound.tag, from_plc=bound.tag.partition(".")[0] in programs)
     writable = write and not isinstance(v.kind, ty.Enum)
     return replace(

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from fieldtwin.plc.st.dialects import Dialect
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import address_of
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import nodes
 
@@ -68,9 +69,12 @@ def _uses(pou: t.Pou, outer: frozenset[str]) -> Iterator[tuple[t.Ref, bool]]:
 
 
 def _block(program: t.Pou) -> t.Pou:
-    """Return a program as a function block, whose local variables other POUs can read."""
-    blocks = tuple(
-        replace(block, kind="VAR_OUTPUT") if block.kind == "VAR" and "CONSTANT" not in block.qualifiers else block
-        for block in program.blocks
-    )
-    return replace(program, kind="FUNCTION_BLOCK", blocks=blocks)
+    """Return a program as a function block, whose local variables other POUs can read, except those with an address."""
+    blocks: list[t.VarBlock] = []
+    for block in program.blocks:
+        located = tuple(v for v in block.variables if address_of(v.location))
+        others = replace(block, variables=tuple(v for v in block.variables if v not in located))
+        if block.kind == "VAR" and "CONSTANT" not in block.qualifiers:
+            others = replace(others, kind="VAR_OUTPUT")
+        blocks += [others, *([replace(block, kind="VAR", variables=located)] if located else [])]
+    return replace(program, kind="FUNCTION_BLOCK", blocks=tuple(blocks))

@@ -78,9 +78,11 @@ def _task(env: Environment, task: t.Task, declarations: Declarations) -> Compile
     return CompiledTask(task.name, interval_ns, number, text_of(single) if single is not None else "", task.pos)
 
 
-def with_configured(unit: t.SourceUnit) -> t.SourceUnit:
+def with_configured(unit: t.SourceUnit, *, vendor: bool) -> t.SourceUnit:
     """Return `unit` with the addresses and initial values of VAR_CONFIG in the declarations of its programs.
 
+    The result keeps those of parts of variables (`configured`); each path begins with the name of a PROGRAM or global variable.
+    In a vendor's dialect a path may begin with the name of a PROGRAM, because its project has no CONFIGURATION.
     Raises `FileInvalid` for a variable that does not exist or already has an address, and for programs of one type with
     different values.
     """
@@ -88,40 +90,47 @@ def with_configured(unit: t.SourceUnit) -> t.SourceUnit:
         return unit
     changed: dict[tuple[str, str], t.ConfiguredVariable] = {}
     for one in unit.configured:
-        program, name = _target(unit, one)
-        before = changed.setdefault((program.name.lower(), name), one)
+        program, name = _target(unit, one, vendor=vendor)
+        before = changed.setdefault((program.name.lower() if program else "", name), one)
         if (before.location, before.initial) != (one.location, one.initial):
             _fail(one, "two programs of one type have different values", expected="a PROGRAM for each of them")
-    return replace(unit, pous=tuple(_with_values(pou, changed) if pou.kind == "PROGRAM" else pou for pou in unit.pous))
-
-
-def _target(unit: t.SourceUnit, one: t.ConfiguredVariable) -> tuple[t.Pou, str]:
-    """Return the program that declares a variable of VAR_CONFIG, and the variable's name in lower case."""
-    instances = {instance.name.lower(): instance for instance in unit.instances}
-    path = [name.lower() for name in one.path]
-    if path[0] not in instances and len(path) > 1:
-        path.pop(0)  # the resource
-    instance = instances.get(path[0])
-    program = next(
-        (
-            pou
-            for pou in unit.pous
-            if instance and pou.kind == "PROGRAM" and pou.name.lower() == instance.program.lower()
-        ),
-        None,
+    parts = tuple(
+        replace(one, path=tuple(part for part in (program, name) if part))
+        for (program, name), one in changed.items()
+        if "." in name or "[" in name
     )
+    pous = tuple(_with_values(pou, changed) if pou.kind == "PROGRAM" else pou for pou in unit.pous)
+    return replace(unit, pous=pous, configured=parts)
+
+
+def _target(unit: t.SourceUnit, one: t.ConfiguredVariable, *, vendor: bool) -> tuple[t.Pou | None, str]:
+    """Return the program that declares a variable of VAR_CONFIG, and the variable's path in it, in lower case.
+
+    The program is None for a part of a global variable.
+    """
+    programs = {pou.name.lower(): pou for pou in unit.pous if pou.kind == "PROGRAM"}
+    instances = {instance.name.lower(): programs.get(instance.program.lower()) for instance in unit.instances}
+    path = [name.lower() for name in one.path]
+    if path[0] not in instances and len(path) > 1 and path[1] in instances:
+        path.pop(0)  # the resource
+    program = instances.get(path[0]) or (programs.get(path[0]) if vendor else None)
     if program is None:
-        _fail(one, "no program of the configuration has this name", expected=", ".join(i.name for i in unit.instances))
-    if len(path) > 2:
-        _fail(one, "a variable in a function block is not supported here", expected="a variable of a program")
+        names = {name.lower() for b in unit.globals for name in (b.list, *(v.name for v in b.variables)) if name}
+        if len(path) > 1 and path[0].partition("[")[0] in names:
+            return None, ".".join(path)
+        known = [i.name for i in unit.instances] or [pou.name for pou in programs.values() if vendor]
+        _fail(one, "no program of the configuration has this name", expected=", ".join(known) or "a CONFIGURATION")
     declared = {v.name.lower(): v for block in program.blocks for v in block.variables}
-    variable = declared.get(path[-1]) if len(path) == 2 else None
+    name = path[1].partition("[")[0] if len(path) > 1 else ""
+    variable = declared.get(name)
     if variable is None:
         _fail(one, f"{program.name} has no such variable", expected=", ".join(v.name for v in declared.values()))
+    if len(path) > 2 or "[" in path[1]:
+        return program, ".".join(path[1:])
     if one.location and (address_of(variable.location) or area_of(variable.location) != area_of(one.location)):
         wanted = f"{variable.name} AT %{area_of(one.location)}* in {program.name}"
         _fail(one, f"{variable.name} cannot get the address {one.location}", expected=wanted)
-    return program, path[-1]
+    return program, path[1]
 
 
 def _with_values(pou: t.Pou, changed: dict[tuple[str, str], t.ConfiguredVariable]) -> t.Pou:

@@ -7,6 +7,9 @@ An address that one PROGRAM alone uses is a variable of that program. Any other 
 that uses it, directly or through function blocks and functions, offers as its input or output. All declarations of one address
 are then this one variable, as in OpenPLC. A global variable that only an address names has the address as its name.
 
+A variable of a function block at a full address is the global variable of this address in every instance. A variable at ``%I*``,
+``%Q*`` or ``%M*`` of a function block or structure belongs to its instance (`parts`).
+
 Addresses of different sizes, such as %QX0.0 and %QW0, are different variables. The standard leaves the correspondence between
 an address and its place to the manufacturer; OpenPLC has one area for each size.
 """
@@ -16,14 +19,41 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+from fieldtwin.plc.st.compiler.configurations.parts import holders, type_name
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, bits_of, short_name
 from fieldtwin.plc.st.syntax.walk import nodes
 
 KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
 RETAIN = frozenset({"RETAIN", "PERSISTENT"})
+_BLOCKS = {
+    "PROGRAM": ("VAR", "VAR_INPUT", "VAR_OUTPUT"),
+    "FUNCTION_BLOCK": ("VAR", "VAR_INPUT", "VAR_OUTPUT"),
+    "CLASS": ("VAR",),
+}
+"""The blocks of each kind of POU whose variables can have addresses."""
 _TYPES = {"X": "BOOL", "B": "BYTE", "W": "WORD", "D": "DWORD", "L": "LWORD"}
 """The type of a variable that is not declared, by the size in its address (IEC 61131-3:2013, table 16)."""
+
+
+def misplaced(unit: t.SourceUnit) -> Iterator[tuple[t.Pos, str, str]]:
+    """Yield each address that is not allowed where it stands: its place, the error, and what is expected there."""
+    for pou in unit.pous:
+        for part in (pou, *pou.methods):
+            for block in part.blocks:
+                for v in _located([block]):
+                    where = f"{v.name} AT {v.location}: an address in {block.kind} of a {part.kind}"
+                    if block.kind not in _BLOCKS.get(part.kind, ()):
+                        expected = "VAR, VAR_INPUT or VAR_OUTPUT of a PROGRAM or FUNCTION_BLOCK, or VAR_GLOBAL"
+                        yield v.pos, where, f"addresses in {expected}"
+                    elif part.kind != "PROGRAM" and block.kind != "VAR" and address_of(v.location):
+                        free = f"{v.location[:2]}*"
+                        yield v.pos, where, f"{free}, because each instance has its own {v.name}, or the address in VAR"
+    for declared in unit.types:
+        for v in declared.fields if isinstance(declared, t.StructDecl) else ():
+            if address_of(v.location):
+                where = f"{v.name} AT {v.location}: an address in the structure {declared.name}"
+                yield v.pos, where, f"{v.location[:2]}*, because each variable of this type has its own {v.name}"
 
 
 def shared_addresses(blocks: Iterable[t.VarBlock]) -> Iterator[tuple[t.VarDecl, t.VarDecl]]:
@@ -37,9 +67,10 @@ def shared_addresses(blocks: Iterable[t.VarBlock]) -> Iterator[tuple[t.VarDecl, 
 
 @dataclass(frozen=True, slots=True)
 class Offered:
-    """A global variable with an address that a program offers as an input, an output or a local variable.
+    """A global variable that a program uses, and that has an address or located parts (`parts`).
 
-    `name` is its name in the program, and `list` the name of its global list, in lower case. A `retain` variable keeps its value.
+    The program offers it, or its parts, as inputs, outputs or local variables. `name` is its name in the program, and `list` the
+    name of its global list, in lower case. A `retain` variable keeps its value.
     """
 
     name: str
@@ -58,16 +89,18 @@ def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
     shared = {address for address, places in uses.items() if len(places) > 1 or not places[0]}
     declared = set(_addresses(unit.globals))
     programs = [pou for pou in unit.pous if pou.kind == "PROGRAM"]
-    local = {
+    others = [pou for pou in unit.pous if pou.kind in _BLOCKS and pou.kind != "PROGRAM"]
+    stated = {
         address_of(v.location): (v, block.qualifiers & RETAIN)
-        for pou in reversed(programs)
+        for pou in (*reversed(others), *reversed(programs))
         for block in pou.blocks
         for v in _located([block])
     }
+    local = set(_addresses(block for pou in programs for block in pou.blocks))
     added = []
     for address in uses:
-        if address in shared | (uses.keys() - local.keys()) and address not in declared:
-            v, qualifiers = local.get(address) or (_undeclared(unit, address), frozenset())
+        if address in shared | (uses.keys() - local) and address not in declared:
+            v, qualifiers = stated.get(address) or (_undeclared(unit, address), frozenset())
             variable = replace(v, name=address, location=address)
             added.append(t.VarBlock(v.pos, "VAR_GLOBAL", qualifiers, (variable,)))
     known = frozenset(declared | {block.variables[0].name for block in added})
@@ -80,7 +113,7 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     places = [("", address) for address in _addresses(unit.globals)]
     for pou in unit.pous:
-        names = [*_addresses(pou.blocks)] if pou.kind == "PROGRAM" else []
+        names = [*_addresses(pou.blocks)] if pou.kind in _BLOCKS else []
         names += [node.name for node in nodes(pou) if isinstance(node, t.Ref) and node.name.startswith("%")]
         places += [(pou.name.lower(), name) for name in names]
     places += [
@@ -90,6 +123,11 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
         if place not in found.setdefault(address, []):
             found[address].append(place)
     return found
+
+
+def used_addresses(unit: t.SourceUnit) -> frozenset[str]:
+    """Return the addresses that a unit uses, in their normal form."""
+    return frozenset(_uses(unit)) | frozenset(_addresses(block for pou in unit.pous for block in pou.blocks))
 
 
 def overlaps(unit: t.SourceUnit, *, in_bytes: bool) -> Iterator[tuple[t.Pos, str, str]]:
@@ -148,7 +186,7 @@ def _undeclared(unit: t.SourceUnit, address: str) -> t.VarDecl:
 def _program(pou: t.Pou, known: frozenset[str]) -> t.Pou:
     blocks: list[t.VarBlock] = []
     for block in pou.blocks:
-        if block.kind != "VAR" or not any(v.location for v in block.variables):
+        if block.kind not in _BLOCKS["PROGRAM"] or not any(v.location for v in block.variables):
             blocks.append(block)
             continue
         for v in block.variables:
@@ -163,13 +201,18 @@ def _program(pou: t.Pou, known: frozenset[str]) -> t.Pou:
 
 
 def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
-    """Return the located global variables that a program uses. `unit` is the result of `without_addresses`."""
+    """Return the global variables with addresses or located parts that a program uses.
+
+    `unit` is the result of `without_addresses`.
+    """
+    with_parts = holders(unit)
     retained = {v.name.lower() for block in unit.globals if block.qualifiers & RETAIN for v in block.variables}
     located = {
         (block.list.lower(), v.name.lower()): v
         for block in unit.globals
         if "CONSTANT" not in block.qualifiers
-        for v in _located([block])
+        for v in block.variables
+        if v.location or type_name(v.type) in with_parts
     }
     by_address = {address_of(v.location): key for key, v in reversed(located.items()) if address_of(v.location)}
     found: dict[tuple[str, str], str] = {}
@@ -185,17 +228,23 @@ def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
         for v in (v for b in pou.blocks if b.kind == "VAR_EXTERNAL" for v in _located([b]) if pou is program):
             found[by_address[address_of(v.location)]] = v.name
             own.add(v.name.lower())
-        for ref in (node for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Ref)):
+        for address in _addresses(pou.blocks) if pou.kind != "PROGRAM" else ():
+            add(by_address.get(address))
+        for ref in (node for node in nodes((pou.body, pou.actions, pou.methods)) if isinstance(node, t.Ref)):
             add(_global(ref, own, located, by_address))
     for ref in (n for n in nodes(_connections(unit, program.name.lower())) if isinstance(n, t.Ref)):
         add(_global(ref, set(), located, by_address))
     taken = {v.name.lower() for b in program.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
-    ordered = [key for key in located if key in found]
-    names = {}
-    for key in ordered:
-        address = address_of(located[key].location)
-        names[key] = found[key] if found[key].lower() not in taken or not address else short_name(address)
-    return [Offered(names[key], key[0], located[key], key[1] in retained) for key in ordered]
+    offers = []
+    for key in (key for key in located if key in found):
+        v, name = located[key], found[key]
+        if name.lower() in taken:
+            name = (
+                short_name(address) if (address := address_of(v.location)) else f"{key[0]}.{name}" if key[0] else name
+            )
+        taken.add(name.lower() if not v.location else "")
+        offers.append(Offered(name, key[0], v, key[1] in retained))
+    return offers
 
 
 def _global(
@@ -214,21 +263,31 @@ def _global(
 
 
 def _reached(unit: t.SourceUnit, program: t.Pou) -> list[t.Pou]:
-    """Return a program and the POUs that it calls, directly or through others."""
+    """Return a program and the POUs that it calls or contains, directly or through others, with their bases."""
     pous = {pou.name.lower(): pou for pou in unit.pous}
+    types: dict[str, list[t.TypeSpec]] = {}
+    for declared in unit.types:
+        if not isinstance(declared, t.EnumDecl):
+            inner = [v.type for v in declared.fields] if isinstance(declared, t.StructDecl) else [declared.type]
+            types[declared.name.lower()] = inner
     instances = {v.name.lower(): v.type for block in unit.globals for v in block.variables}
-    found, seen, at = [program], {program.name.lower()}, 0
-    while at < len(found):
-        pou = found[at]
-        at += 1
-        used = {
-            node.name.lower() for node in nodes((pou.blocks, pou.body, pou.actions)) if isinstance(node, t.NamedType)
-        }
-        for ref in (node.ref for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Call)):
-            used.add(ref.name.lower())
-            used |= {n.name.lower() for n in nodes(instances.get(ref.name.lower())) if isinstance(n, t.NamedType)}
-        for name in used - seen:
-            seen.add(name)
-            if name in pous:
-                found.append(pous[name])
+    found, seen, waiting = [program], {program.name.lower()}, [program]
+    while waiting:
+        pou = waiting.pop(0)
+        names = [*pou.extends]
+        everything = [*nodes((pou.blocks, pou.body, pou.actions, pou.methods))]
+        names += [node for node in everything if isinstance(node, t.NamedType)]
+        used = {name.name.lower() for name in names}
+        for ref in (node for node in everything if isinstance(node, t.Ref)):
+            of_list = ref.selectors[0] if ref.selectors else None
+            for name in (ref.name.lower(), of_list.name.lower() if isinstance(of_list, t.Member) else ""):
+                used |= {n.name.lower() for n in nodes(instances.get(name)) if isinstance(n, t.NamedType)}
+        used |= {node.ref.name.lower() for node in everything if isinstance(node, t.Call)}
+        new = used - seen
+        while new:
+            seen |= new
+            waiting += (more := [pous[name] for name in sorted(new) if name in pous])
+            found += more
+            inside = nodes(tuple(spec for name in new for spec in types.get(name, ())))
+            new = {n.name.lower() for n in inside if isinstance(n, t.NamedType)} - seen
     return found

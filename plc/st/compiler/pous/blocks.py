@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.assignments import line_of
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, by_reference, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.addresses import area_of
 
 
 class Bodies:
@@ -93,6 +95,8 @@ class Blocks(Bodies):
         super().__init__(variables, functions)
         self.kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
         """By function block: its variables that keep their values."""
+        self.outputs: dict[str, frozenset[str]] = {}
+        """By class of a function block: the attributes that hold its variables at %Q*."""
 
     def write(self, pou: t.Pou) -> None:
         """Write the Python class of a FUNCTION_BLOCK or CLASS."""
@@ -108,7 +112,7 @@ class Blocks(Bodies):
             for s, attribute in zip(held, kept, strict=True)
             if attribute not in in_outs and not s.is_constant
         )
-        with self.out.block(f"class B_{identifier(pou.name)}:", pou.pos):
+        with self.out.block(f"class {self._class_of(pou, kept)}:", pou.pos):
             self.out.line(f"__slots__ = {(*kept, *number)}")
             self.out.line(f"in_outs = {(*in_outs, *number)}")
             self.out.line(f"name = {pou.name!r}")
@@ -170,6 +174,20 @@ class Blocks(Bodies):
                 method.pos,
             )
             self.out.line("return self", method.pos)
+
+    def _class_of(self, pou: t.Pou, kept: list[str]) -> str:
+        """Return the head of the class of a POU. The lines of the last assignments of its variables at %Q* are in a base class,
+        because they do not belong to the state.
+        """
+        name = f"B_{identifier(pou.name)}"
+        located = {f"v_{v.name.lower()}" for b in pou.blocks for v in b.variables if area_of(v.location) == "Q"}
+        outputs = [attribute for attribute in kept if attribute in located]
+        if not outputs:
+            return name
+        self.outputs[name] = frozenset(outputs)
+        with self.out.block(f"class L_{identifier(pou.name)}:", pou.pos):
+            self.out.line(f"__slots__ = {(*map(line_of, outputs),)}")
+        return f"{name}(L_{identifier(pou.name)})"
 
     def _marked(self, pou: t.Pou, symbols: dict[str, Symbol], *words: str) -> tuple[str, ...]:
         """Return the attributes of the variables in blocks with one of these qualifiers."""

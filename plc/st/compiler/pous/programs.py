@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.configurations.located import offered
+from fieldtwin.plc.st.compiler.configurations.configured import ConfiguredParts
+from fieldtwin.plc.st.compiler.configurations.located import Offered, offered
+from fieldtwin.plc.st.compiler.configurations.parts import MAX_PARTS, Parts
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, Value, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.runtime.parts import Key
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 
@@ -24,25 +28,30 @@ COMPOUND = (ty.String, ty.Array, ty.Struct)
 _BLOCKS = {"VAR_INPUT": "input", "VAR_OUTPUT": "output", "VAR_IN_OUT": "local", "VAR": "local"}
 """The role of the variables in each block. A VAR_IN_OUT is a variable of the program, which a CONFIGURATION may connect."""
 _ROLES = {"I": "input", "Q": "output", "M": "local"}
+_AREAS = {"input": "%I*", "output": "%Q*"}
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramVariable:
-    """A variable of a PROGRAM that can be bound to a tag.
+    """A variable of a PROGRAM, or a part of one, that can be bound to a tag.
 
     `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts. Its value
-    is the `attribute` of the program's object, or of the object with the global variables if it is `shared`. `location` is its
-    address, if any. An `optional` input need not be bound to a tag.
+    is the `attribute` of the program's object, or of the object with the global variables if it is `shared`. The value of a part,
+    such as ``pump.fault``, is the `attribute`, or the element, of the object that is reached from there through `steps`.
+    `location` is its address, if any. An `optional` input need not be bound to a tag.
     """
 
     name: str
     role: str
     kind: ty.Type
     retain: bool
-    attribute: str
+    attribute: Key
     shared: bool = False
     location: str = ""
     optional: bool = False
+    steps: tuple[Key, ...] = ()
+    of_block: str = ""
+    """The function block, in lower case, of which it is a variable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +69,8 @@ class Programs(Bodies):
     def __init__(self, variables: Variables, functions: Functions, unit: t.SourceUnit) -> None:
         super().__init__(variables, functions)
         self._unit = unit
+        self._parts = Parts(unit, self.declarations)
+        self.configured = ConfiguredParts(self.env, self.declarations, unit)
         self.outputs: dict[str, frozenset[str]] = {}
         """By class of a PROGRAM: the attributes that hold its outputs and local variables."""
         self.shared_outputs: set[str] = set()
@@ -93,13 +104,17 @@ class Programs(Bodies):
                     variables.append(
                         ProgramVariable(v.name, role or "", kind, retain, attribute, location=address, optional=located)
                     )
-        assigned = frozenset(v.attribute for v in variables if v.role != "input")
+        assigned = frozenset(str(v.attribute) for v in variables if v.role != "input")
+        own = [part for v in variables for part in self._parts_of(pou, v, f"{pou.name}.{v.name}")]
+        variables += own
         variables += self._offered(pou, {v.name.lower() for v in variables})
-        self.shared_outputs.update(v.attribute for v in variables if v.shared and v.role != "input")
+        shared = (v for v in variables if v.shared and v.role != "input" and not v.steps)
+        self.shared_outputs.update(str(v.attribute) for v in shared)
         self.outputs[f"P_{identifier(pou.name)}"] = assigned
         with self.out.block(f"class P_{identifier(pou.name)}:", pou.pos):
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(pou, symbols, tuple(_BLOCKS))
+                self.configured.write_initials(self.out, pou)
             with self.out.block("def execute(self):"):
                 self.variables.initialise(pou, symbols, ("VAR_TEMP",))
                 inputs = frozenset(v.name for v in variables if v.role == "input" and not isinstance(v.kind, COMPOUND))
@@ -162,34 +177,83 @@ class Programs(Bodies):
         self.env.collected(self.env.error(argument.pos, message, expected=expected))
         return False
 
+    def _parts_of(self, pou: t.Pou, of: ProgramVariable, *paths: str) -> Iterator[ProgramVariable]:
+        """Yield the located parts of a variable that a program offers: those at %I and %Q, and those at %M with an address.
+
+        `paths` are the paths of the variable in VAR_CONFIG.
+        """
+        area = _AREAS.get(of.role, "") if of.optional and isinstance(of.kind, ty.Array | ty.Struct) else ""
+        found = list(islice(self._parts.of(of.kind, of.attribute, area), MAX_PARTS + 1))
+        if len(found) > MAX_PARTS:
+            message = f"{of.name} has too many variables at %I* and %Q*"
+            self.env.fail(pou.pos, message, expected=f"at most {MAX_PARTS}")
+        for part in found:
+            location = self.configured.address(part, *(f"{path}{part.path}" for path in paths))
+            role = _ROLES[area_of(part.location)]
+            if (role != "local" or location) and _is_bindable(part.type):
+                yield ProgramVariable(
+                    f"{of.name}{part.path}",
+                    role,
+                    part.type,
+                    False,
+                    part.key,
+                    of.shared,
+                    location,
+                    True,
+                    part.steps,
+                    part.block,
+                )
+
     def _offered(self, pou: t.Pou, taken: set[str]) -> Iterator[ProgramVariable]:
-        """Yield the located global variables that a program uses. `taken` has the names of its variables, in lower case."""
+        """Yield the located global variables, and located parts of global variables, that a program uses. `taken` has the names
+        of its variables, in lower case.
+        """
         for one in offered(self._unit, pou):
-            symbol, v = self.variables.offered(one), one.variable
+            symbol = self.variables.offered(one)
             if symbol is None or symbol.constant is not None:
                 continue
-            address = address_of(v.location)
-            name = short_name(address) if _is_reserved(one.name) and address else one.name
-            if name.lower() in taken or _is_reserved(name):
-                expected = f"a name that {pou.name} does not use"
-                self.env.fail(v.pos, f"the global variable {v.name} needs another name", expected=expected)
-            taken.add(name.lower())
-            role = _ROLES[area_of(v.location)]
-            self._check_interface(v, symbol.type, role)
-            attribute = symbol.code.rpartition(".")[2]
-            yield ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
+            of = self._offered_variable(one, symbol, taken, pou)
+            if one.variable.location:
+                yield of
+            yield from self._parts_of(pou, of, f"{one.list}.{one.variable.name}", one.variable.name)
+
+    def _offered_variable(self, one: Offered, symbol: Symbol, taken: set[str], pou: t.Pou) -> ProgramVariable:
+        v, address = one.variable, address_of(one.variable.location)
+        name = short_name(address) if _is_reserved(one.name) and address else one.name
+        if name.lower() in taken or (_is_reserved(name) and v.location):
+            expected = f"a name that {pou.name} does not use"
+            self.env.fail(v.pos, f"the global variable {v.name} needs another name", expected=expected)
+        taken.add(name.lower())
+        role = _ROLES[area_of(v.location)] if v.location else "local"
+        self._check_interface(v, symbol.type, role)
+        attribute = symbol.code.rpartition(".")[2]
+        return ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
-        if (role == "local" or (isinstance(kind, COMPOUND) and not v.location)) and not isinstance(kind, ty.OpenArray):
+        if role == "local" or (isinstance(kind, ty.Array | ty.Struct) and _is_divisible(kind)):
             return
-        parts = (*COMPOUND, ty.Block, ty.Pointer, ty.Interface, ty.OpenArray)
-        if isinstance(kind, parts) or ty.is_kind(kind, "char"):
+        if isinstance(kind, COMPOUND) and (not v.location or ("*" in v.location and self.env.dialect.vendor)):
+            return
+        if not _is_bindable(kind):
             self.env.fail(
                 v.pos,
                 f"{v.name} cannot be bound to a tag",
                 expected="BOOL, a number, a time, an enumeration or MESSAGES",
                 got=str(kind),
             )
+
+
+def _is_divisible(kind: ty.Type) -> bool:
+    """Return whether the parts of a variable can be bound: it is a structure, or an array without function blocks."""
+    while isinstance(kind, ty.Array):
+        kind = kind.of
+    return isinstance(kind, ty.Struct) or _is_bindable(kind)
+
+
+def _is_bindable(kind: ty.Type) -> bool:
+    """Return whether a variable of this type can be bound to a tag."""
+    parts = (*COMPOUND, ty.Block, ty.Pointer, ty.Interface, ty.OpenArray)
+    return not isinstance(kind, parts) and not ty.is_kind(kind, "char")
 
 
 def connection(instance: str, *, into: bool) -> str:

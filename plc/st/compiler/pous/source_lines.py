@@ -19,7 +19,7 @@ class SourceLines:
     def __init__(
         self, out: CodeWriter, path: str, outputs: Mapping[str, frozenset[str]], shared: Collection[str]
     ) -> None:
-        """`outputs` has the attributes that hold outputs by class of a PROGRAM; `shared` are those of global variables."""
+        """`outputs` has the attributes that hold outputs by class of a program or block; `shared` are those of globals."""
         self.out, self.path, self.outputs, self.shared = out, path, outputs, frozenset(shared)
 
     def code(self, text: str) -> tuple[CodeType, ...]:
@@ -56,6 +56,7 @@ class SourceLines:
         if isinstance(statement, ast.ClassDef | ast.FunctionDef):
             own = self.outputs.get(statement.name, frozenset())
             if own or self.shared:
-                Assignments(own, self.shared, path).visit(statement)
+                of_block = not statement.name.startswith("P_")
+                Assignments(own, self.shared, path, with_path=of_block).visit(statement)
             Inlining().visit(statement)
         return ast.fix_missing_locations(statement)

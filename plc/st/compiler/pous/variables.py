@@ -149,13 +149,13 @@ class Variables:
                     if v.name.lower() in symbols:
                         self.env.fail(v.pos, f"{v.name} is declared twice")
                     before = "" if block.kind == "VAR_TEMP" and not pou.actions else prefix
-                    symbol = self._variable(v, block, before, of_program=pou.kind == "PROGRAM")
+                    symbol = self._variable(v, block, before, pou.kind)
                     names = indexed if isinstance(symbol.type, ty.String) else addressed
                     if "." not in symbol.code and v.name.lower() in names and not by_reference(symbol.type):
                         symbol = replace(symbol, code=f"{symbol.code}.v", reference=symbol.code)
                     symbols[v.name.lower()] = symbol
-                    if v.location:
-                        symbols.setdefault(address_of(v.location).lower(), symbol)
+                    if address := address_of(v.location):
+                        symbols.setdefault(address.lower(), symbol)
         for key, value in self.declarations.enumerated(pou).items():
             if key in symbols:
                 self.env.fail(pou.pos, f"{value.name} is declared twice: as a variable and as a value of {value.type}")
@@ -170,8 +170,9 @@ class Variables:
         self.declarations.bounded(pou.pos, own)
         return symbols
 
-    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str, *, of_program: bool) -> Symbol:
-        if block.kind == "VAR_EXTERNAL":
+    def _variable(self, v: t.VarDecl, block: t.VarBlock, prefix: str, of_kind: str) -> Symbol:
+        of_program = of_kind == "PROGRAM"
+        if block.kind == "VAR_EXTERNAL" or (_is_global(v) and not of_program):
             return self._external(v)
         code = f"{prefix}v_{v.name.lower()}"
         symbol = self._symbol(v, block, code)
@@ -192,7 +193,7 @@ class Variables:
     def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
         kind = self.declarations.type_of(v.type, block.kind)
         if "CONSTANT" not in block.qualifiers:
-            is_input = block.kind == "VAR_INPUT"
+            is_input = block.kind == "VAR_INPUT" or (area_of(v.location) == "I" and block.kind != "VAR_GLOBAL")
             return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
@@ -203,7 +204,9 @@ class Variables:
 
         `own` is the class to which a method belongs.
         """
-        variables = [v for block in pou.blocks if block.kind in kinds for v in block.variables]
+        of_program = pou.kind == "PROGRAM"
+        blocks = (block for block in pou.blocks if block.kind in kinds)
+        variables = [v for block in blocks for v in block.variables if of_program or not _is_global(v)]
         found = [(v, symbols[v.name.lower()]) for v in variables if v.name.lower() in symbols]
         compiler = Calls(self.env, symbols, self.out, pou.name.lower())
         compiler.own = self.env.classes.get(pou.name.lower()) if own is None else own
@@ -245,6 +248,11 @@ def _indexed(pou: t.Pou) -> set[str]:
     """Return the names, in lower case, of the variables with an index after them, which may be strings."""
     refs = (node for node in nodes((pou.body, pou.actions)) if isinstance(node, t.Ref))
     return {ref.name.lower() for ref in refs if any(isinstance(selector, t.Index) for selector in ref.selectors)}
+
+
+def _is_global(v: t.VarDecl) -> bool:
+    """Return whether a variable of a function block is the global variable at its address."""
+    return bool(address_of(v.location))
 
 
 def _addressed(pou: t.Pou) -> set[str]:

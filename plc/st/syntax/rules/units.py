@@ -13,6 +13,7 @@ from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.rules.base import Bad, Rules
 from fieldtwin.plc.st.syntax.rules.charts import chart_of
 from fieldtwin.plc.st.syntax.rules.declarations import initial_of, spec_of
+from fieldtwin.plc.st.syntax.written import text_of
 
 _OF_ALL_INTERFACES = "__system.iqueryinterface"
 """The interface that others extend in CODESYS to be queried, in lower case. Here all interfaces can be queried."""
@@ -41,6 +42,12 @@ class _InTask:
 
 Configured = t.VarBlock | t.Instance | t.Task | t.ConfiguredVariable
 """A part of a configuration that is used."""
+
+
+def _is_number(expr: t.Expr) -> bool:
+    """Return whether an expression is a decimal number, which may have a sign."""
+    operand = expr.operand if isinstance(expr, t.Unary) and expr.op == "-" else expr
+    return isinstance(operand, t.Literal) and operand.kind == "INTEGER"
 
 
 def _token(meta: Meta) -> Token:
@@ -138,11 +145,16 @@ class UnitRules(Rules):
 
     def config_var(self, meta: Meta, items: list[Any]) -> t.ConfiguredVariable:
         ref = items[0]
-        if not all(isinstance(selector, t.Member) for selector in ref.selectors):
-            raise Bad(_token(meta), "not a path such as Resource.Instance.Variable")
-        path = (ref.name, *(selector.name for selector in ref.selectors))
+        path = [ref.name]
+        for selector in ref.selectors:
+            if isinstance(selector, t.Member):
+                path.append(selector.name)
+            elif isinstance(selector, t.Index) and all(_is_number(one) for one in selector.indices):
+                path[-1] += f"[{','.join(text_of(one) for one in selector.indices)}]"
+            else:
+                raise Bad(_token(meta), "not a path such as Resource.Instance.Variable")
         location = next((i[1] for i in items if isinstance(i, tuple) and i[0] == "at"), "")
-        return t.ConfiguredVariable(self._pos(meta), path, location, spec_of(items), initial_of(items))
+        return t.ConfiguredVariable(self._pos(meta), tuple(path), location, spec_of(items), initial_of(items))
 
     def access_vars(self, meta: Meta, items: list[Any]) -> None:
         return None

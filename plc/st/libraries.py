@@ -13,8 +13,10 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.walk import nodes
+from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
+STANDARD_NAMES = frozenset({"standard", "tc2_standard"})
+"""The names in lower case under which CODESYS and TwinCAT have the standard functions and function blocks."""
 Declaration = t.TypeDecl | t.VarBlock | t.Pou
 
 
@@ -88,6 +90,46 @@ def with_library(unit: t.SourceUnit, library: Library) -> t.SourceUnit:
     )
 
 
+def without_qualifiers(unit: t.SourceUnit, names: frozenset[str]) -> t.SourceUnit:
+    """Return `unit` without the names of libraries before the names of their declarations, such as ``Tc2_Standard.TON``.
+
+    `names` are those of the libraries, in lower case. A variable, list or namespace with such a name has precedence.
+    """
+    own = {v.name.lower() for block in unit.globals for v in block.variables} | {b.list.lower() for b in unit.globals}
+    own |= {declared.within.namespace.lower().partition(".")[0] for declared in (*unit.types, *unit.pous)}
+    names -= own
+    if not any(_qualified(node, names) for node in nodes(unit)):
+        return unit
+
+    def changed(node: Any, known: frozenset[str]) -> Any:
+        if isinstance(node, t.Pou | t.Test):
+            known -= {v.name.lower() for block in node.blocks for v in block.variables}
+        if _qualified(node, known):
+            if isinstance(node, t.Ref):
+                first = node.selectors[0]
+                assert isinstance(first, t.Member)
+                node = replace(node, name=first.name, selectors=node.selectors[1:])
+            elif isinstance(node, t.Literal):
+                node = replace(node, text=node.text.partition(".")[2])
+            else:
+                node = replace(node, name=node.name.partition(".")[2])
+        return with_parts(node, lambda part: changed(part, known))
+
+    found: t.SourceUnit = changed(unit, names)
+    return found
+
+
+def _qualified(node: Any, names: frozenset[str]) -> bool:
+    """Return whether a node is a name with the name of a library before it."""
+    if isinstance(node, t.Ref):
+        return node.name.lower() in names and bool(node.selectors) and isinstance(node.selectors[0], t.Member)
+    if isinstance(node, t.NamedType | t.SubrangeType):
+        return "." in node.name and node.name.lower().partition(".")[0] in names
+    if isinstance(node, t.Literal) and node.kind == "ENUM_REF":
+        return "." in node.text and node.text.lower().partition(".")[0] in names
+    return False
+
+
 def _owner(missing: t.Missing) -> str:
     """Return the name of a missing declaration, or of the POU to which a missing action belongs, in lower case."""
     return missing.name.lower().partition(".")[0]
@@ -126,5 +168,8 @@ def _references(root: Any, local: frozenset[str]) -> Iterator[str]:
             isinstance(node, t.Ref) and node.name.lower() not in local
         ):
             yield node.name.rpartition(".")[2].lower()
+            first = node.selectors[0] if isinstance(node, t.Ref) and node.selectors else None
+            if isinstance(first, t.Member):  # the name of a library may stand before the name
+                yield first.name.lower()
         elif isinstance(node, t.Literal) and node.kind == "ENUM_REF":
-            yield node.text.partition("#")[0].lower()
+            yield node.text.partition("#")[0].rpartition(".")[2].lower()

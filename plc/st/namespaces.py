@@ -1,12 +1,13 @@
 """Namespaces (IEC 61131-3:2013, 6.9): each declaration gets its full name, such as ``Plant.Drives.Motor``, and so does its use.
 
-A name is looked up in the namespace of the POU that uses it and in those around it, then in the namespaces after USING. Names of
-variables and methods belong to no namespace and stay as they are.
+A name is looked up in the namespace of the POU that uses it and in those around it, then in the namespaces after USING. The
+global variables of a namespace are a list with the name of the namespace. Names of other variables, and those of methods,
+belong to no namespace and stay as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,33 +23,48 @@ def with_full_names(unit: t.SourceUnit) -> t.SourceUnit:
 
     Raises `FileInvalid` with line and column for the first unknown namespace or ambiguous name, and with the others.
     """
-    declared = (*unit.types, *unit.pous)
+    variables = [_Global(v.name, t.Within(b.namespace)) for b in unit.globals if b.namespace for v in b.variables]
+    declared = (*unit.types, *unit.pous, *variables)
     if not any(one.within.namespace or one.within.using for one in (*declared, *unit.tests)):
         return unit
     names = _Names(declared)
-    for one in (*declared, *unit.tests):
+    for one in (*unit.types, *unit.pous, *unit.tests):
         names.check(one.within)
     renamed = replace(
         unit,
         types=tuple(_Renaming(names, one.within).declaration(one) for one in unit.types),
         pous=tuple(_Renaming(names, one.within).declaration(one) for one in unit.pous),
-        globals=tuple(_Renaming(names, t.Within()).changed(block) for block in unit.globals),
+        globals=tuple(_Renaming(names, t.Within(block.namespace)).changed(block) for block in unit.globals),
         tests=tuple(_Renaming(names, one.within, _own(one)).changed(one) for one in unit.tests),
     )
     names.errors.raise_all()
     return renamed
 
 
-def _full(one: t.TypeDecl | t.Pou) -> str:
+@dataclass(frozen=True, slots=True)
+class _Global:
+    """A global variable of a namespace."""
+
+    name: str
+    within: t.Within
+
+
+_Declared = t.TypeDecl | t.Pou | _Global
+
+
+def _full(one: _Declared) -> str:
     return f"{one.within.namespace}.{one.name}" if one.within.namespace else one.name
 
 
 class _Names:
     """The full names that a unit declares, by the full name in lower case."""
 
-    def __init__(self, declared: Sequence[t.TypeDecl | t.Pou]) -> None:
+    def __init__(self, declared: Sequence[_Declared]) -> None:
         self.errors = ErrorCollector()
-        self.declared = {_full(one).lower(): one for one in declared}
+        self._types: dict[str, _Declared] = {
+            _full(one).lower(): one for one in declared if not isinstance(one, _Global)
+        }
+        self._all = {**{_full(one).lower(): one for one in declared if isinstance(one, _Global)}, **self._types}
         self._namespaces = {name for one in declared for name in _enclosing(one.within.namespace.lower()) if name}
 
     def check(self, within: t.Within) -> None:
@@ -61,23 +77,32 @@ class _Names:
     def fail(self, pos: t.Pos, message: str, hint: str = "") -> None:
         self.errors.add(invalid(pos, message, hint=hint))
 
-    def find(self, parts: Sequence[str], within: t.Within, pos: t.Pos) -> tuple[t.TypeDecl | t.Pou, int] | None:
-        """Return the declaration to which a name refers, and how many of its `parts` belong to the name of the declaration."""
+    def find(
+        self, parts: Sequence[str], within: t.Within, pos: t.Pos, *, variables: bool = False
+    ) -> tuple[_Declared, int] | None:
+        """Return the declaration to which a name refers, and how many of its `parts` belong to the name of the declaration.
+
+        With `variables` it may also be a global variable.
+        """
+        known = self._all if variables else self._types
         for outer in _enclosing(within.namespace.lower()):
-            found = self._below(outer, parts)
+            found = self._below(known, outer, parts)
             if found is not None:
                 return found
-        others: dict[str, tuple[t.TypeDecl | t.Pou, int]] = {}
-        others |= {_full(one[0]): one for using in within.using if (one := self._below(using.name.lower(), parts))}
+        others: dict[str, tuple[_Declared, int]] = {}
+        others |= {
+            _full(one[0]): one for using in within.using if (one := self._below(known, using.name.lower(), parts))
+        }
         if len(others) > 1:
             self.fail(pos, f"{'.'.join(parts)} is declared in several namespaces: {', '.join(sorted(others))}")
         return next(iter(others.values()), None)
 
-    def _below(self, outer: str, parts: Sequence[str]) -> tuple[t.TypeDecl | t.Pou, int] | None:
+    @staticmethod
+    def _below(known: Mapping[str, _Declared], outer: str, parts: Sequence[str]) -> tuple[_Declared, int] | None:
         for count in range(len(parts), 0, -1):
             name = ".".join((*([outer] if outer else []), *parts[:count])).lower()
-            if name in self.declared:
-                return self.declared[name], count
+            if name in known:
+                return known[name], count
         return None
 
 
@@ -108,8 +133,23 @@ class _Renaming:
 
     def declaration(self, one: Any) -> Any:
         """Return a declaration with its full name and with the full names of what it uses."""
+        if isinstance(one, t.Pou):
+            one = self._without_externals(one)
         inner = replace(self, local=_own(one)) if isinstance(one, t.Pou) else self
         return replace(inner.changed(one), name=_full(one))
+
+    def _without_externals(self, pou: t.Pou) -> t.Pou:
+        """Return a POU without the VAR_EXTERNAL of global variables of a namespace, which it then uses by their full names."""
+
+        def kept(v: t.VarDecl) -> bool:
+            found = self.names.find([v.name], self.within, v.pos, variables=True)
+            return found is None or not isinstance(found[0], _Global)
+
+        blocks = (
+            replace(b, variables=tuple(v for v in b.variables if kept(v))) if b.kind == "VAR_EXTERNAL" else b
+            for b in pou.blocks
+        )
+        return replace(pou, blocks=tuple(blocks))
 
     def changed(self, node: Any) -> Any:
         """Return a part of the tree with full names."""
@@ -137,10 +177,13 @@ class _Renaming:
             if not isinstance(selector, t.Member):
                 break
             members.append(selector.name)
-        found = self.names.find([ref.name, *members], self.within, ref.pos)
+        found = self.names.find([ref.name, *members], self.within, ref.pos, variables=True)
         if found is None:
             return ref
         declared, count = found
+        if isinstance(declared, _Global):
+            member = t.Member(ref.pos, declared.name)
+            return replace(ref, name=declared.within.namespace, selectors=(member, *ref.selectors[count - 1 :]))
         of_enum = isinstance(declared, t.EnumDecl) and len(members) >= count
         if not of_enum and not (called and isinstance(declared, t.Pou) and count > len(members)):
             return ref

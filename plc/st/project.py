@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
-from fieldtwin.plc.st.libraries import Library, with_library
+from fieldtwin.plc.st.libraries import STANDARD_NAMES, Library, with_library, without_qualifiers
 from fieldtwin.plc.st.plcopen.elements import is_plcopen
 from fieldtwin.plc.st.plcopen.read import read_parts, read_plcopen
 from fieldtwin.plc.st.syntax import twincat
@@ -40,7 +40,8 @@ def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Pat
 
     Raises `FileInvalid` for the first error, with the others.
     """
-    return _compiled(_texts((path,)), _texts(libraries), str(path), dialect)
+    names = frozenset(library.stem.lower() for library in libraries)
+    return _compiled(_texts((path,)), _texts(libraries), str(path), dialect, names)
 
 
 def read_with(
@@ -72,9 +73,14 @@ def _text(path: Path) -> str:
 
 
 @lru_cache(maxsize=32)
-def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect) -> CompiledUnit:
-    """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
+def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect, names: frozenset[str]) -> CompiledUnit:
+    """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program.
+
+    `names` are those of the libraries.
+    """
     unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
+    if dialect.vendor:
+        unit = without_qualifiers(unit, STANDARD_NAMES | names)
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
     return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
@@ -150,5 +156,7 @@ def _in_list(unit: SourceUnit, path: str, text: str, dialect: Dialect) -> Source
     if not dialect.vendor:
         return unit
     name, only_qualified = Path(path).stem, _QUALIFIED_ONLY.search(text) is not None
-    lists = (replace(block, list=name, only_qualified=only_qualified) for block in unit.globals)
+    lists = (
+        block if block.namespace else replace(block, list=name, only_qualified=only_qualified) for block in unit.globals
+    )
     return replace(unit, globals=tuple(lists))

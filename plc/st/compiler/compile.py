@@ -18,6 +18,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
+from fieldtwin.plc.st.classes.structures import with_inherited_members
 from fieldtwin.plc.st.compiler.configurations.called import with_called_programs
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
 from fieldtwin.plc.st.compiler.configurations.located import (
@@ -109,7 +110,8 @@ class _Unit:
         for warning in unit.warnings:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
-        unit = with_configured(with_called_programs(with_full_names(unit), dialect), vendor=dialect.vendor)
+        unit = with_inherited_members(with_called_programs(with_full_names(unit), dialect), dialect)
+        unit = with_configured(unit, vendor=dialect.vendor)
         self.unit = without_edges(without_charts(without_addresses(unit)))
         self.unit = with_inherited(without_instance_variables(self.unit, dialect))
         if not dialect.vendor:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from fieldtwin.plc.st.runtime.logic_error import LogicError
+from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
 
 Key = tuple[Any, ...]
 """The identity of a variable: the id of the Python object that holds it, and where it is in that object."""
@@ -44,7 +45,7 @@ class Whole(Cell):
     __slots__ = ()
 
     def key(self) -> Key:
-        return self.v.key() if isinstance(self.v, Characters) else (id(self.v),)
+        return self.v.key() if isinstance(self.v, Characters | Memory) else (id(self.v),)
 
 
 class MemberReference:
@@ -79,7 +80,8 @@ class Element:
         self.owner, self.at = owner, at
 
     def key(self) -> Key:
-        owner = self.owner.key() if isinstance(self.owner, Single | Characters | Letters) else (id(self.owner),)
+        named = isinstance(self.owner, Single | Characters | Letters | Memory)
+        owner = self.owner.key() if named else (id(self.owner),)
         return *owner, self.at
 
     @property
@@ -259,6 +261,32 @@ def characters(reference: Reference | None, length: int) -> Reference | None:
     return None if reference is None else Whole(Characters(reference, length))
 
 
+def memory(reference: Reference | None, held: str, shown: str, *, array: bool) -> Reference | None:
+    """Return a pointer to the memory of a number, of an element, or of an `array` of numbers, as values of another type.
+
+    `held` and `shown` are the formats of `struct` of the numbers and of the other type.
+    """
+    if reference is None:
+        return None
+    if array:
+        owner, at = reference.v, 0
+    elif isinstance(reference, Element):
+        owner, at = reference.owner, reference.at
+    else:
+        owner, at = Single(reference), 0
+    return Element(Memory(owner, held, shown), place_in_memory(at, held, shown))
+
+
+def from_beginning(reference: Reference | None) -> Reference | None:
+    """Return the whole memory to which a pointer points. Raises `LogicError` if it does not point to the beginning."""
+    if reference is None:
+        return None
+    assert isinstance(reference, Element)
+    if reference.at:
+        raise LogicError("a pointer to an array that begins in the middle of another one", expected="the first element")
+    return Whole(reference.owner)
+
+
 def moved(reference: Reference | None, amount: int, size: int) -> Reference:
     """Return a pointer that was moved by `amount` bytes, where an element has `size` bytes.
 
@@ -288,7 +316,7 @@ def view(array: Any, i: int, low: int, high: int) -> int:
 
 def whole(array: Any, size: int) -> Any:
     """Return the array to which a pointer points. Raises `LogicError` if it has another number of elements."""
-    if len(array) != size or isinstance(array, Characters):
+    if len(array) != size or isinstance(array, Characters | Memory):
         raise LogicError(
             "a pointer to an array of another size is used as a whole", expected=f"{size} elements", got=str(len(array))
         )

@@ -127,10 +127,13 @@ class Within:
 
 @dataclass(frozen=True, slots=True)
 class StructDecl:
+    """A structure. `extends` is the name after EXTENDS, in the dialects of CODESYS, if any."""
+
     pos: Pos
     name: str
     fields: tuple[VarDecl, ...]
     within: Within = Within()
+    extends: tuple[NamedType, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +167,8 @@ class VarBlock:
     """A block of variables. `kind` (VAR, VAR_INPUT, ..., VAR_GLOBAL) and `qualifiers` (RETAIN, PUBLIC, ...) are in capitals.
 
     `list` is the name of the global list to which a VAR_GLOBAL belongs, if the dialect has such lists. If
-    `only_qualified` is true, its variables are known only as ``list.variable``.
+    `only_qualified` is true, its variables are known only as ``list.variable``. A VAR_GLOBAL in a NAMESPACE is a list with the
+    name of the `namespace`.
     """
 
     pos: Pos
@@ -173,6 +177,7 @@ class VarBlock:
     variables: tuple[VarDecl, ...]
     list: str = ""
     only_qualified: bool = False
+    namespace: str = ""
 
 
 class Graphic:

@@ -126,10 +126,42 @@ def test_retained_values_and_inspection_use_the_names_of_variables_only() -> Non
             "'a'",
         ),
         ("NAMESPACE X CLASS a", "23:20", "got the end of the file"),
-        ("NAMESPACE X VAR_GLOBAL n : INT; END_VAR END_NAMESPACE", "23:13", "VAR_GLOBAL"),
+        ("NAMESPACE X VAR n : INT; END_VAR END_NAMESPACE", "23:13", "got VAR"),
+        (
+            "NAMESPACE X VAR_GLOBAL n : INT; END_VAR END_NAMESPACE PROGRAM p VAR m : INT; END_VAR m := n; END_PROGRAM",
+            "23:91",
+            "a variable 'n' is not declared",
+        ),
     ],
 )
 def test_an_error_has_its_place(text: str, place: str, message: str) -> None:
     with pytest.raises(FileInvalid, match=message) as caught:
         compile_text(PLANT + text)
     assert f"{caught.value.line}:{caught.value.column}" == place
+
+
+def test_global_variables_of_a_namespace_are_known_inside_it_and_by_their_full_names() -> None:
+    text = """NAMESPACE Plant
+  VAR_GLOBAL total : INT := 3; END_VAR
+  TYPE Kind : (small, large); END_TYPE
+  NAMESPACE Drives
+    VAR_GLOBAL count : INT; kind : Kind := Kind#large; timer : TON; END_VAR
+    VAR_GLOBAL CONSTANT step : INT := 2; END_VAR
+    FUNCTION_BLOCK Motor
+    VAR_EXTERNAL total : INT; END_VAR
+    VAR_OUTPUT n : INT; late : BOOL; END_VAR
+    VAR hours : ARRAY[1..step] OF INT; END_VAR
+      count := count + total * step; n := count; timer(IN := TRUE, PT := T#20ms); late := timer.Q; hours[2] := n;
+    END_FUNCTION_BLOCK
+  END_NAMESPACE
+END_NAMESPACE
+PROGRAM Main
+USING Plant.Drives;
+VAR m : Motor; seen : INT; count : BOOL; large : BOOL; END_VAR
+  m(); seen := Plant.Drives.count; Plant.total := 5; count := m.late; large := kind = Plant.Kind#large;
+END_PROGRAM
+"""
+    made: Any = program(text)
+    for number in (1, 2, 3):
+        scan(made, number)
+    assert (made.seen, made.count, made.large) == (26, True, True)

@@ -195,10 +195,8 @@ def test_sizes_are_those_of_codesys(what: str, size: int) -> None:
     [
         ("d := ADR(x);", "an address is not a number"),
         ("p := 16#1000;", "POINTER TO INT"),
-        ("p := ADR(y);", "the memory of a REAL as a INT is not supported"),
-        ("b := ADR(y);", "the memory of a REAL as a BYTE is not supported"),
         ("b := ADR(point);", "the memory of a Point as a BYTE is not supported"),
-        ("b := p;", "the memory of a INT as a BYTE is not supported"),
+        ("f := p;", "the memory of a INT as a TON is not supported"),
         ("p := ADR(d.3);", "needs a variable"),
         ("p := ADR(5);", "needs a variable"),
         ("x := p - p;", "operands of -"),

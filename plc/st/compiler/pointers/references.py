@@ -1,8 +1,8 @@
 """References to variables: REF() (IEC 61131-3:2013, 6.4.4.10), and in the dialects of CODESYS also ADR and REF=.
 
 A pointer is never a number. It points to a variable, to an element of an array, or to a byte of a string, and at run time it
-cannot leave that array or string (`fieldtwin.plc.st.runtime.references`). The compiler refuses what would need the memory of a
-controller, such as the bytes of a REAL.
+cannot leave that array or string (`fieldtwin.plc.st.runtime.references`). Numbers may be seen as their bytes or bits. The
+compiler refuses what would need more of the memory of a controller, such as the bytes of a structure.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ from fieldtwin.plc.st.compiler.variables import lookup, place, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 _BYTE = ty.ELEMENTARY["BYTE"]
+_FORMATS = {
+    "SINT": "b", "INT": "h", "DINT": "i", "LINT": "q", "USINT": "B", "UINT": "H", "UDINT": "I", "ULINT": "Q",
+    "BYTE": "B", "WORD": "H", "DWORD": "I", "LWORD": "Q", "REAL": "f", "LREAL": "d",
+}  # fmt: skip
+"""The formats of `struct` of the types whose memory can be seen as another type. BOOL, times and texts have other values here
+than in the memory of a controller."""
 REF_TO, POINTER, REFERENCE = "REF_TO", "POINTER TO", "REFERENCE TO"
 
 
@@ -106,10 +112,22 @@ def _converted(x: Compiling, code: str, source: ty.Pointer, target: ty.Pointer, 
                 return f"_v.first({code})"
             if isinstance(wanted, ty.Array) and _row(held) == _row(wanted):
                 return code
+        if memory := _memory(code, held, wanted):
+            return memory
     raise x.env.error(
         pos, f"the memory of a {held} as a {wanted} is not supported", expected=str(target), got=str(source),
         hint="use a conversion function, or a pointer to the type of the variable",
     )  # fmt: skip
+
+
+def _memory(code: str, held: ty.Type | ty.Named, wanted: ty.Type | ty.Named) -> str:
+    """Return a pointer to numbers or bit strings as one to their memory; "" for other types, whose memory is not known."""
+    of, as_type = (_row(kind) if isinstance(kind, ty.Array) else kind for kind in (held, wanted))
+    formats = [_FORMATS.get(kind.name, "") if isinstance(kind, ty.Elementary) else "" for kind in (of, as_type)]
+    if not all(formats):
+        return ""
+    found = f"_v.memory({code}, {formats[0]!r}, {formats[1]!r}, array={isinstance(held, ty.Array)})"
+    return f"_v.from_beginning({found})" if isinstance(wanted, ty.Array) else found
 
 
 def _extends(x: Compiling, source: ty.Pointer, target: ty.Pointer, pos: t.Pos) -> bool:

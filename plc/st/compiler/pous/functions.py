@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.pous.variables import Variables
-from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol, identifier
+from fieldtwin.plc.st.compiler.pous.variables import Variables, addressed_in
+from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol, by_reference, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -55,15 +55,21 @@ class Functions:
         if pou.returns is not None and key in own:
             word = "function" if pou.kind == "FUNCTION" else "method"
             self.env.fail(pou.pos, f"{pou.name} is the name of the {word}'s result, and is declared again")
+        reference = result if pou.returns is not None and key in addressed_in(pou) else ""
+        if by_reference(signature.returns):
+            reference = ""
+        if reference:
+            result = f"{reference}.v"
         if pou.returns is not None:
-            symbols[key] = Symbol(pou.name, signature.returns, result)
+            symbols[key] = Symbol(pou.name, signature.returns, result, reference=reference)
         arguments = [f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs]
         results = [result, *(symbols[p.name.lower()].code for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
         with self.out.block(f"def {name}({', '.join([instance] * bool(instance) + arguments)}):", pou.pos):
             self.out.step(pou.pos)
             if pou.returns is not None:
-                self.out.line(f"{result} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
+                value = self.declarations.initial(signature.returns, None, pou.returns)
+                self.out.line(f"{reference} = _v.Cell({value})" if reference else f"{result} = {value}", pou.pos)
             for p in signature.inputs:
                 if reference := symbols[p.name.lower()].reference:
                     self.out.line(f"{reference} = _v.Cell({reference})", pou.pos)

@@ -139,7 +139,7 @@ class Variables:
         because it is local to a call, unless the POU has actions, which use it too.
         """
         symbols: dict[str, Symbol] = {}
-        addressed = _addressed(pou)
+        addressed = addressed_in(pou)
         indexed = addressed | _indexed(pou)
         for block in pou.blocks:
             if pou.kind not in ("PROGRAM", "FUNCTION_BLOCK", "CLASS") or block.kind == "VAR_TEMP":
@@ -195,6 +195,10 @@ class Variables:
         if "CONSTANT" not in block.qualifiers:
             is_input = block.kind == "VAR_INPUT" or (area_of(v.location) == "I" and block.kind != "VAR_GLOBAL")
             return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)
+        if isinstance(kind, ty.Block) and not self.env.dialect.vendor:
+            self.env.fail(
+                v.pos, f"{v.name} is an instance of {kind} and cannot be CONSTANT", expected="VAR without CONSTANT"
+            )
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
     def initialise(
@@ -255,11 +259,12 @@ def _is_global(v: t.VarDecl) -> bool:
     return bool(address_of(v.location))
 
 
-def _addressed(pou: t.Pou) -> set[str]:
+def addressed_in(pou: t.Pou) -> set[str]:
     """Return the names, in lower case, of the variables to which ADR or REF= makes a reference."""
 
     def found() -> Iterator[t.Expr | None]:
-        for node in nodes((pou.body, pou.actions)):
+        initials = tuple(v.initial for block in pou.blocks for v in block.variables)
+        for node in nodes((pou.body, pou.actions, initials)):
             if isinstance(node, t.Refer):
                 yield node.value
             elif isinstance(node, t.Call) and node.ref.name.upper() == "ADR":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from lark import Token
@@ -24,6 +25,14 @@ class Bad(Exception):
         """Return the error with its place in the file `path`."""
         line, column = self.token.line or 1, self.token.column or 1
         return FileInvalid(str(self), path=path, line=line, column=column, got=shortened(str(self.token)))
+
+
+@dataclass(frozen=True, slots=True)
+class Bases:
+    """The names after EXTENDS, IMPLEMENTS or USING."""
+
+    word: str
+    names: tuple[t.NamedType, ...]
 
 
 class Rules(Transformer_NonRecursive[Token, Any]):

@@ -8,7 +8,7 @@ from lark import Token, v_args
 from lark.tree import Meta
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.rules.base import Bad, Rules, integer
+from fieldtwin.plc.st.syntax.rules.base import Bad, Bases, Rules, integer
 
 
 @v_args(meta=True)
@@ -50,8 +50,10 @@ class DeclarationRules(Rules):
         return items
 
     def struct_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
-        name, *fields = items
-        return t.StructDecl(self._pos(name), str(name), tuple(f for group in fields for f in group))
+        name, *rest = items
+        fields = tuple(v for group in rest if isinstance(group, list) for v in group)
+        bases = next((i.names for i in rest if isinstance(i, Bases)), ())
+        return t.StructDecl(self._pos(name), str(name), fields, extends=bases)
 
     def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
         name, *rest = items

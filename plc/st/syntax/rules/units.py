@@ -10,7 +10,7 @@ from lark import Token, v_args
 from lark.tree import Meta
 
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.rules.base import Bad, Rules
+from fieldtwin.plc.st.syntax.rules.base import Bad, Bases, Rules
 from fieldtwin.plc.st.syntax.rules.charts import chart_of
 from fieldtwin.plc.st.syntax.rules.declarations import initial_of, spec_of
 from fieldtwin.plc.st.syntax.written import text_of
@@ -60,23 +60,26 @@ class UnitRules(Rules):
 
     def start(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
         unit = self._unit(items)
-        using = tuple(name for item in items if isinstance(item, _Bases) for name in item.names)
+        using = tuple(name for item in items if isinstance(item, Bases) for name in item.names)
         return placed(unit, "", using) if using else unit
 
     def namespace(self, meta: Meta, items: list[Any]) -> t.SourceUnit:
         name = next(i for i in items if isinstance(i, t.NamedType))
-        using = tuple(name for item in items if isinstance(item, _Bases) for name in item.names)
+        using = tuple(name for item in items if isinstance(item, Bases) for name in item.names)
         return placed(self._unit(items), name.name, using)
 
-    def using(self, meta: Meta, items: list[Any]) -> _Bases:
-        return _Bases("USING", tuple(items[1:]))
+    def using(self, meta: Meta, items: list[Any]) -> Bases:
+        return Bases("USING", tuple(items[1:]))
 
     def _unit(self, items: list[Any]) -> t.SourceUnit:
         inner = [i for i in items if isinstance(i, t.SourceUnit)]
         types = tuple(one for item in items if isinstance(item, list) for one in item)
         return t.SourceUnit(
             (*types, *(one for unit in inner for one in unit.types)),
-            tuple(each for each in _flat(items) if isinstance(each, t.VarBlock)),
+            (
+                *(each for each in _flat(items) if isinstance(each, t.VarBlock)),
+                *(block for unit in inner for block in unit.globals),
+            ),
             (*_with_members(items), *(one for unit in inner for one in unit.pous)),
             instances=tuple(each for each in _flat(items) if isinstance(each, t.Instance)),
             tests=tuple(i for i in items if isinstance(i, t.Test)),
@@ -173,8 +176,8 @@ class UnitRules(Rules):
         body = tuple(i for i in parts if isinstance(i, t.Statement))
         actions = tuple(i for i in parts if isinstance(i, t.Action))
         methods = _methods(parts)
-        bases = {i.word: i.names for i in rest if isinstance(i, _Bases)}
-        using = tuple(name for i in rest if isinstance(i, _Bases) and i.word == "USING" for name in i.names)
+        bases = {i.word: i.names for i in rest if isinstance(i, Bases)}
+        using = tuple(name for i in rest if isinstance(i, Bases) and i.word == "USING" for name in i.names)
         return t.Pou(
             self._pos(name), kind, str(name), returns, blocks, body, actions, chart_of(parts), methods,
             bases.get("EXTENDS", ()), bases.get("IMPLEMENTS", ()), modifiers, t.Within("", using),
@@ -198,11 +201,11 @@ class UnitRules(Rules):
     def pou_name(self, meta: Meta, items: list[Any]) -> t.NamedType:
         return t.NamedType(self._pos(meta), ".".join(items))
 
-    def extends(self, meta: Meta, items: list[Any]) -> _Bases:
-        return _Bases("EXTENDS", tuple(item for item in items if item.name.lower() != _OF_ALL_INTERFACES))
+    def extends(self, meta: Meta, items: list[Any]) -> Bases:
+        return Bases("EXTENDS", tuple(item for item in items if item.name.lower() != _OF_ALL_INTERFACES))
 
-    def implements(self, meta: Meta, items: list[Any]) -> _Bases:
-        return _Bases("IMPLEMENTS", tuple(items))
+    def implements(self, meta: Meta, items: list[Any]) -> Bases:
+        return Bases("IMPLEMENTS", tuple(items))
 
     def method(self, meta: Meta, items: list[Any]) -> _Members:
         pou = self._pou("METHOD", items[1:])
@@ -236,14 +239,6 @@ _Accessor = tuple[str, frozenset[str], tuple[t.VarBlock, ...], tuple[t.Statement
 """GET or SET, the modifiers, the variables, and the statements of one."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Bases:
-    """The names after EXTENDS, IMPLEMENTS or USING."""
-
-    word: str
-    names: tuple[t.NamedType, ...]
-
-
 def placed(unit: t.SourceUnit, namespace: str, using: tuple[t.NamedType, ...]) -> t.SourceUnit:
     """Return `unit` with its declarations in a namespace, or in one below it, and with the names after its USING."""
 
@@ -251,8 +246,16 @@ def placed(unit: t.SourceUnit, namespace: str, using: tuple[t.NamedType, ...]) -
         parts = [part for part in (namespace, one.within.namespace) if part]
         return replace(one, within=t.Within(".".join(parts), (*one.within.using, *using)))
 
+    def of_block(block: t.VarBlock) -> t.VarBlock:
+        full = ".".join(part for part in (namespace, block.namespace) if part)
+        return replace(block, namespace=full, list=full, only_qualified=True) if full else block
+
     return replace(
-        unit, types=tuple(map(of, unit.types)), pous=tuple(map(of, unit.pous)), tests=tuple(map(of, unit.tests))
+        unit,
+        types=tuple(map(of, unit.types)),
+        globals=tuple(map(of_block, unit.globals)),
+        pous=tuple(map(of, unit.pous)),
+        tests=tuple(map(of, unit.tests)),
     )
 
 

@@ -1,0 +1,58 @@
+"""Structures that extend others (``TYPE Big EXTENDS Small : STRUCT``), an addition of CODESYS and TwinCAT to the standard.
+
+A structure gets the members of its base before its own. A structure without members is also an addition of these dialects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.plc.st.dialects import Dialect
+from fieldtwin.plc.st.syntax import tree as t
+from fieldtwin.plc.st.syntax.errors import invalid
+
+
+def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit:
+    """Return `unit` with the inherited members in its structures.
+
+    Raises `FileInvalid` with line and column for the first error in an EXTENDS, and with the others. A base that was not imported
+    is left to the compiler, which names the reason.
+    """
+    structures = {one.name.lower(): one for one in unit.types if isinstance(one, t.StructDecl)}
+    errors = ErrorCollector()
+    hint = "the dialects codesys and twincat accept it"
+    for one in structures.values() if not dialect.vendor else ():
+        if one.extends:
+            errors.add(invalid(one.extends[0].pos, "EXTENDS of a structure is not in the standard", hint=hint))
+        elif not one.fields:
+            errors.add(invalid(one.pos, f"the structure {one.name} has no members", "at least one member", hint=hint))
+    errors.raise_all()
+    missing = {one.name.lower() for one in unit.missing}
+    done: dict[str, t.StructDecl] = {}
+
+    def extended(one: t.StructDecl, below: tuple[str, ...]) -> t.StructDecl:
+        key = one.name.lower()
+        if key in done:
+            return done[key]
+        members: tuple[t.VarDecl, ...] = ()
+        for base in one.extends:
+            of = structures.get(base.name.lower())
+            if base.name.lower() in (*below, key):
+                errors.add(invalid(base.pos, f"{one.name} extends itself"))
+            elif len(one.extends) > 1:
+                errors.add(invalid(one.extends[1].pos, f"{one.name} extends two structures", "one name after EXTENDS"))
+            elif of is not None:
+                members = extended(of, (*below, key)).fields
+            elif base.name.lower() not in missing:
+                hint = did_you_mean(base.name, [each.name for each in structures.values()])
+                errors.add(
+                    invalid(base.pos, f"EXTENDS {base.name}: {base.name!r} is not declared", "a STRUCT", hint=hint)
+                )
+        done[key] = replace(one, fields=(*members, *one.fields))
+        return done[key]
+
+    types = tuple(extended(one, ()) if isinstance(one, t.StructDecl) else one for one in unit.types)
+    errors.raise_all()
+    return replace(unit, types=types)

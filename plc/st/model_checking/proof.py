@@ -8,6 +8,7 @@ from typing import Any
 import z3
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.model_checking.properties import Asked, Expression, State, asked
 from fieldtwin.plc.st.model_checking.replay import Check, ModelDisagrees, Replay, held, instances
@@ -112,17 +113,20 @@ def prove(question: Question, limits: Limits) -> Report:
     Raises `FileInvalid` for an error in the program or a construct without a model, `UsageError` for an error in an
     expression, and `ModelDisagrees` if the program does not do what the model does.
     """
-    _refuse_shared(question)
     found = asked(
         question.unit, question.program, question.path, question.dialect, question.invariants, question.assumptions
     )
+    _refuse_shared(question, found.unit)
     kind = program_class(found.unit, question.program)
     return _Proof(question, found, kind).report(limits)
 
 
-def _refuse_shared(question: Question) -> None:
-    """Refuse a program whose global variables another program may change, because the model contains one program."""
-    others = [p.name for p in question.unit.pous if p.kind == "PROGRAM" and p.name.lower() != question.program.lower()]
+def _refuse_shared(question: Question, compiled: CompiledUnit) -> None:
+    """Refuse a program whose global variables another program may change, because the model contains one program.
+
+    The programs that it calls are part of it.
+    """
+    others = [p.name for p in compiled.programs if p.name.lower() != question.program.lower()]
     blocks = [block for block in question.unit.globals if "CONSTANT" not in block.qualifiers and block.variables]
     if others and blocks:
         shared = blocks[0].variables[0]

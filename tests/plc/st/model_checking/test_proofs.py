@@ -12,7 +12,7 @@ import pytest
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.plc.program import ScanInfo
 from fieldtwin.plc.st.compiler.compile import compile_text
-from fieldtwin.plc.st.dialects import STANDARD
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, dialect_of
 from fieldtwin.plc.st.model_checking.execution.natives import BUILTINS
 from fieldtwin.plc.st.model_checking.proof import NO_FAILURE, Limits, Question, Report, Result, prove
 from fieldtwin.plc.st.model_checking.properties import named
@@ -42,13 +42,14 @@ END_PROGRAM
 
 
 def proved(
-    text: str, *invariants: str, assume: Sequence[str] = (), scans: int = 8, interval_ms: tuple[float, float] = (10, 60_000)
+    text: str, *invariants: str, assume: Sequence[str] = (), scans: int = 8, interval_ms: tuple[float, float] = (10, 60_000),
+    dialect: Dialect = STANDARD,
 ) -> Report:  # fmt: skip
     unit = parse(text)
     program = next(pou.name for pou in unit.pous if pou.kind == "PROGRAM")
     low, high = (round(ms * 1e6) for ms in interval_ms)
     question = Question(
-        unit, "", program, STANDARD, tuple(map(named, invariants)), tuple(map(named, assume)), (low, high)
+        unit, "", program, dialect, tuple(map(named, invariants)), tuple(map(named, assume)), (low, high)
     )
     return prove(question, Limits(scans, lambda: 50.0))
 
@@ -343,3 +344,13 @@ def test_a_choice_between_texts_is_exact_in_its_scan() -> None:
     )
     assert one(report).verdict == "proved"
     assert report.unknowns == ()
+
+
+def test_programs_that_a_program_calls_are_part_of_the_proof() -> None:
+    text = """
+    VAR_GLOBAL total : INT; END_VAR
+    PROGRAM Main VAR_INPUT on : BOOL; END_VAR IF on THEN Sums(); END_IF END_PROGRAM
+    PROGRAM Sums VAR n : INT; END_VAR n := (n + 1) MOD 4; total := 10 * n; END_PROGRAM
+    """
+    report = proved(text, "total <= 30", "total < 30", dialect=dialect_of("codesys"))
+    assert [r.verdict for r in report.invariants] == ["proved", "violated", "proved"]

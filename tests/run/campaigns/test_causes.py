@@ -148,6 +148,7 @@ def test_no_more_parts_run_at_a_time_than_there_are_workers_and_none_runs_twice(
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_ctrl_c_during_the_search_ends_the_campaign_with_the_failures_that_are_known(tmp_path: Path, jobs: str) -> None:
     write_plant(tmp_path, PLANT)
@@ -175,6 +176,7 @@ def test_ctrl_c_during_the_search_ends_the_campaign_with_the_failures_that_are_k
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)
 def test_a_campaign_names_each_cause_with_its_seeds_and_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

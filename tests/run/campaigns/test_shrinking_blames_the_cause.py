@@ -69,6 +69,7 @@ def judged(folder: Path, program: str) -> tuple[ScenarioResult, str]:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)
 def test_a_crash_in_the_first_scan_is_blamed_on_no_fault(folder: Path) -> None:
     code, told = campaign(CRASHES_AT_ONCE)
     assert code == 1
@@ -83,6 +84,7 @@ def test_a_crash_in_the_first_scan_is_blamed_on_no_fault(folder: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)
 def test_a_crash_because_of_a_fault_is_blamed_on_that_fault(folder: Path) -> None:
     code, told = campaign(CRASHES_ON_BAD_LEVEL)
     assert code == 1

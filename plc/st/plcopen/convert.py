@@ -133,7 +133,8 @@ class _Converter:
             self._put(inner.line, f"{name} : STRUCT")
             for v in inner.children:
                 if v.tag == "variable":
-                    self._put(v.line, f"{self._name(v)} : {self._type(v)}{self._initial(v)};")
+                    at = f" AT {v.attributes['address']}" if v.attributes.get("address") else ""
+                    self._put(v.line, f"{self._name(v)}{at} : {self._type(v)}{self._initial(v)};")
             self._put(inner.end_line, "END_STRUCT;")
         else:
             self._put(inner.line, f"{name} : {self._type_of(inner)}{self._initial(element)};")
@@ -146,9 +147,8 @@ class _Converter:
             raise self._fail(
                 pou, "a POU of unknown kind", expected=", ".join(_POUS), got=pou.attributes.get("pouType", "")
             )
-        for tag in ("Method", "Property"):
-            for found in pou.every(tag):
-                raise self._unsupported(found, f"{self._name(pou)} has a {tag.lower()}, which is not supported")
+        for found in pou.every("Property"):
+            raise self._unsupported(found, f"{self._name(pou)} has a property, which is not supported")
         interface = pou.find("interface")
         result = interface.inside("returnType") if kind == "FUNCTION" and interface is not None else []
         self._put(pou.line, f"{kind} {self._name(pou)}" + (f" : {self._type_of(result[0])}" if result else ""))
@@ -162,7 +162,26 @@ class _Converter:
                 self._body(pou, part)
             elif part.tag == "actions":
                 self._actions(pou, part)
+        for method in pou.every("Method"):
+            self._method(pou, method)
         self._put(pou.end_line, f"END_{kind}")
+
+    def _method(self, pou: Element, method: Element) -> None:
+        """Write a method, which CODESYS adds to a POU after its body."""
+        name, interface, body = self._name(method), method.find("interface"), method.find("body")
+        of = f"{self._name(pou)}.{name}"
+        text = body.find("ST") if body is not None else None
+        if interface is None or text is None:
+            raise self._unsupported(method, f"the method {of} has no interface and body in ST, which is not supported")
+        result = interface.inside("returnType")
+        self._put(method.line, f"METHOD PUBLIC {name}" + (f" : {self._type_of(result[0])}" if result else ""))
+        for block in interface.children:
+            if block.tag in _BLOCKS:
+                self._variables(block)
+        whole = pou.find("interface")
+        variables = [*interface.every("variable"), *(whole.every("variable") if whole is not None else ())]
+        self._statements(text, {v.attributes.get("name", "").lower() for v in variables})
+        self._put(method.end_line, "END_METHOD")
 
     def _actions(self, pou: Element, actions: Element) -> None:
         for action in actions.children:
@@ -221,6 +240,8 @@ class _Converter:
         ]
         if tag == "array" and inner and ranges:
             return f"ARRAY[{', '.join(ranges)}] OF {inner}"
+        if tag == "pointer" and inner:
+            return f"POINTER TO {inner}"
         if tag in ("subrangeSigned", "subrangeUnsigned") and inner and ranges:
             return f"{inner}({ranges[0]})"
         if element.children or not tag.isupper():

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from fieldtwin.cli.plc.check_command import check
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.program import load_source
 
 HEAD = """<?xml version="1.0" encoding="utf-8"?>
@@ -106,8 +107,14 @@ def test_a_type_that_is_not_supported_does_not_refuse_the_others(tmp_path: Path)
     types = f'<dataTypes><dataType name="P"><baseType>{pointer}</baseType></dataType></dataTypes>'
     path = saved(tmp_path, f'<pou name="Main" pouType="program">{OUT}{st("n := 7;")}</pou>')
     path.write_text(path.read_text().replace("<dataTypes/>", types))
+    path.write_text(path.read_text().replace("pointer>", "strange>"))
     assert run(path).n == 7
+    path.write_text(path.read_text().replace("strange>", "pointer>"))
     use = '<localVars><variable name="p"><type><derived name="P"/></type></variable></localVars></interface>'
     path.write_text(path.read_text().replace("</interface>", use))
-    with pytest.raises(FileInvalid, match="the type pointer is not supported"):
+    with pytest.raises(FileInvalid, match="POINTER TO is not in the standard"):
         load_source(path)
+    load_source(path, dialect=dialect_of("codesys"))
+    path.write_text(path.read_text().replace("pointer>", "strange>"))
+    with pytest.raises(FileInvalid, match="the type strange is not supported"):
+        load_source(path, dialect=dialect_of("codesys"))

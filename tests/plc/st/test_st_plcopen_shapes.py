@@ -9,6 +9,7 @@ import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.program import Role, ScanInfo
+from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.program import StProgram, load_source
 
 SHAPES = Path(__file__).parents[2] / "vectors" / "plcopen"
@@ -79,13 +80,31 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
         assert (e.value.line, e.value.column) == (line, column)
 
 
-def test_a_block_with_a_method_is_refused_where_it_is_used(tmp_path: Path) -> None:
+def test_a_block_with_an_empty_method_is_refused_where_it_is_used(tmp_path: Path) -> None:
     text = (SHAPES / "codesys_shape.xml").read_text()
     assert text.count("<addData />") == 1
     path = tmp_path / "tank.xml"
     data = '<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Reset"/></data></addData>'
     path.write_text(text.replace("<addData />", data))
     with pytest.raises(
-        FileInvalid, match=r"tank\.xml:\d+:\d+: FB_Ramp has a method, which is not supported \(.*tank\.xml:\d+\)"
+        FileInvalid,
+        match=r"tank\.xml:\d+:\d+: the method FB_Ramp\.Reset has no interface and body in ST, which is not supported",
     ):
         load_source(path)
+
+
+def test_a_method_of_a_block_is_imported(tmp_path: Path) -> None:
+    text = (SHAPES / "codesys_shape.xml").read_text()
+    path = tmp_path / "tank.xml"
+    method = """<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Twice">
+<interface><returnType><INT/></returnType><inputVars><variable name="x"><type><INT/></type></variable></inputVars></interface>
+<body><ST><xhtml xmlns="http://www.w3.org/1999/xhtml">Twice := 2 * x;</xhtml></ST></body></Method></data></addData>"""
+    path.write_text(text.replace("<addData />", method))
+    (tmp_path / "main.st").write_text("PROGRAM P VAR ramp : FB_Ramp; n : INT; END_VAR n := ramp.Twice(21); END_PROGRAM")
+    made: Any = load_source(tmp_path, "P", dialect_of("codesys"))()
+    scan(made, 1)
+    assert made.n == 42
+    path.write_text(path.read_text().replace("2 * x", "2 * y"))
+    with pytest.raises(FileInvalid, match="a variable 'y' is not declared") as e:
+        load_source(tmp_path, "P", dialect_of("codesys"))
+    assert path.read_text().splitlines()[e.value.line - 1].count("2 * y") == 1

@@ -340,6 +340,21 @@ class Program(ABC):
             if isinstance(block, FunctionBlock):
                 yield from (f"{name}.{member}" for member, _, _ in block.members())
 
+    def drawings(self) -> list[tuple[str, str]]:
+        """Return the name and the SVG text of each drawing of the program: charts, ladder and function block diagrams.
+
+        The first call takes several ms for each drawing.
+        """
+        return []
+
+    def drawn(self, number: int) -> dict[str, Any]:
+        """Return the present values of a drawing, by kind and part, as data for JSON."""
+        return {}
+
+    def state_diagram(self) -> Any:
+        """Return the states and transitions of the variable `state` as the source has them; None if it has none."""
+        return None
+
     def internal(self, path: str) -> InternalVariable | None:
         """Return a variable that is not a tag, by its path; None if no block has it."""
         name, _, wanted = path.partition(".")

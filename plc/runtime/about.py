@@ -53,7 +53,7 @@ def _variables(bound: BoundProgram) -> dict[str, Any]:
 def _machine(bound: BoundProgram) -> dict[str, Any] | None:
     """Return the states and transitions of a program; None if its states have no names.
 
-    A program without a `StateTable` has no declared transitions, and its initial state is not known.
+    Without a `StateTable`, or a CASE that assigns the states, no transitions are declared, and the initial state is not known.
     """
     state = bound.program.variables.get(STATE)
     if state is None or not state.words:
@@ -61,6 +61,8 @@ def _machine(bound: BoundProgram) -> dict[str, Any] | None:
     names = [word for _, word in state.words]
     table = getattr(type(bound.program), "table", None)
     if not isinstance(table, StateTable):
+        table = bound.program.state_diagram()
+    if table is None or set(table.states) != set(names):
         return {"states": names, "initial": "", "transitions": [], "declared": False}
     transitions = [
         {"source": "" if t.source == ANY else t.source, "target": t.target, "label": t.label} for t in table.transitions

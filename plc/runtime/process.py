@@ -26,6 +26,8 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
               the first scan in which a condition in Structured Text is TRUE (fieldtwin.plc.runtime.variable_trace)
     trace_read
               {"number": ..., "since": row}: the next rows of a trace: number, scan, time and values; `trace_end` removes it
+    drawings  of each program: its charts, ladder and function block diagrams as SVG
+    drawn     {"program": ..., "number": ...}: the present values of one drawing
     stop      set the outputs to their safe values, then end the process
 
 The actions of users (force to restart, and apply_change) are recorded before they are carried out; each of these commands takes
@@ -55,6 +57,7 @@ from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.plc.runtime.acts import Acts
 from fieldtwin.plc.runtime.config import PlcConfig
+from fieldtwin.plc.runtime.drawings import drawings_of_programs, present_values
 from fieldtwin.plc.runtime.online.changes import OnlineChanges
 from fieldtwin.plc.runtime.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from fieldtwin.plc.runtime.runner import TaskRunner
@@ -98,9 +101,12 @@ class PlcProcess:
                 "trace_begin": self._traces.begin,
                 "trace_read": self._traces.read,
                 "trace_end": self._traces.end,
+                "drawings": self._drawings,
+                "drawn": self._drawn,
             }
         )
         self._realtime = RealtimeReport((), ())
+        drawings_of_programs(self._runner.programs)  # made before the first scan, which they would delay
         self._stopping = False
 
     def run(self) -> int:
@@ -245,6 +251,12 @@ class PlcProcess:
 
     async def _about(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"programs": describe_programs(self._runner.programs, self._runner.sources)}
+
+    async def _drawings(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"drawings": drawings_of_programs(self._runner.programs)}
+
+    async def _drawn(self, args: dict[str, Any]) -> dict[str, Any]:
+        return present_values(self._runner.programs, args.get("program"), args.get("number"))
 
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
         cold = args.get("cold") is True

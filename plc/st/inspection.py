@@ -127,6 +127,10 @@ class Inspection:
             return {**kind.inputs, **kind.outputs}.get(key)
         return next(((f"v_{key}", of) for name, of in self._blocks[kind.name.lower()] if name.lower() == key), None)
 
+    def variables_of(self, kind: ty.Block) -> Sequence[tuple[str, ty.Type]]:
+        """Return the variables of a function block of the user, with their types."""
+        return self._blocks.get(kind.name.lower(), ())
+
     def below(self, name: str, kind: ty.Type, value: Any) -> Iterator[str]:
         """Return the path of a variable, or of each of its parts."""
         if isinstance(kind, ty.Struct | ty.Block):

@@ -37,11 +37,13 @@ from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.coverage.recording import active_recording
 from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of, reader
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
 from fieldtwin.plc.st.inspection import Inspection, shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
+from fieldtwin.plc.st.state_diagram import StateDiagram
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.variable_paths import VariablePaths
 
@@ -57,6 +59,8 @@ class StProgram(Program):
     st_declared: CompiledProgram
     st_paths: VariablePaths
     st_decisions: DecisionReader
+    st_pictures: Pictures | None
+    """The drawings and the state machine, once they are made."""
     st_instance: str = ""
     """The program of a configuration whose connections are used, if it has any."""
     st_internal: frozenset[str] = frozenset()
@@ -217,6 +221,30 @@ class StProgram(Program):
         unit = "ns" if ty.is_kind(kind, "duration") else ""
         return VariableReader(str(kind), lambda: shown_value(kind, read(self.st_body, self.st_resource.globals)), unit)
 
+    @classmethod
+    def st_pictured(cls) -> Pictures:
+        """Return the pictures of the program. They are made once for a class."""
+        if cls.st_pictures is None:
+            variables = [(v.name, v.kind) for v in cls.st_declared.variables]
+            cls.st_pictures = pictures_of(cls.st_unit, cls.st_declared.name, variables)
+        return cls.st_pictures
+
+    def drawings(self) -> list[tuple[str, str]]:
+        return [(live.name, live.svg) for live in self.st_pictured().drawings]
+
+    def state_diagram(self) -> StateDiagram | None:
+        return self.st_pictured().machine
+
+    def drawn(self, number: int) -> dict[str, Any]:
+        live = self.st_pictured().drawings[number]
+        body, shared, paths = self.st_body, self.st_resource.globals, self.st_paths
+        if not live.path:
+            return Reading(live, lambda path: paths.typed(path, body, shared), body).values()
+        instance = paths.typed(live.path, body, shared)
+        if instance is None:
+            return {}
+        return Reading(live, lambda path: paths.within(instance, f".{path}"), instance[1]).values()
+
     # -- online change ----------------------------------------------------------------------------------------------------
 
     def st_become(self, new: StProgram) -> None:
@@ -302,14 +330,15 @@ def program_class(
     unit: CompiledUnit,
     name: str = "",
     decisions: Mapping[tuple[str, int, str], Any] | None = None,
+    pictures: Pictures | None = None,
     *,
     takes_writes: bool = False,
 ) -> type[StProgram]:
     """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`.
 
     `name` may also be that of a program of a configuration, which states the PROGRAM. With `takes_writes` the program has a
-    message input whose messages set its variables, each before the next scan. `decisions` are those of the unit, if they are
-    known already; the `source` of the unit is not used then.
+    message input whose messages set its variables, each before the next scan. `decisions` and `pictures` are those of the unit
+    and of the program, if they are known already; the `source` of the unit is not used then.
     """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
     names = [*(p.name for p in unit.programs), *missing]
@@ -341,7 +370,7 @@ def program_class(
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )
     named = instance.name if instance is not None and connected else ""
-    return _class_of(unit, found, decided, tags, frozenset(), named)
+    return _class_of(unit, found, decided, tags, frozenset(), named, pictures)
 
 
 def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:
@@ -353,7 +382,9 @@ def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> 
     own = made.variables
     internal = made.st_internal | {name for name, v in own.items() if not _replaces(v, interface.get(name))}
     tags = {name: v if name in internal or name not in own else own[name] for name, v in interface.items()}
-    return _class_of(made.st_unit, made.st_declared, made.st_decisions, tags, internal, made.st_instance)
+    return _class_of(
+        made.st_unit, made.st_declared, made.st_decisions, tags, internal, made.st_instance, made.st_pictures
+    )
 
 
 def _replaces(new: Variable, old: Variable | None) -> bool:
@@ -368,6 +399,7 @@ def _class_of(
     tags: Mapping[str, Variable],
     internal: frozenset[str],
     instance: str,
+    pictures: Pictures | None,
 ) -> type[StProgram]:
     """Return the class of program `found` with the variables `tags`. Those in `internal` could be tags as well."""
     own = [v for v in found.variables if not v.shared and not v.steps]
@@ -379,6 +411,7 @@ def _class_of(
         "st_paths": VariablePaths(unit, found, hidden),
         "st_decisions": decisions,
         "st_internal": internal,
+        "st_pictures": pictures,
         "source_path": found.path,
         "source_files": tuple(sorted(unit.files, key=lambda file: (file != found.path, file))),
         "source_warnings": tuple(map(str, unit.warnings)),

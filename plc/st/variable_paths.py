@@ -13,7 +13,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
 from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable
-from fieldtwin.plc.st.inspection import Inspection, first_name, shown_value
+from fieldtwin.plc.st.inspection import Inspection, Typed, first_name, shown_value
 
 Read = Callable[[Any, Any], Any]
 """Reads a variable from the object of the program and that of the global variables."""
@@ -26,6 +26,7 @@ class VariablePaths:
         self._hidden = Inspection(unit, [(v.name, v.kind) for v in hidden])
         self._every = Inspection(unit, [(v.name, v.kind) for v in program.variables if not v.shared and not v.steps])
         self._shared = {v.name.lower(): v for v in program.variables if v.shared and not v.steps}
+        self._own = {v.name.lower(): v for v in program.variables if not v.steps}
         self._globals = _globals_of(unit, program)
 
     def internal_names(self, body: Any, shared: Any) -> Iterator[str]:
@@ -52,6 +53,21 @@ class VariablePaths:
         if found is None or isinstance(found[1], ty.Struct | ty.Block | ty.MessagesIn | ty.MessagesOut):
             return None
         return found[1], eval(f"lambda body, shared: {found[0]}")  # safe: names of declarations, and numbers
+
+    def typed(self, path: str, body: Any, shared: Any) -> Typed | None:
+        """Return the type and the value of any variable, also of a structure or block; None for a path that names none."""
+        name, rest = first_name(path)
+        of = self._own.get(name.lower())
+        if of is not None:  # without steps, the attribute is a name
+            return self.within((of.kind, getattr(shared if of.shared else body, str(of.attribute))), rest)
+        found = self._global(path)
+        return (
+            self.within((found[0].kind, getattr(shared, found[0].attribute)), found[1]) if found is not None else None
+        )
+
+    def within(self, found: Typed, rest: str) -> Typed | None:
+        """Return the part of a variable that the `rest` of a path selects, such as ``.ET``; None for any other."""
+        return self._every.within(found, rest)
 
     def _code(self, path: str) -> tuple[str, ty.Type] | None:
         name, rest = first_name(path)

@@ -49,6 +49,22 @@ async def get_internal_variables(request: Request) -> Any:
     return await attachment.read_internal_variables()
 
 
+async def get_drawings(request: Request) -> Any:
+    """Return the charts, ladder and function block diagrams of each program as SVG text; none for a PLC of an older version."""
+    attachment = await attached(request)
+    return await attachment.read_drawings()
+
+
+async def get_drawing(request: Request) -> Any:
+    """Return the present values of a drawing: of a chart its steps, transitions and actions, of a network its nodes and wires.
+
+    The PLC answers between two scans.
+    """
+    attachment = await attached(request)
+    program, number = request.path_params["program"], int(request.path_params["number"])
+    return await attachment.plc_channel.call("drawn", program=program, number=number)
+
+
 async def get_why(request: Request) -> Any:
     """Return which program last changed a tag, when, and what it had read. `now_ns` is the time to which the ages refer."""
     attachment = await attached(request)
@@ -105,6 +121,8 @@ OPERATIONS = (
     Operation("GET", f"{PLC}/programs", get_programs, "Describe the programs: variables, states, transitions, source"),
     Operation("GET", f"{PLC}/transitions", get_transitions, "Read the last transitions of the programs"),
     Operation("GET", f"{PLC}/internal", get_internal_variables, "Read the variables of programs that are not tags"),
+    Operation("GET", f"{PLC}/drawings", get_drawings, "Draw the charts and networks of the programs"),
+    Operation("GET", PLC + "/drawings/{program}/{number:int}", get_drawing, "Read the present values of a drawing"),
     Operation("GET", PLC + "/why/{tag}", get_why, "Explain the value of a tag"),
     Operation("POST", f"{PLC}/forces", force_tag, "Force a tag", body=Force, changes=True),
     Operation("DELETE", f"{PLC}/forces", unforce_all, "Remove all forces", changes=True),

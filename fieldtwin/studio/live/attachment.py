@@ -225,6 +225,15 @@ class Attachment:
         shown = [{"name": row["tag"], "type": row["kind"], "value": row["value"], "unit": row["unit"]} for row in rows]
         return {"variables": shown, "more": len(names) - len(rows)}
 
+    async def read_drawings(self) -> dict[str, Any]:
+        """Return the drawings of each program: number, name and SVG text."""
+        try:
+            answer = await self.plc_channel.call("drawings")
+        except RemoteError:  # the PLC has an older version
+            return {}
+        drawings: dict[str, Any] = answer["drawings"]
+        return drawings
+
     async def _read_plc(self) -> None:
         known, buckets = self.plc, self.plc is None or self.now_ns() - self._buckets_ns >= BUCKETS_EVERY_S * NS_PER_S
         plc = await self.read_plc(buckets)

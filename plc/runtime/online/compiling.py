@@ -28,8 +28,10 @@ from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.decisions import Decisions, decisions_of
 from fieldtwin.plc.st.dialects import dialect_of
+from fieldtwin.plc.st.drawing.live import Pictures
 from fieldtwin.plc.st.program import StProgram, program_class
 from fieldtwin.plc.st.project import compile_source
+from fieldtwin.plc.st.state_diagram import StateDiagram
 from fieldtwin.plc.st.syntax.tree import SourceUnit
 
 PATIENCE_S = 100.0
@@ -84,7 +86,8 @@ def compile_elsewhere(request: CompileRequest) -> dict[str, Version]:
     for config in request.programs:
         at, name, digests = result.programs[config.name]
         unit, decisions = units[at]
-        made = program_class(unit, name, decisions, takes_writes=config.takes_writes)
+        pictures = Pictures(_joined(result.drawings[config.name]), result.machines[config.name])
+        made = program_class(unit, name, decisions, pictures, takes_writes=config.takes_writes)
         found[config.name] = _version(config.name, made, digests)
         make_way()
     return found
@@ -126,6 +129,8 @@ class _Result:
     units: list[_Packed]
     programs: dict[str, tuple[int, str, dict[str, str]]]
     """By program: the number of its unit, the name of its PROGRAM, and the digests of its files."""
+    drawings: dict[str, list[bytes]]
+    machines: dict[str, StateDiagram | None]
     error: dict[str, Any] | None = None
 
 
@@ -186,11 +191,15 @@ def main() -> None:
     request = msgspec.json.decode(sys.stdin.buffer.read(), type=CompileRequest)
     units: list[CompiledUnit] = []
     programs = {}
+    drawings: dict[str, list[bytes]] = {}
+    machines: dict[str, StateDiagram | None] = {}
     error = None
     try:
         for config in request.programs:
             unit, name, digests = _compiled(config, request.python_path)
-            program_class(unit, name)  # raises an error if the source does not have this PROGRAM
+            pictures = program_class(unit, name).st_pictured()  # an error if the source does not have this PROGRAM
+            drawings[config.name] = [pickle.dumps([one]) for one in pictures.drawings]
+            machines[config.name] = pictures.machine
             at = next((n for n, known in enumerate(units) if known is unit), len(units))
             if at == len(units):
                 units.append(unit)
@@ -199,5 +208,5 @@ def main() -> None:
         error = _described(e)
     except FieldtwinError as e:
         error = _described(FileInvalid(str(e)))
-    result = _Result([_packed(unit) for unit in units] if error is None else [], programs, error)
+    result = _Result([_packed(unit) for unit in units] if error is None else [], programs, drawings, machines, error)
     sys.stdout.buffer.write(pickle.dumps(result))

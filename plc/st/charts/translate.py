@@ -119,7 +119,7 @@ class _Translation:
         named = {one.name.lower(): one for one in self._chart.transitions if one.body}
         return [
             *(_declared(step.pos, step.name, STEP) for step in self._chart.steps),
-            *(_declared(at, _control(name), "0action_control") for name in self._controls),
+            *(_declared(at, control_of(name), "0action_control") for name in self._controls),
             *(_declared(one.pos, one.name, "BOOL") for one in named.values()),
             _declared(at, self._started, "0chart"),
         ]
@@ -167,7 +167,7 @@ class _Translation:
 
     def _control(self, name: str) -> list[t.Statement]:
         """Return the statements that set the inputs of an action's control and call it."""
-        control, associations = _control(name), self._controls[name]
+        control, associations = control_of(name), self._controls[name]
         pos = associations[0][1].pos
         statements: list[t.Statement] = []
         for qualifier in dict.fromkeys(one.qualifier for _, one in associations):
@@ -194,12 +194,13 @@ class _Translation:
         """Return the call of an action while the output of its control is TRUE, or the assignment of the BOOL variable."""
         one = self._controls[name][0][1]
         if name in self._actions or name not in self._variables:
-            run = _member(one.pos, _control(name), "0a")
+            run = _member(one.pos, control_of(name), "0a")
             return t.If(one.pos, ((run, (_call(one.pos, one.action),)),))
-        return t.Assign(one.pos, t.Ref(one.pos, one.action), _member(one.pos, _control(name), "0q"))
+        return t.Assign(one.pos, t.Ref(one.pos, one.action), _member(one.pos, control_of(name), "0q"))
 
 
-def _control(name: str) -> str:
+def control_of(name: str) -> str:
+    """Return the name of the block that controls an action."""
     return f"0control_{name}"
 
 

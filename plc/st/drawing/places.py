@@ -85,6 +85,21 @@ def _stretch(figures: Sequence[Figure]) -> None:
             port.x, port.y = port.x * kx, port.y * ky
             for link in port.links:
                 link.route = [(x * kx, y * ky) for x, y in link.route]
+    _lengthen_rails(figures)
+
+
+def _lengthen_rails(figures: Sequence[Figure]) -> None:
+    """Make the left power rails reach the inputs that are connected to them, if the file does not give them this length."""
+    rails = {one.id: one for one in figures if one.tag == "leftPowerRail"}
+    for one in figures:
+        for port in one.inputs:
+            for link in port.links:
+                rail, y = rails.get(link.source), one.y + port.y
+                if rail is not None and not link.route:
+                    low, high = min(rail.y, y - 10), max(rail.y + rail.height, y + 10)
+                    for output in rail.outputs:
+                        output.y += rail.y - low
+                    rail.y, rail.height = low, high - low
 
 
 def _between_texts(figures: Sequence[Figure]) -> Iterable[float]:

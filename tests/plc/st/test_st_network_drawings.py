@@ -157,6 +157,19 @@ def test_random_networks_without_positions_do_not_overlap(links: list[list[int]]
                 assert high < other_low or other_high < low, "two outputs share a line"
 
 
+def test_a_power_rail_without_a_length_reaches_its_contacts() -> None:
+    body = "".join(
+        f'<contact localId="{n}"><position x="{60 + n}" y="{y}"/><connectionPointIn><connection refLocalId="1"/>'
+        "</connectionPointIn><connectionPointOut/><variable>a</variable></contact>"
+        for n, y in ((2, 20), (3, 300))
+    )
+    rail = '<leftPowerRail localId="1"><position x="0" y="0"/><connectionPointOut/></leftPowerRail>'
+    text = re.sub(r"<FBD>.*</FBD>", f"<LD>{rail}{body}</LD>", chain([[]]), flags=re.DOTALL)
+    read = drawn("Main", text.replace("<interface/>", "<interface><localVars><variable name='a'><type><BOOL/></type></variable>"
+                                      "</localVars></interface>"))  # fmt: skip
+    assert vertical_lines(read) == []  # each connection is a straight line
+
+
 def run(*words: str) -> Result:
     return CliRunner().invoke(diagram, words, standalone_mode=False, catch_exceptions=False)
 

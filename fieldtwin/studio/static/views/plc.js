@@ -6,6 +6,7 @@ import { number } from "../lib/format.js";
 import { Failure, Quality, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { ForceDialog, ReleaseDialog, Why } from "./plc_dialogs.js";
+import { Drawings } from "./plc_drawings.js";
 import { Source } from "./plc_source.js";
 import { States, Transitions } from "./plc_states.js";
 
@@ -15,6 +16,7 @@ export function Plc({ store }) {
   const [run, error] = useAction();
   const [open, setOpen] = useState(null); // the open dialog: [component, its properties]
   const [transitions] = useFetched(() => get(`${store.path}/plc/transitions${store.isTrace ? `?at_ns=${store.settled ?? 0}` : ""}`), [store.settled, JSON.stringify(store.status?.transitions ?? {})]);
+  const [drawings] = useFetched(() => (store.isTrace ? Promise.resolve({}) : get(`${store.path}/plc/drawings`)), [store.path, Boolean(plc), plc?.pid, plc?.restarts, plc?.programs_replaced]);
   if (!plc) return html`<p class="empty">The PLC does not answer.</p>`;
   const act = (path, body) => () => run(() => post(`${store.path}/plc/${path}`, body));
   const programs = Object.keys(store.about.system.programs);
@@ -34,6 +36,7 @@ export function Plc({ store }) {
     <div class="columns plc">
       <div class="stack">
         ${programs.map((name) => html`<${Program} key=${name} store=${store} name=${name} plc=${plc} changes=${transitions?.[name] ?? []} />`)}
+        ${programs.map((name) => drawings?.[name] && html`<${Drawings} key=${name} store=${store} program=${name} drawings=${drawings[name]} />`)}
         ${!store.isTrace && html`${tags}<${Internal} store=${store} />`}
         ${store.isTrace &&
         programs.length > 0 &&

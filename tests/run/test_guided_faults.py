@@ -175,6 +175,13 @@ def test_a_failure_by_guided_faults_is_shrunk_to_a_scenario_that_is_confirmed(pl
     assert "fails with 1 fault of its schedule; without faults the run passes" in done.output
 
 
+def test_the_programs_of_the_benchmark_run() -> None:
+    bugs = Path(__file__).resolve().parents[2] / "benchmarks" / "steering_bugs" / "plant.yaml"
+    run, events = made(VirtualOptions(str(bugs), 30.0, seed=1))
+    assert run.summary()["ok"]
+    assert {"burner.state", "dosing.state", "pumps.state", "standby.state"} <= {event.where for event in events}
+
+
 def test_options_of_faults_without_chosen_faults_name_both_ways_to_choose(plant: str) -> None:
     done = invoke("simulate", plant, "--for", "1h", "--fault-every", "20s")
     assert "--faults random or --faults guided" in str(done.exception)

@@ -79,15 +79,17 @@ class CoverageCollector:
             self._add(Kind.TAG, tag, quality, variable, value)
 
     def _fault(self, event: TraceEvent) -> None:
-        """Note when a fault will begin and end: an injected fault has its times, which count from its injection, in `said`."""
+        """Note when a fault will begin and end. An injected fault has its times in `said`, in seconds of the run."""
         if not event.data.get("on"):
             self._ended(event.where, event.t_ns)
             return
         said = event.data.get("said", {})
-        begin_ns = event.t_ns + round(seconds(said.get("from", 0.0)) * NS_PER_S)
-        heappush(self._edges, (begin_ns, event.where, f"{event.data.get('name')} {event.data.get('target')}"))
-        if (until := said.get("until")) is not None:
-            heappush(self._edges, (event.t_ns + round(seconds(until) * NS_PER_S), event.where, NO_FAULT))
+        begin_ns = max(event.t_ns, round(seconds(said.get("from", 0.0)) * NS_PER_S))
+        end_ns = None if said.get("until") is None else round(seconds(said["until"]) * NS_PER_S)
+        if end_ns is None or end_ns > begin_ns:
+            heappush(self._edges, (begin_ns, event.where, f"{event.data.get('name')} {event.data.get('target')}"))
+            if end_ns is not None:
+                heappush(self._edges, (end_ns, event.where, NO_FAULT))
         self._advance(event.t_ns)
 
     def _advance(self, t_ns: int) -> None:

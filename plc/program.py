@@ -365,7 +365,7 @@ class Program(ABC):
                     return InternalVariable(path, kind, value)
         return None
 
-    def reader(self, path: str) -> VariableReader | None:
+    def variable_reader(self, path: str) -> VariableReader | None:
         """Return what reads a variable by its path, whether or not it is a tag; None if the program has no such variable."""
         declared = self.variables.get(path)
         if declared is not None:

@@ -92,7 +92,7 @@ class RunnerTrace:
         runner = self._runner
         program, _, path = name.partition(".")
         for bound in runner.programs:
-            if bound.name == program and (found := bound.program.reader(path)) is not None:
+            if bound.name == program and (found := bound.program.variable_reader(path)) is not None:
                 return TracedVariable(name, found.type, found.read, found.unit)
         specs = {region.name: {tag.name: tag for tag in region.tags} for region in runner.regions}
         if (spec := specs[INPUTS].get(name)) is not None:

@@ -213,7 +213,7 @@ class StProgram(Program):
     def internal(self, path: str) -> InternalVariable | None:
         return self.st_paths.internal(path, self.st_body, self.st_resource.globals)
 
-    def reader(self, path: str) -> VariableReader | None:
+    def variable_reader(self, path: str) -> VariableReader | None:
         found = self.st_paths.reading(path)
         if found is None:
             return None

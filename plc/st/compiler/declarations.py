@@ -260,9 +260,6 @@ class Declarations:
                 if isinstance(field.type, t.EnumType) and isinstance(kind, ty.Enum):
                     self.register(kind)
                 fields[field.name.lower()] = (field.name, kind)
-            if not fields and not self.env.dialect.vendor:
-                hint = "the dialects codesys and twincat accept it"
-                self.env.fail(declared.pos, f"{declared.name} is a STRUCT without members", hint=hint)
             total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
             refers = any(ty.holds_interface(kind) for _, kind in fields.values())
             struct = ty.Struct(declared.name, fields, total, nested + 1, refers)

@@ -255,7 +255,7 @@ def test_a_string_may_have_several_lines() -> None:
 def test_a_structure_may_have_no_members() -> None:
     before = "TYPE Nothing : STRUCT END_STRUCT END_TYPE"
     assert codesys("a, b : Nothing; n : INT;", "a := b; n := 1;", before)["n"] == 1
-    with pytest.raises(FileInvalid, match="Nothing is a STRUCT without members"):
+    with pytest.raises(FileInvalid, match="the structure Nothing has no members"):
         run("a : Nothing;", "", before)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.plc.st.classes.readable import readable
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.dialects import Dialect
 from fieldtwin.plc.st.model_checking.transition import HIDDEN, action_of
@@ -82,7 +83,7 @@ def asked(
         if len(machine.states) <= MAX_STATES and not _is_reference(unit, machine)
         for state, text in _states(unit, machine)
     )
-    whole = unit
+    whole = replace(unit, pous=tuple(map(readable, unit.pous)))
     for each in (*own, *supposed):
         whole = _with_action(whole, each)
         try:

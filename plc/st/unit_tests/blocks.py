@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from fieldtwin.plc.st.classes.readable import readable
 from fieldtwin.plc.st.compiler.configurations.called import AS_BLOCK
 from fieldtwin.plc.st.compiler.configurations.located import KINDS
 from fieldtwin.plc.st.syntax import tree as t
@@ -24,24 +25,10 @@ def programs_as_blocks(unit: t.SourceUnit) -> t.SourceUnit:
     pous = (pou for pou in unit.pous if pou.name not in missing)
     return replace(
         unit,
-        pous=tuple(_block(pou) if pou.kind == "PROGRAM" else _readable(pou) for pou in pous),
+        pous=tuple(_block(pou) if pou.kind == "PROGRAM" else readable(pou) for pou in pous),
         instances=(),
         missing=(*unit.missing, *missing.values()),
     )
-
-
-def _readable(pou: t.Pou) -> t.Pou:
-    """Return a function block or class whose local variables a test can read, except those that state their access."""
-    if pou.kind not in ("FUNCTION_BLOCK", "CLASS"):
-        return pou
-    access = {"PUBLIC", "PROTECTED", "PRIVATE", "INTERNAL", "CONSTANT"}
-    blocks = (
-        replace(block, qualifiers=block.qualifiers | {"PUBLIC"})
-        if block.kind == "VAR" and not block.qualifiers & access
-        else block
-        for block in pou.blocks
-    )
-    return replace(pou, blocks=tuple(blocks))
 
 
 def _no_block(program: t.Pou) -> t.Missing | None:

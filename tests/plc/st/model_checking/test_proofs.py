@@ -354,3 +354,14 @@ def test_programs_that_a_program_calls_are_part_of_the_proof() -> None:
     """
     report = proved(text, "total <= 30", "total < 30", dialect=dialect_of("codesys"))
     assert [r.verdict for r in report.invariants] == ["proved", "violated", "proved"]
+
+
+def test_an_invariant_may_read_local_variables_of_function_blocks() -> None:
+    text = """
+    FUNCTION_BLOCK Motor VAR_INPUT on : BOOL; END_VAR VAR delay : TON; runs : BOOL; END_VAR
+      delay(IN := on, PT := T#1s); runs := delay.Q;
+    END_FUNCTION_BLOCK
+    PROGRAM Main VAR_INPUT on : BOOL; END_VAR VAR motor : Motor; END_VAR motor(on := on); END_PROGRAM
+    """
+    report = proved(text, "motor.runs = motor.delay.Q", "NOT motor.runs")
+    assert [r.verdict for r in report.invariants] == ["proved", "violated", "proved"]

@@ -141,10 +141,10 @@ def test_no_more_parts_run_at_a_time_than_there_are_workers_and_none_runs_twice(
         asked.append([tuple(part) for part in parts])
         return echo(parts)
 
-    assert shrunk_run(range(12), results_of, {3, 8}.issubset, FurtherRuns(0), lambda: 4)[:2] == ([3, 8], True)
+    assert shrunk_run(range(12), results_of, {3, 8}.issubset, FurtherRuns(0), lambda: 3)[:2] == ([3, 8], True)
     runs = [part for parts in asked for part in parts]
     assert len(runs) == len(set(runs))
-    assert max(map(len, asked)) == 4
+    assert max(map(len, asked)) == 3
 
 
 @pytest.mark.long

@@ -1,6 +1,6 @@
 """Structures that extend others (``TYPE Big EXTENDS Small : STRUCT``), an addition of CODESYS and TwinCAT to the standard.
 
-A structure gets the members of its base before its own.
+A structure gets the members of its base before its own. A structure without members is also an addition of these dialects.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit
     for one in structures.values() if not dialect.vendor else ():
         if one.extends:
             errors.add(invalid(one.extends[0].pos, "EXTENDS of a structure is not in the standard", hint=hint))
+        elif not one.fields:
+            errors.add(invalid(one.pos, f"the structure {one.name} has no members", "at least one member", hint=hint))
     errors.raise_all()
     missing = {one.name.lower() for one in unit.missing}
     done: dict[str, t.StructDecl] = {}

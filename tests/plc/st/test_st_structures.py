@@ -52,6 +52,8 @@ def test_mistakes_in_the_bases_of_structures_are_refused(text: str, said: str) -
 def test_the_standard_has_no_such_structures(dialect: str) -> None:
     with pytest.raises(FileInvalid, match=r"EXTENDS of a structure is not in the standard"):
         compile_text(TYPES, dialect=dialect_of(dialect))
+    with pytest.raises(FileInvalid, match=r"the structure E has no members; expected at least one member"):
+        compile_text("TYPE E : STRUCT END_STRUCT; END_TYPE", dialect=dialect_of(dialect))
 
 
 def test_the_name_of_a_library_may_stand_before_its_declarations(tmp_path: Path) -> None:

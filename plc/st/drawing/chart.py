@@ -176,10 +176,16 @@ class _Layout:
         return [own for _, own in groups]
 
     def _merging(self, leaving: Sequence[t.Transition], end: str | t.Transition | None) -> str | None:
-        """Return the step to which most of the alternatives lead, the nearest one first; None if no two lead to one step."""
+        """Return the step to which most of the alternatives lead, the nearest one first.
+
+        If only one of them leads on, return its step, so that the others are short branches beside the main sequence.
+        """
         reached = [self._distances(map(str.lower, one.targets), end) for one in leaving]
         counts = {step: [each[step] for each in reached if step in each] for each in reached for step in each}
         shared = {step: distances for step, distances in counts.items() if len(distances) > 1}
+        leading_on = [one for one, steps in zip(leaving, reached, strict=True) if steps]
+        if not shared and len(leading_on) == 1 and len(leading_on[0].targets) == 1:
+            return leading_on[0].targets[0].lower()
         return min(shared, key=lambda step: (-len(shared[step]), sum(shared[step])), default=None)
 
     def _joining(self, targets: Sequence[str]) -> t.Transition | None:

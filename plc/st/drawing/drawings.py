@@ -23,13 +23,23 @@ class Drawing:
     def svg(self, title: str, network: int = 0, style: bool = True) -> str:
         """Return the drawing as SVG text. `network` selects a network, from 1; 0 draws the whole body.
 
-        Raises `UsageError` for an unknown network.
+        Raises `UsageError` for an unknown network, and for a chart with too many branches inside each other.
         """
         if isinstance(self.body, t.Graphic):
             return draw_network(self.body.body, title, network, style)
         if network:
             raise UsageError(f"{title} is a chart, which has no networks")
-        return draw_chart(self.body, title, style)
+        try:
+            return draw_chart(self.body, title, style)
+        except RecursionError as e:
+            raise UsageError(f"{title} has too many branches inside each other to be drawn") from e
+
+    @property
+    def elements(self) -> int:
+        """Return the number of elements, steps and transitions."""
+        if isinstance(self.body, t.Graphic):
+            return len(self.body.body.children)
+        return len(self.body.steps) + len(self.body.transitions)
 
     @property
     def networks(self) -> int:

@@ -7,10 +7,12 @@ other than of a few functions of the standard, has no value here. Only the parts
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import add, and_, eq, ge, gt, le, lt, mul, ne, or_, sub, xor
 from typing import Any
 
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.charts.translate import control_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
@@ -23,6 +25,8 @@ from fieldtwin.plc.st.syntax.written import reference
 
 MOST_DRAWINGS = 16
 """The largest number of drawings of one program."""
+MOST_ELEMENTS = 1_000
+"""The largest number of elements of a drawing for displays, because a PLC makes it when it starts: 0.2 s for 800 elements."""
 MOST_PARTS = 400
 """The largest number of parts of a drawing whose values are read, because this happens between two scans."""
 _STATE = "state"
@@ -84,9 +88,10 @@ def _live_drawings(
     found: list[LiveDrawing] = []
     for path, pou in (("", program.lower()), *_instances(variables, inspection)):
         for one in by_pou.get(pou, ()):
-            if len(found) < MOST_DRAWINGS:
+            if len(found) < MOST_DRAWINGS and one.elements <= MOST_ELEMENTS:
                 name = ".".join(part for part in (program, path, one.action) if part)
-                found.append(LiveDrawing(name, path, pous[pou], one, one.svg(name, style=False)))
+                with suppress(UsageError):  # a chart that cannot be drawn is still executed
+                    found.append(LiveDrawing(name, path, pous[pou], one, one.svg(name, style=False)))
     return found
 
 

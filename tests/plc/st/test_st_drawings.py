@@ -6,6 +6,7 @@ from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 from drawn_boxes import Read
 from hypothesis import given
@@ -13,7 +14,9 @@ from hypothesis import strategies as st
 from random_charts import random_charts, text_of_chart
 
 from fieldtwin.cli.plc.diagram_command import diagram
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.st.drawing.chart import draw_chart
+from fieldtwin.plc.st.drawing.drawings import drawings_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_all
 
@@ -108,6 +111,25 @@ def test_any_other_chart_is_also_drawn_completely(moves: list[tuple[list[str], l
     assert drawn.problems() == []
     assert Counter(drawn.groups("step", "step")) == Counter(STEPS)
     assert Counter(drawn.groups("transition", "transition")) == Counter(map(str, range(len(moves))))
+
+
+def test_a_long_sequence_that_each_step_can_abort_is_one_straight_line() -> None:
+    steps = [f"s{n}" for n in range(400)]
+    moves = [([a], [b]) for a, b in pairwise(steps)] + [([step], ["s0"]) for step in steps[1:]]
+    drawn = read(text_of_chart(steps, moves))
+    assert drawn.view.right - drawn.view.left < 500
+    assert Counter(drawn.groups("step", "step")) == Counter(steps)
+
+
+def test_a_chart_with_too_many_branches_inside_each_other_is_refused() -> None:
+    steps = [f"s{n}" for n in range(1200)]
+    moves = [([f"s{n // 2}"], [f"s{n}"]) for n in range(1, 3)]
+    moves += [([f"s{n}"], [f"s{n + 2}"]) for n in range(1, 1198, 2)] + [
+        ([f"s{n}"], [f"s{n + 3}"]) for n in range(1, 1197, 2)
+    ]
+    (one,) = drawings_of(parse_all(text_of_chart(steps, moves)))
+    with pytest.raises(UsageError, match="too many branches inside each other"):
+        one.svg("deep")
 
 
 def test_the_chart_of_an_action_has_a_drawing_of_its_own(tmp_path: Path) -> None:

@@ -351,3 +351,11 @@ def test_the_process_image_holds_the_variables_of_instances(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["codesys", "twincat"])
 def test_the_dialects_accept_the_same(name: str) -> None:
     compile_text(CONFIGURED, dialect=dialect_of(name))
+
+
+def test_the_line_of_an_output_is_in_the_file_of_its_function_block(tmp_path: Path) -> None:
+    (tmp_path / "Pump.st").write_text(PUMP)
+    (tmp_path / "Main.st").write_text("PROGRAM Main VAR a : Pump; END_VAR a(on := TRUE); END_PROGRAM")
+    made: Any = load_program(str(tmp_path))
+    scan(made)
+    assert str(made.place("a.run")) == f"{tmp_path / 'Pump.st'}:6"

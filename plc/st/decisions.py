@@ -1,18 +1,23 @@
-"""The statements of a PROGRAM that assign its variables, each with the conditions under which it is executed.
+"""The statements that assign variables of a PROGRAM and outputs of function blocks, each with the conditions under which it is
+executed.
 
-So `fieldtwin plc why` can show which statement gave a tag its value, and what decided that it was executed.
+So `fieldtwin plc why` can show which statement gave a tag its value, also inside the function blocks that the program uses, and
+what decided that it was executed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from operator import attrgetter
 from typing import Any
 
 import msgspec
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.assignments import line_of
+from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.inspection import Inspection, literal
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.source import shortened
@@ -21,6 +26,10 @@ from fieldtwin.plc.st.syntax.written import case_label, reference, text_of
 
 MAX_VARIABLES = 16
 """The largest number of variables that are recorded for one statement."""
+MAX_DEPTH = 8
+"""How deep instances inside instances are followed."""
+MAX_INSIDE = 8
+"""The largest number of statements inside function blocks that are recorded for one statement of a program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +52,14 @@ class Condition:
 class Decision:
     """A statement that assigns a variable, with the conditions around it, the outer ones first.
 
-    `reads` are the paths of the variables in the conditions and in the assigned value.
+    `reads` are the paths of the variables in the conditions and in the assigned value. `source` is the path of the output of a
+    block that a call assigns to the variable, such as ``pump.run``; empty for an assignment.
     """
 
     statement: t.Assign | t.CallStatement
     conditions: tuple[Condition, ...]
     reads: tuple[str, ...]
+    source: str = ""
 
     @property
     def text(self) -> str:
@@ -58,21 +69,50 @@ class Decision:
         return f"{reference(one.target)} := {_text(one.value)}"
 
 
-Decisions = Mapping[tuple[str, int, str], Decision]
-"""By file, line and assigned variable in lower case. Of several statements in one line the last one counts."""
+DecisionKey = tuple[str, int, str]
+"""A file, a line, and an assigned variable in lower case."""
+Decisions = Mapping[DecisionKey, Decision]
+"""Of several statements in one line that assign a variable, the last one counts."""
+_Assignment = t.Assign | t.CallStatement
+_Found = tuple[_Assignment, tuple[Condition, ...], tuple[t.Expr, ...]]
 
 
 def decisions_of(unit: t.SourceUnit) -> Decisions:
-    """Return the statements of the PROGRAMs of a unit that assign a variable, without those of function blocks."""
-    found: dict[tuple[str, int, str], Decision] = {}
-    for pou in unit.pous:
-        for body in (pou.body, *(action.body for action in pou.actions)) if pou.kind == "PROGRAM" else ():
-            for statement, conditions, read in _statements(body, (), ()):
-                _add(found, statement, conditions, read)
-    return found
+    """Return the statements of the PROGRAMs, function blocks and methods of a unit that assign a variable.
+
+    Nothing is computed before the first statement is looked up, and then only what all statements need.
+    """
+    return _Lookup(unit)
 
 
-_Found = tuple[t.Assign | t.CallStatement, tuple[Condition, ...], tuple[t.Expr, ...]]
+class _Lookup(Mapping[DecisionKey, Decision]):
+    """The decisions of a unit, each of which is made when it is looked up."""
+
+    def __init__(self, unit: t.SourceUnit) -> None:
+        self._unit = unit
+        self._made: dict[DecisionKey, Decision] = {}
+
+    @cached_property
+    def _found(self) -> dict[DecisionKey, _Found]:
+        found: dict[DecisionKey, _Found] = {}
+        for pou in self._unit.pous:
+            bodies = (pou.body, *(one.body for one in pou.actions), *(one.body for one in pou.methods))
+            for body in bodies if pou.kind not in ("FUNCTION", "INTERFACE") else ():
+                for one in _statements(body, (), ()):
+                    for target in _targets(one[0]):
+                        found[one[0].pos.path, one[0].pos.line, target] = one
+        return found
+
+    def __getitem__(self, key: DecisionKey) -> Decision:
+        if key not in self._made:
+            self._made[key] = _decision(*self._found[key], key[2])
+        return self._made[key]
+
+    def __iter__(self) -> Iterator[DecisionKey]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
 
 
 def _statements(
@@ -104,23 +144,30 @@ def _case(case: t.Case, conditions: tuple[Condition, ...], read: tuple[t.Expr, .
     yield from _statements(case.otherwise, (*conditions, other), read)
 
 
-def _add(
-    found: dict[tuple[str, int, str], Decision],
-    statement: t.Assign | t.CallStatement,
-    conditions: tuple[Condition, ...],
-    read: tuple[t.Expr, ...],
-) -> None:
+def _targets(statement: _Assignment) -> Iterator[str]:
+    """Yield the variables that a statement assigns, in lower case."""
     if isinstance(statement, t.Assign):
-        targets, values = [statement.target], [statement.value]
+        yield statement.target.name.lower()
+        return
+    for argument in statement.call.arguments:
+        if argument.target is not None:
+            yield argument.target.name.lower()
+
+
+def _decision(
+    statement: _Assignment, conditions: tuple[Condition, ...], read: tuple[t.Expr, ...], target: str
+) -> Decision:
+    """Return the decision of a statement that assigns the variable `target`, in lower case."""
+    source = ""
+    if isinstance(statement, t.Assign):
+        values = [statement.value]
     else:
-        arguments = statement.call.arguments
-        targets = [a.target for a in arguments if a.target is not None]
-        values = [a.value for a in arguments if a.value is not None]
+        call = statement.call
+        values = [one.value for one in call.arguments if one.value is not None]
+        output = next(one for one in call.arguments if one.target is not None and one.target.name.lower() == target)
+        source = f"{reference(call.ref)}.{output.name}"
     paths = [reference(ref) for ref in _references((*read, *values))]
-    pos = statement.pos
-    decision = Decision(statement, conditions, tuple(dict.fromkeys(paths))[:MAX_VARIABLES])
-    for target in targets:
-        found[pos.path, pos.line, target.name.lower()] = decision
+    return Decision(statement, conditions, tuple(dict.fromkeys(paths))[:MAX_VARIABLES], source)
 
 
 def _references(expressions: Sequence[t.Expr]) -> list[t.Ref]:
@@ -140,26 +187,74 @@ def _text(expression: t.Expr) -> str:
 class DecisionReader:
     """Reads the variables of a decision from a running program. `hidden` are variables in lower case that are not wanted."""
 
-    def __init__(self, inspection: Inspection, decisions: Decisions, hidden: frozenset[str]) -> None:
-        self._inspection, self._decisions, self._hidden = inspection, decisions, hidden
-        self._found: dict[tuple[str, int, str], tuple[Decision, _Variables, _Reader]] = {}
-        """The decisions that were read, with their variables, and the function that reads these from a program."""
+    def __init__(
+        self,
+        unit: CompiledUnit,
+        variables: Sequence[tuple[str, ty.Type]],
+        decisions: Decisions,
+        hidden: frozenset[str] = frozenset(),
+    ) -> None:
+        self._unit, self._inspection, self._decisions = unit, Inspection(unit, variables), decisions
+        self._hidden = hidden
+        self._plans: dict[DecisionKey, _Plan] = {}
+        """The decisions that were read."""
+        self._blocks: dict[str, DecisionReader] = {}
+        """The readers of function blocks by their names in lower case; those of a block are shared by all its instances."""
 
-    def read(self, body: Any, key: tuple[str, int, str]) -> Decided | None:
-        """Return the decision for a file, a line and a variable, with the present values; None without such a statement."""
-        found = self._found.get(key)
-        if found is None:
+    def read(self, body: Any, key: DecisionKey) -> Decided | None:
+        """Return the decision for a file, a line and a variable, with the present values; None without such a statement.
+
+        The outputs of function blocks that it uses are followed to the statements in these blocks.
+        """
+        plan = self._plan(key)
+        if plan is None:
+            return None
+        inside = tuple(self._inside(body, plan, "", 0)[:MAX_INSIDE]) if plan.outputs else ()
+        return Decided(plan.decision, plan.variables, plan.values_of(body), inside)
+
+    def _inside(self, body: Any, plan: _Plan, at: str, depth: int) -> list[Inside]:
+        """Return the statements that assigned the outputs of instances which a statement uses, each before those inside it."""
+        found: list[Inside] = []
+        for output in plan.outputs if depth < MAX_DEPTH else ():
+            instance = output.instance(body)
+            place = getattr(instance, line_of(f"v_{output.name}"), None)
+            inner = output.reader._plan((*place, output.name)) if place and len(found) < MAX_INSIDE else None
+            if inner is not None:
+                path = f"{at}{output.path}"
+                values = inner.values_of(instance)
+                found.append(Inside(path, output.block, place, Decided(inner.decision, inner.variables, values)))
+                found += output.reader._inside(instance, inner, f"{path}.", depth + 1)
+        return found
+
+    def _plan(self, key: DecisionKey) -> _Plan | None:
+        plan = self._plans.get(key)
+        if plan is None:
             decision = self._decisions.get(key)
             if decision is None:
                 return None
-            found = self._found[key] = (decision, *self._variables(decision))
-        decision, variables, values_of = found
-        return Decided(decision, variables, values_of(body))
+            paths = (*decision.reads, *((decision.source,) if decision.source else ()))
+            plan = self._plans[key] = _Plan(decision, *self._variables(decision), tuple(self._outputs(paths)))
+        return plan
 
     def _variables(self, decision: Decision) -> tuple[_Variables, _Reader]:
         shown = [path for path in decision.reads if path.partition(".")[0].lower() not in self._hidden]
         found = [(path, *attribute) for path in shown if (attribute := self._inspection.attribute(path)) is not None]
         return tuple([(path, kind) for path, _, kind in found]), reader([attribute for _, attribute, _ in found])
+
+    def _outputs(self, paths: Sequence[str]) -> Iterator[_Output]:
+        """Yield the outputs of instances of function blocks among `paths`."""
+        for path in dict.fromkeys(paths):
+            instance, _, name = path.rpartition(".")
+            found = self._inspection.instance(instance) if instance else None
+            if found is None:
+                continue
+            attribute, block = found
+            key = block.name.lower()
+            if key not in self._blocks:
+                reader_of_block = DecisionReader(self._unit, self._unit.blocks[key], self._decisions)
+                reader_of_block._blocks = self._blocks
+                self._blocks[key] = reader_of_block
+            yield _Output(instance, name.lower(), block.name, attrgetter(attribute), self._blocks[key])
 
 
 def reader(attributes: list[str]) -> _Reader:
@@ -176,16 +271,40 @@ _Reader = Callable[[Any], tuple[Any, ...]]
 """A function that returns the values of some attributes of an object."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Output:
+    """The output `name` of an instance at `path`, in lower case, with the reader of its block."""
+
+    path: str
+    name: str
+    block: str
+    instance: Callable[[Any], Any]
+    reader: DecisionReader
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """A decision, with its variables, the function that reads these, and the outputs of instances that are followed."""
+
+    decision: Decision
+    variables: _Variables
+    values_of: _Reader
+    outputs: tuple[_Output, ...]
+
+
 class Decided(msgspec.Struct, frozen=True, gc=False):
-    """An executed decision, with the values of its variables after the scan."""
+    """An executed decision, with the values of its variables after the scan, and the statements inside the function blocks whose
+    outputs it used, the outer blocks first.
+    """
 
     decision: Decision
     variables: _Variables
     values: tuple[Any, ...]
+    inside: tuple[Inside, ...] = ()
 
     def describe(self) -> dict[str, Any]:
         """Return data for JSON."""
-        return {
+        found: dict[str, Any] = {
             "statement": self.decision.text,
             "conditions": [
                 {"line": one.line, "text": one.text, "holds": one.holds} for one in self.decision.conditions
@@ -194,3 +313,21 @@ class Decided(msgspec.Struct, frozen=True, gc=False):
                 path: literal(kind, value) for (path, kind), value in zip(self.variables, self.values, strict=True)
             },
         }
+        return {**found, "inside": [one.describe() for one in self.inside]} if self.inside else found
+
+
+class Inside(msgspec.Struct, frozen=True, gc=False):
+    """The statement inside a function block that assigned an output of the instance `path`, such as ``pump.starter``.
+
+    `place` is its file and line.
+    """
+
+    path: str
+    block: str
+    place: tuple[str, int]
+    decided: Decided
+
+    def describe(self) -> dict[str, Any]:
+        """Return data for JSON."""
+        place = ":".join(map(str, self.place))
+        return {"instance": self.path, "block": self.block, "place": place, **self.decided.describe()}

@@ -90,6 +90,13 @@ class Inspection:
         found = self.code(path) if "[" not in path else None
         return None if found is None or isinstance(found[1], ty.Struct | ty.Block | ty.Array) else found
 
+    def instance(self, path: str) -> tuple[str, ty.Block] | None:
+        """Return the Python attributes of a path without indices to an instance of a function block of the unit, and its type."""
+        found = self.code(path) if "[" not in path else None
+        if found is None or not isinstance(found[1], ty.Block) or found[1].standard is not None:
+            return None
+        return found[0], found[1]
+
     def code(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes and indices of a path, such as ``v_levels[2]``, and its type; None for an unknown path."""
         name, rest = first_name(path)

@@ -35,10 +35,10 @@ from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.coverage.recording import active_recording
-from fieldtwin.plc.st.decisions import Decided, DecisionReader, decisions_of, reader
+from fieldtwin.plc.st.decisions import Decided, DecisionReader, Decisions, decisions_of, reader
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
-from fieldtwin.plc.st.inspection import Inspection, shown_value
+from fieldtwin.plc.st.inspection import shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
@@ -329,7 +329,7 @@ def _too_deep(error: RecursionError) -> values.LogicError:
 def program_class(
     unit: CompiledUnit,
     name: str = "",
-    decisions: Mapping[tuple[str, int, str], Any] | None = None,
+    decisions: Decisions | None = None,
     pictures: Pictures | None = None,
     *,
     takes_writes: bool = False,
@@ -365,7 +365,8 @@ def program_class(
     if takes_writes:
         tags = {WRITES: message_input(), **tags}
     decided = DecisionReader(
-        Inspection(unit, [(v.name, v.kind) for v in found.variables if not v.steps]),
+        unit,
+        [(v.name, v.kind) for v in found.variables if not v.steps],
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )

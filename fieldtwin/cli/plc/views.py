@@ -273,9 +273,15 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
 
 def _print_decision(place: str, decided: Mapping[str, Any]) -> None:
     """Print the line that made a change; for Structured Text with its statement, the conditions around it, and the values that
-    its variables had after the scan.
+    its variables had after the scan. The statements inside function blocks follow.
     """
-    stdout.print(f"    in {place}  {decided.get('statement', '')}".rstrip(), markup=False, soft_wrap=True)
+    _print_statement(f"in {place}", decided)
+    for one in decided.get("inside", ()):
+        _print_statement(f"{one['instance']} ({one['block']}): in {one['place']}", one)
+
+
+def _print_statement(where: str, decided: Mapping[str, Any]) -> None:
+    stdout.print(f"    {where}  {decided.get('statement', '')}".rstrip(), markup=False, soft_wrap=True)
     for one in decided.get("conditions", ()):
         said = "because" if one["holds"] else "because not"
         stdout.print(f"        {said} {one['text']}  (line {one['line']})", markup=False, soft_wrap=True)

@@ -75,11 +75,32 @@ class Statements(Calls):
     # -- unit tests and coverage --------------------------------------------------------------------------------------
 
     def _assertion(self, s: t.Assertion) -> None:
-        condition = self.condition(s.condition, "an assertion")
+        condition = self.condition(s.condition, "an assertion") if s.condition is not None else ""
         shown = [self.value(expr) for expr in s.shown]
+        condition = condition or self._same_arrays(s, shown)
         self.env.recorded[s.number] = tuple(value.type for value in shown)
         values = "".join(f"{value.code}, " for value in shown)
         self.out.line(f"_c.asserted({s.number}, {condition}, ({values}), {s.of_test})", s.pos)
+
+    def _same_arrays(self, s: t.Assertion, values: list[Value]) -> str:
+        """Return the code that compares two arrays of an assertion."""
+        kinds = [value.type for value in values[:2] if isinstance(value.type, ty.Array)]
+        for expr, value in zip(s.shown[:2], values, strict=False):
+            if not isinstance(value.type, ty.Array) or not isinstance(
+                ty.plain(value.type.of), ty.Elementary | ty.String
+            ):
+                wanted = "an array of numbers, texts or truth values"
+                self.env.fail(expr.pos, "an assertion about arrays", expected=wanted, got=str(value.type))
+        actual, expected = kinds
+        fits = ty.fits(actual.of, expected.of) or ty.fits(expected.of, actual.of)
+        if not fits or len(actual.ranges) != len(expected.ranges):
+            self.env.fail(s.pos, "arrays of different types", expected=str(expected), got=str(actual))
+        within = self.coerced(values[2], ty.LREAL, s.pos, "Delta") if len(values) > 2 else "None"
+        return f"_c.same({values[0].code}, {values[1].code}, {within})"
+
+    def _ordered(self, s: t.Ordered) -> None:
+        with self.out.block(f"if _c.has_turn({s.test}):", s.pos):
+            self.body(s.body)
 
     def _finished(self, s: t.Finished) -> None:
         self.out.line(f"_c.finished.add({s.test})", s.pos)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from fieldtwin.plc.st.compiler.assignments import line_of
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
 
@@ -51,21 +52,24 @@ class Whole(Cell):
 class MemberReference:
     """A reference to an attribute: a variable of a program or block, a global variable, or a member of a structure."""
 
-    __slots__ = ("_name", "_owner")
+    __slots__ = ("name", "owner")
 
     def __init__(self, owner: Any, name: str) -> None:
-        self._owner, self._name = owner, name
+        self.owner, self.name = owner, name
 
     def key(self) -> Key:
-        return id(self._owner), self._name
+        return id(self.owner), self.name
 
     @property
     def v(self) -> Any:
-        return getattr(self._owner, self._name)
+        return getattr(self.owner, self.name)
 
     @v.setter
     def v(self, value: Any) -> None:
-        setattr(self._owner, self._name, value)
+        setattr(self.owner, self.name, value)
+        line = line_of(self.name)
+        if getattr(self.owner, line, 0):  # that of an earlier assignment; the line of this one is not known here
+            setattr(self.owner, line, 0)
 
 
 class Element:

@@ -576,11 +576,12 @@ class Assertion:
     """An assertion of a unit test. `number` identifies it in the unit; `shown` are the values that a failure shows.
 
     An assertion of a cyclic test has the number of the test (`of_test`), because it does not count after the end of that test.
+    Without a `condition` it compares two arrays, the first two values, element by element; a third value is the tolerance.
     """
 
     pos: Pos
     number: int
-    condition: Expr
+    condition: Expr | None
     shown: tuple[Expr, ...]
     of_test: int = 0
 
@@ -591,6 +592,15 @@ class Finished:
 
     pos: Pos
     test: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ordered:
+    """The statements of the cyclic unit test with the number `test`, executed after the ordered tests before it have ended."""
+
+    pos: Pos
+    test: int
+    body: tuple[Statement, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -611,6 +621,6 @@ class Probe:
 
 
 Statement = (
-    Assertion | Finished | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement
+    Assertion | Finished | Ordered | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement
     | If | Case | For | While | Repeat | Jump
 )  # fmt: skip

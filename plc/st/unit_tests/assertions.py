@@ -11,6 +11,9 @@ COMPARISONS = {
     "ASSERT_EQ": "=", "ASSERT_NE": "<>", "ASSERT_LT": "<", "ASSERT_LE": "<=", "ASSERT_GT": ">", "ASSERT_GE": ">=",
 }  # fmt: skip
 
+ARRAYS = "ASSERT_ARRAYS"
+"""The kind of an assertion that compares two arrays."""
+
 
 @dataclass(frozen=True, slots=True)
 class AssertionText:
@@ -64,8 +67,10 @@ def assertion(kind: str, pos: t.Pos, number: int, given: list[t.Expr], of_test: 
     return [*held, t.Assertion(pos, number, _condition(kind, pos, shown), tuple(shown), of_test)]
 
 
-def _condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr:
-    """Return the condition that an assertion checks. `values` are its arguments without the message."""
+def _condition(name: str, pos: t.Pos, values: list[t.Expr]) -> t.Expr | None:
+    """Return the condition that an assertion checks; None if it is about arrays. `values` are its arguments, but no message."""
+    if name == ARRAYS:
+        return None
     if name == "ASSERT_TRUE":
         return values[0]
     if name == "ASSERT_FALSE":

@@ -6,6 +6,7 @@ block in a test executes it once, as a scan does; time passes with ADVANCE_TIME 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,9 +15,10 @@ from typing import Any
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.plc.program import ScanTooLong
+from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.inspection import literal
+from fieldtwin.plc.st.inspection import elements, literal
 from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource, line_of_error
 from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest
 
@@ -72,7 +74,7 @@ class _Count:
 class _TestContext(Context):
     """The context of compiled code in a test: its time is that of the test."""
 
-    __slots__ = ("_advances", "counts", "finished")
+    __slots__ = ("_advances", "_ordered", "counts", "finished")
 
     def __init__(self, recorded: set[Any]) -> None:
         super().__init__()
@@ -82,6 +84,8 @@ class _TestContext(Context):
         """The numbers of the cyclic tests that have ended."""
         self.executed = recorded.add
         self._advances = 0
+        self._ordered: list[int] = []
+        """The numbers of the ordered tests, in the order in which the suite has named them first."""
 
     def asserted(self, number: int, holds: bool, shown: tuple[Any, ...], of_test: int) -> None:
         """Record an execution of an assertion, unless the cyclic test `of_test` has ended. The first failure is kept."""
@@ -90,7 +94,23 @@ class _TestContext(Context):
         count = self.counts.setdefault(number, _Count())
         count.executed += 1
         if not count.failed:
-            count.failed, count.t_ns, count.values = not holds, self.now_ns, shown
+            count.failed, count.t_ns = not holds, self.now_ns
+            count.values = shown if holds else copy.deepcopy(shown)  # an array may change after this
+
+    @staticmethod
+    def same(actual: Any, expected: Any, within: float | None) -> bool:
+        """Return whether two arrays have the same size and equal elements, those of REAL within a tolerance."""
+        if isinstance(actual, list):
+            return len(actual) == len(expected) and all(
+                _TestContext.same(a, e, within) for a, e in zip(actual, expected, strict=True)
+            )
+        return bool(actual == expected if within is None else abs(actual - expected) <= within)
+
+    def has_turn(self, test: int) -> bool:
+        """Return whether an ordered test is the first one that has not ended."""
+        if test not in self._ordered:
+            self._ordered.append(test)
+        return next((one for one in self._ordered if one not in self.finished), None) == test
 
     def advance(self, by_ns: int) -> None:
         """Advance the time. Raises `LogicError` for a negative time, and `ScanTooLong` for a test that does not end."""
@@ -143,11 +163,28 @@ def _result(number: int, text: AssertionText, context: _TestContext, unit: Compi
     count = context.counts.get(number, _Count())
     if not count.failed:
         return AssertionResult(text, count.executed, False, count.t_ns)
-    shown = [literal(kind, value) for kind, value in zip(unit.recorded[number], count.values, strict=True)]
+    kinds = unit.recorded[number]
+    if isinstance(kinds[0], ty.Array) and isinstance(kinds[1], ty.Array):
+        within = count.values[2] if len(kinds) > 2 else None
+        expected, got = _difference(kinds[0], kinds[1], count.values[0], count.values[1], within)
+        return AssertionResult(text, count.executed, True, count.t_ns, expected, got)
+    shown = [literal(kind, value) for kind, value in zip(kinds, count.values, strict=True)]
     expected = text.expected + (shown[1] if len(shown) > 1 else "")
     if len(shown) > 2:
         expected += f" within {shown[2]}"
     return AssertionResult(text, count.executed, True, count.t_ns, expected, shown[0])
+
+
+def _difference(kind: ty.Array, other: ty.Array, actual: Any, expected: Any, within: float | None) -> tuple[str, str]:
+    """Return the expected and the actual value of the first different element of two arrays, or their sizes."""
+    sizes = [" x ".join(str(high - low + 1) for low, high in of.ranges) for of in (other, kind)]
+    if sizes[0] != sizes[1]:
+        return f"{sizes[0]} elements", f"{sizes[1]} elements"
+    for (index, is_), (_, wanted) in zip(elements(kind, actual), elements(other, expected), strict=True):
+        if not _TestContext.same(is_, wanted, within):
+            tolerance = "" if within is None else f" within {literal(ty.LREAL, within)}"
+            return f"{literal(other.of, wanted)}{tolerance} in element {index}", literal(kind.of, is_)
+    return "", ""
 
 
 def _reason(error: BaseException) -> str:

@@ -6,6 +6,7 @@ library itself is not needed. The names and the order of the parameters are thos
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,13 +15,14 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.errors import invalid
-from fieldtwin.plc.st.syntax.walk import with_parts
+from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 from fieldtwin.plc.st.syntax.written import text_of
-from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest, assertion, bound
+from fieldtwin.plc.st.unit_tests.assertions import ARRAYS, AssertionText, TranslatedTest, assertion, bound
 
 _SUITE = "FB_TestSuite"
 _EQUAL, _TRUE, _FALSE = "ASSERTEQUALS", "ASSERTTRUE", "ASSERTFALSE"
 _WITH_DELTA = ("ASSERTEQUALS_REAL", "ASSERTEQUALS_LREAL")
+_ARRAYS = re.compile(r"ASSERTARRAY(2D|3D)?EQUALS_\w+$")
 
 
 def suites_as_programs(
@@ -79,6 +81,12 @@ class _Suite:
             return with_parts(node, lambda part: self._statements(part, current))
         found: list[Any] = []
         for part in node:
+            if isinstance(part, t.If) and any(_is_ordered(one) for one in nodes(part.branches[0][0])):
+                try:
+                    found += self._ordered(part)
+                except FileInvalid as e:
+                    self.errors.add(e)
+                continue
             name = _called(part)
             if not name:
                 found.append(self._statements(part, current))
@@ -88,6 +96,15 @@ class _Suite:
             except FileInvalid as e:
                 self.errors.add(e)
         return tuple(found)
+
+    def _ordered(self, statement: t.If) -> list[t.Statement]:
+        """Return an ordered test: ``IF TEST_ORDERED('name') THEN ... END_IF``."""
+        (condition, body), *more = statement.branches
+        call = next(one for one in nodes(condition) if _is_ordered(one))
+        if more or statement.otherwise or condition is not call:
+            raise invalid(call.pos, call.ref.name, expected="IF TEST_ORDERED('name') THEN ... END_IF")
+        test = self._begin(call)
+        return [t.Ordered(statement.pos, test.number, self._statements(body, [test]))]
 
     def _statement(self, call: t.Call, name: str, current: list[TranslatedTest]) -> list[t.Statement]:
         if name == "TEST":
@@ -114,12 +131,16 @@ class _Suite:
         given, message = _arguments(call, _parameters(call, name))
         number = next(self.numbers)
         kind = {_TRUE: "ASSERT_TRUE", _FALSE: "ASSERT_FALSE"}.get(
-            name, "ASSERT_NEAR" if len(given) > 2 else "ASSERT_EQ"
+            name, ARRAYS if _ARRAYS.match(name) else "ASSERT_NEAR" if len(given) > 2 else "ASSERT_EQ"
         )
         expected = {_TRUE: "TRUE", _FALSE: "FALSE"}.get(name, "")
         said = replace(call, arguments=tuple(one for one in call.arguments if one.value in given))
         test.assertions[number] = AssertionText(call.pos, text_of(said), expected, message)
         return assertion(kind, call.pos, number, given, test.number)
+
+
+def _is_ordered(node: Any) -> bool:
+    return isinstance(node, t.Call) and node.ref.name.upper() == "TEST_ORDERED" and not node.ref.selectors
 
 
 def _called(statement: Any) -> str:
@@ -143,7 +164,10 @@ def _parameters(call: t.Call, name: str) -> tuple[str, ...]:
         return ("EXPECTED", "ACTUAL", "DELTA")
     if name == _EQUAL or (name.startswith(f"{_EQUAL}_") and "ARRAY" not in name):
         return ("EXPECTED", "ACTUAL")
-    known = "AssertTrue, AssertFalse, AssertEquals, AssertEquals_INT and those of the other elementary types"
+    if _ARRAYS.match(name):
+        delta = ("DELTA",) if name.endswith("REAL") else ()
+        return ("EXPECTEDS", "ACTUALS", *delta)
+    known = "AssertTrue, AssertFalse, AssertEquals, AssertEquals_INT, AssertArrayEquals_INT, and those of other types"
     raise invalid(call.pos, f"{call.ref.name} is not supported", expected=known)
 
 
@@ -152,7 +176,9 @@ def _arguments(call: t.Call, parameters: tuple[str, ...]) -> tuple[list[t.Expr],
     found = bound(call, (*parameters, "MESSAGE"))
     message = found.get("MESSAGE")
     text = message.text[1:-1] if isinstance(message, t.Literal) else ""
-    order = [name for name in ("CONDITION", "ACTUAL", "EXPECTED", "DELTA") if name in parameters]
+    order = [
+        name for name in ("CONDITION", "ACTUAL", "ACTUALS", "EXPECTED", "EXPECTEDS", "DELTA") if name in parameters
+    ]
     return [found[name] for name in order], text
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 from st_bench import program, scan
 
 from fieldtwin.plc.program import Described
+from fieldtwin.plc.st.decisions import decisions_of
 from fieldtwin.plc.st.program import StProgram
 
 PUMP = """TYPE States : (IDLE, FILLING, FULL, FAULT); END_TYPE
@@ -118,3 +120,199 @@ def test_values_are_written_as_in_the_source() -> None:
     found = decision_of(made, "q")
     assert found is not None
     assert found.describe()["variables"] == {"timer.ET": "T#1s500ms", "x": "0.1", "s": "'on'"}
+
+
+STARTERS = """FUNCTION_BLOCK Starter
+VAR_INPUT start : BOOL; END_VAR
+VAR_OUTPUT run : BOOL; END_VAR
+VAR delay : TON; END_VAR
+  delay(IN := start, PT := T#2s);
+  IF delay.Q THEN
+    run := TRUE;
+  ELSE
+    run := FALSE;
+  END_IF
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Pump
+VAR_INPUT on : BOOL; END_VAR
+VAR_OUTPUT motor : BOOL; END_VAR
+VAR starter : Starter; locked : BOOL; END_VAR
+  starter(start := on);
+  motor := starter.run AND NOT locked;
+END_FUNCTION_BLOCK
+PROGRAM p
+VAR_INPUT wanted : BOOL; END_VAR
+VAR_OUTPUT a, b : BOOL; END_VAR
+VAR pump : Pump; END_VAR
+  pump(on := wanted, motor => a);
+  b := pump.motor;
+END_PROGRAM
+"""
+
+
+def inside(name: str) -> list[dict[str, Any]]:
+    made = program(STARTERS)
+    made.wanted = True
+    scan(made, 1, ms=0)
+    scan(made, 2, ms=2000)
+    found = decision_of(made, name)
+    assert found is not None
+    return list(found.describe()["inside"])
+
+
+def test_the_statements_inside_nested_blocks_are_named_with_their_locals() -> None:
+    for name in ("a", "b"):
+        pump, starter = inside(name)
+        assert (pump["instance"], pump["block"], pump["statement"]) == (
+            "pump",
+            "Pump",
+            "motor := starter.run AND NOT locked",
+        )
+        assert pump["place"].endswith(":17")
+        assert pump["variables"] == {"starter.run": "TRUE", "locked": "FALSE"}
+        assert starter == {
+            "instance": "pump.starter",
+            "block": "Starter",
+            "place": starter["place"],
+            "statement": "run := TRUE",
+            "conditions": [{"line": 6, "text": "delay.Q", "holds": True}],
+            "variables": {"delay.Q": "TRUE"},
+        }
+        assert starter["place"].endswith(":7")
+
+
+def test_a_method_that_assigned_the_output_is_named() -> None:
+    made = program(
+        """FUNCTION_BLOCK Valve
+        VAR_OUTPUT open : BOOL; END_VAR
+        METHOD PUBLIC Set
+        VAR_INPUT x : INT; END_VAR
+          open := x > 3;
+        END_METHOD
+        END_FUNCTION_BLOCK
+        PROGRAM p
+        VAR_OUTPUT q : BOOL; END_VAR
+        VAR valve : Valve; END_VAR
+          valve.Set(x := 5);
+          q := valve.open;
+        END_PROGRAM"""
+    )
+    scan(made)
+    found = decision_of(made, "q")
+    assert found is not None
+    (valve,) = found.describe()["inside"]
+    assert (valve["statement"], valve["place"].rpartition(":")[2]) == ("open := x > 3", "5")
+
+
+def test_two_instances_of_a_block_have_different_lines() -> None:
+    made = program(
+        STARTERS.partition("PROGRAM")[0]
+        + """PROGRAM p
+        VAR_OUTPUT q, r : BOOL; END_VAR
+        VAR one, two : Starter; END_VAR
+          one(start := TRUE); two();
+          q := one.run; r := NOT two.run;
+        END_PROGRAM"""
+    )
+    scan(made, 1, ms=0)
+    scan(made, 2, ms=3000)
+    found = [decision_of(made, name) for name in ("q", "r")]
+    lines = [one.describe()["inside"][0]["place"].rpartition(":")[2] for one in found if one is not None]
+    assert lines == ["7", "9"]
+
+
+def test_the_lines_of_a_block_are_no_part_of_its_state() -> None:
+    one, other = program(STARTERS), program(f"\n\n{STARTERS}")  # with different lines
+    for made in (one, other):
+        made.wanted = False
+        scan(made, 1, ms=0)
+    assert one.whole_state(0) == other.whole_state(0)
+    assert copy.deepcopy(one).whole_state(0) == one.whole_state(0)
+
+
+def test_statements_inside_blocks_are_limited() -> None:
+    block = (
+        "FUNCTION_BLOCK B{} VAR_OUTPUT q : BOOL; END_VAR VAR b : B{}; END_VAR\n b(); q := b.q;\nEND_FUNCTION_BLOCK\n"
+    )
+    blocks = "".join(block.format(n, n - 1) for n in range(1, 20))
+    made = program(
+        "FUNCTION_BLOCK B0 VAR_OUTPUT q : BOOL; END_VAR q := TRUE; END_FUNCTION_BLOCK\n"
+        + blocks
+        + "PROGRAM p VAR_OUTPUT q : BOOL; END_VAR VAR b : B19; END_VAR\n b();\n q := b.q;\nEND_PROGRAM"
+    )
+    scan(made)
+    found = decision_of(made, "q")
+    assert found is not None
+    assert len(found.describe()["inside"]) == 8
+
+
+def test_decisions_are_made_when_they_are_looked_up() -> None:
+    unit = program(PUMP).st_unit.source
+    found = decisions_of(unit)
+    assert "_found" not in vars(found)
+    assert {name for _, _, name in found} == {"state", "q", "valve"}
+
+
+POINTERS = """FUNCTION_BLOCK Holder VAR_OUTPUT x : INT; END_VAR VAR p : POINTER TO INT; END_VAR
+  IF FIRST_SCAN() THEN
+    x := 1;
+  ELSE
+    p := ADR(x);
+    p^ := 5;
+  END_IF
+END_FUNCTION_BLOCK
+PROGRAM p
+VAR_OUTPUT q, r : INT; END_VAR
+VAR at : POINTER TO INT; holder : Holder; END_VAR
+  holder();
+  r := holder.x;
+  IF FIRST_SCAN() THEN
+    q := 1;
+  ELSE
+    at := ADR(q);
+    at^ := 5;
+  END_IF
+END_PROGRAM
+"""
+
+
+def test_an_output_that_a_pointer_assigned_has_no_line_instead_of_an_old_one() -> None:
+    made = program(POINTERS, dialect="codesys")
+    scan(made, 1)
+    place, found = made.place("q"), decision_of(made, "r")
+    assert place is not None
+    assert place.line == 15
+    assert found is not None
+    assert len(found.inside) == 1
+    scan(made, 2)
+    found = decision_of(made, "r")
+    assert made.place("q") is None
+    assert decision_of(made, "q") is None
+    assert found is not None
+    assert found.inside == ()
+
+
+def test_an_output_that_an_inherited_body_assigned_has_the_line_of_the_base() -> None:
+    made = program(
+        """FUNCTION_BLOCK Base
+        VAR_OUTPUT x : INT; END_VAR
+          x := x + 1;
+        END_FUNCTION_BLOCK
+        FUNCTION_BLOCK Derived EXTENDS Base
+        VAR_OUTPUT y : INT; END_VAR
+          SUPER^();
+          y := 2 * x;
+        END_FUNCTION_BLOCK
+        PROGRAM p
+        VAR_OUTPUT q : INT; END_VAR
+        VAR d : Derived; END_VAR
+          d();
+          q := d.x + d.y;
+        END_PROGRAM""",
+        dialect="codesys",
+    )
+    scan(made)
+    found = decision_of(made, "q")
+    assert found is not None
+    statements = [one["statement"] for one in found.describe()["inside"]]
+    assert statements == ["x := x + 1", "y := 2 * x"]

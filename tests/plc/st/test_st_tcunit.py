@@ -101,7 +101,7 @@ def test_a_test_can_be_ended_by_its_name(tmp_path: Path) -> None:
     ("body", "error"),
     [
         ("AssertTrue(TRUE, '');", "AssertTrue before a test has begun"),
-        ("TEST('x'); AssertArrayEquals_INT(1, 1, '');", "AssertArrayEquals_INT is not supported"),
+        ("TEST('x'); AssertArrayEquals_INT(1, 1, '');", "an assertion about arrays"),
         ("TEST('x'); AssertEquals(1);", "AssertEquals lacks ACTUAL"),
         ("TEST(5);", "the name in TEST"),
         ("TEST_FINISHED_NAMED('y');", "a test 'y' has not begun"),
@@ -132,3 +132,63 @@ TEST_FINISHED();]]></ST></Implementation></Method>
     )
     (result,) = load_suite(path, dialect_of("twincat")).run()
     assert (result.test.name, result.error, [one.failed for one in result.assertions]) == ("half", "", [False])
+
+
+ARRAYS = "a : ARRAY[1..3] OF INT := [1, 2, 3]; b : ARRAY[0..2] OF INT := [1, 2, 3]; c : ARRAY[1..2] OF INT; \
+r : ARRAY[1..2, 0..1] OF LREAL := [1.0, 2.0, 3.0, 4.0]; s : ARRAY[1..2, 0..1] OF LREAL := [1.0, 2.0, 3.5, 4.0];"
+
+
+@pytest.mark.parametrize(
+    ("assertion", "expected", "got"),
+    [
+        ("AssertArrayEquals_INT(Expecteds := a, Actuals := b, Message := 'same');", "", ""),
+        ("b[2] := 7; AssertArrayEquals_INT(a, b, 'x'); b[2] := 3;", "3 in element [2]", "7"),
+        ("AssertArrayEquals_INT(a, c, 'x');", "3 elements", "2 elements"),
+        ("AssertArray2dEquals_LREAL(Expecteds := r, Actuals := s, Delta := 0.5, Message := '');", "", ""),
+        ("AssertArray2dEquals_LREAL(r, s, 0.25, '');", "3.0 within 0.25 in element [2,0]", "3.5"),
+    ],
+)
+def test_arrays_are_compared_by_element(tmp_path: Path, assertion: str, expected: str, got: str) -> None:
+    (result,) = ran(tmp_path, f"METHOD One\nTEST('x'); {assertion} TEST_FINISHED();\nEND_METHOD", variables=ARRAYS)
+    assert result.error == ""
+    (one,) = result.assertions
+    assert (one.executed, one.failed, one.expected, one.got) == (1, bool(got), expected, got)
+
+
+@pytest.mark.parametrize(
+    "assertion",
+    ["AssertArrayEquals_INT(a, 3, 'x');", "AssertArrayEquals_INT(a, ramp, 'x');", "AssertArrayEquals_INT(a, r, 'x');"],
+)
+def test_an_assertion_about_arrays_needs_arrays_of_one_type(tmp_path: Path, assertion: str) -> None:
+    with pytest.raises(FileInvalid, match="array"):
+        ran(tmp_path, f"METHOD One\nTEST('x'); {assertion} TEST_FINISHED();\nEND_METHOD", variables=ARRAYS)
+
+
+def test_ordered_tests_run_one_after_the_other(tmp_path: Path) -> None:
+    first, second = ran(
+        tmp_path,
+        """METHOD One
+        IF TEST_ORDERED('first') THEN
+          n := n + 1;
+          IF n = 5 THEN AssertEquals(5, n, ''); TEST_FINISHED(); END_IF
+        END_IF
+        END_METHOD
+        METHOD Two
+        IF TEST_ORDERED('second') THEN
+          AssertEquals(5, n, 'after the first');
+          TEST_FINISHED();
+        END_IF
+        END_METHOD""",
+        "One(); Two();",
+        "n : INT;",
+    )
+    assert [(one.test.name, one.error, len(one.failed)) for one in (first, second)] == [
+        ("first", "", 0),
+        ("second", "", 0),
+    ]
+    assert [one.executed for one in (*first.assertions, *second.assertions)] == [1, 1]
+
+
+def test_an_ordered_test_is_an_if_of_its_own(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match="TEST_ORDERED"):
+        ran(tmp_path, "METHOD One\nIF TEST_ORDERED('x') AND TRUE THEN TEST_FINISHED(); END_IF\nEND_METHOD")

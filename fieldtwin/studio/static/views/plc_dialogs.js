@@ -36,7 +36,9 @@ function Decision({ decided }) {
     html`<table class="list">
       <thead><tr><th>Variable after the scan</th><th class="number">Value</th></tr></thead>
       <tbody>${variables.map(([name, v]) => html`<tr key=${name}><td>${name}</td><td class="number">${v}</td></tr>`)}</tbody>
-    </table>`}`;
+    </table>`}
+    ${(decided.inside ?? []).map((one) => html`<p key=${one.instance + one.place}>In <strong>${one.instance}</strong> (${one.block}), line <code>${one.place}</code>:</p>
+      <${Decision} decided=${one} />`)}`;
 }
 
 function FromProgram({ store, tag, word }) {

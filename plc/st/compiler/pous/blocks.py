@@ -96,7 +96,7 @@ class Blocks(Bodies):
         self.kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
         """By function block: its variables that keep their values."""
         self.outputs: dict[str, frozenset[str]] = {}
-        """By class of a function block: the attributes that hold its variables at %Q*."""
+        """By class of a function block: the attributes that hold its outputs, and its variables at %Q*."""
 
     def write(self, pou: t.Pou) -> None:
         """Write the Python class of a FUNCTION_BLOCK or CLASS."""
@@ -176,12 +176,13 @@ class Blocks(Bodies):
             self.out.line("return self", method.pos)
 
     def _class_of(self, pou: t.Pou, kept: list[str]) -> str:
-        """Return the head of the class of a POU. The lines of the last assignments of its variables at %Q* are in a base class,
-        because they do not belong to the state.
+        """Return the head of the class of a POU. The lines of the last assignments of its outputs and of its variables at %Q* are
+        in a base class, because they do not belong to the state.
         """
         name = f"B_{identifier(pou.name)}"
-        located = {f"v_{v.name.lower()}" for b in pou.blocks for v in b.variables if area_of(v.location) == "Q"}
-        outputs = [attribute for attribute in kept if attribute in located]
+        variables = [(v, block) for block in pou.blocks for v in block.variables]
+        wanted = {f"v_{v.name.lower()}" for v, b in variables if b.kind == "VAR_OUTPUT" or area_of(v.location) == "Q"}
+        outputs = [attribute for attribute in kept if attribute in wanted]
         if not outputs:
             return name
         self.outputs[name] = frozenset(outputs)

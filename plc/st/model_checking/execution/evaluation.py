@@ -34,6 +34,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
     width,
 )
 from fieldtwin.plc.st.runtime import moments
+from fieldtwin.plc.st.runtime.references import MemberReference
 
 _OPERATORS: dict[type, str] = {
     ast.Add: "+", ast.Sub: "-", ast.Pow: "**", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.BitAnd: "&",
@@ -133,6 +134,9 @@ class Evaluation:
                 self.memory.close()
             return
         if isinstance(owner, Undefined) or owner is None:
+            return
+        if isinstance(owner, MemberReference) and name == "v":  # without the line, on which no scan depends
+            self.put_attribute(owner.owner, owner.name, value)
             return
         found = getattr(type(owner), name, None)
         if isinstance(found, property):

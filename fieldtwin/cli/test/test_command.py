@@ -24,9 +24,9 @@ from fieldtwin.cli.campaigns.ending import INTERRUPTED
 from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
+from fieldtwin.cli.plc.finding_options import TARGET as CHECK_OF_PROGRAMS
+from fieldtwin.cli.plc.finding_options import FindingOptions
 from fieldtwin.cli.template_question import TemplateSearchOptions
-from fieldtwin.cli.test.findings import TARGET as CHECK_OF_PROGRAMS
-from fieldtwin.cli.test.findings import FindingOptions
 from fieldtwin.cli.test.plain_result import plain_result
 from fieldtwin.cli.test.st_coverage import CoverageOptions, coverage_of, recorded, show_coverage
 from fieldtwin.cli.test.target_options import TargetOptions

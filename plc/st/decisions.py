@@ -16,9 +16,9 @@ from typing import Any
 import msgspec
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.assignments import line_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.inspection import Inspection, literal
+from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.source import shortened
 from fieldtwin.plc.st.syntax.walk import nodes

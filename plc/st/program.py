@@ -29,7 +29,6 @@ from fieldtwin.plc.program import (
 )
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
-from fieldtwin.plc.st.compiler.assignments import is_line, line_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
@@ -41,6 +40,7 @@ from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
 from fieldtwin.plc.st.inspection import shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
+from fieldtwin.plc.st.runtime.lines import is_line, line_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.state_diagram import StateDiagram

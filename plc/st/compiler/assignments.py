@@ -8,19 +8,10 @@ from __future__ import annotations
 
 import ast
 
-_PREFIX = "line_"
+from fieldtwin.plc.st.runtime.lines import line_of
+
 GLOBALS = "_G"
 """The name of the object that holds the global variables in the Python code."""
-
-
-def line_of(attribute: str) -> str:
-    """Return the attribute that keeps the line of the last assignment of `attribute`."""
-    return f"{_PREFIX}{attribute}"
-
-
-def is_line(attribute: str) -> bool:
-    """Return whether an attribute keeps a line. Lines are not part of a program's state, because no scan depends on them."""
-    return attribute.startswith(_PREFIX)
 
 
 class Assignments(ast.NodeTransformer):

@@ -8,7 +8,6 @@ from typing import Any
 
 import z3
 
-from fieldtwin.plc.st.compiler.assignments import is_line
 from fieldtwin.plc.st.model_checking.execution import floats
 from fieldtwin.plc.st.model_checking.execution.merging import options_of
 from fieldtwin.plc.st.model_checking.execution.operations import is_none
@@ -28,6 +27,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
     negated,
     width,
 )
+from fieldtwin.plc.st.runtime.lines import is_line
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
 

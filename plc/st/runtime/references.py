@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from fieldtwin.plc.st.compiler.assignments import line_of
+from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
 

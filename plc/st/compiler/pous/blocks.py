@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.assignments import line_of
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, by_reference, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
+from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import area_of
 

@@ -217,8 +217,8 @@ class DecisionReader:
         found: list[Inside] = []
         for output in plan.outputs if depth < MAX_DEPTH else ():
             instance = output.instance(body)
-            place = getattr(instance, line_of(f"v_{output.name}"), None)
-            inner = output.reader._plan((*place, output.name)) if place and len(found) < MAX_INSIDE else None
+            place: tuple[str, int] = getattr(instance, line_of(f"v_{output.name}"), None) or ("", 0)
+            inner = output.reader._plan((*place, output.name)) if place[1] and len(found) < MAX_INSIDE else None
             if inner is not None:
                 path = f"{at}{output.path}"
                 values = inner.values_of(instance)

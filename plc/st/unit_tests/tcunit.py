@@ -100,8 +100,8 @@ class _Suite:
     def _ordered(self, statement: t.If) -> list[t.Statement]:
         """Return an ordered test: ``IF TEST_ORDERED('name') THEN ... END_IF``."""
         (condition, body), *more = statement.branches
-        call = next(one for one in nodes(condition) if _is_ordered(one))
-        if more or statement.otherwise or condition is not call:
+        call: t.Call = next(one for one in nodes(condition) if _is_ordered(one))
+        if more or statement.otherwise or not _is_ordered(condition):
             raise invalid(call.pos, call.ref.name, expected="IF TEST_ORDERED('name') THEN ... END_IF")
         test = self._begin(call)
         return [t.Ordered(statement.pos, test.number, self._statements(body, [test]))]

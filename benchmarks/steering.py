@@ -17,12 +17,11 @@ import argparse
 import sys
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from statistics import geometric_mean, mean
 
 from fieldtwin.results.trace import Trace, TraceEvent, TraceKind
-from fieldtwin.run.processes.workers import Workers, run_all
+from fieldtwin.run.processes.workers import Workers
 from fieldtwin.run.virtual.fault_schedule import RandomFaults
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
@@ -73,7 +72,8 @@ def main() -> int:
     found: list[Counter[str]] = []
     with Workers(options.jobs) as workers:
         for guided in (False, True):
-            ended = run_all(workers, partial(one_run, guided), range(1, runs + 1))
+            waiting = [workers.submit(one_run, guided, seed) for seed in range(1, runs + 1)]
+            ended = [future.result() for future in waiting]
             found.append(Counter(bug for one in ended for bug in one.bugs))
             word = "guided" if guided else "random"
             print(

@@ -106,6 +106,8 @@ class PlcStatus(ScanStatus, frozen=True, kw_only=True):
     counters: dict[str, int] = {}
     realtime: RealtimeStatus | None = None
     """None in virtual time. This also applies to `acts`."""
+    debugger: str = ""
+    """Whether a debugger is attached, and where it has stopped the programs; empty without one."""
     acts: dict[str, int] | None = None
     """By kind of manual intervention (force, pause and so on): how often it was carried out."""
     programs: dict[str, str] = {}

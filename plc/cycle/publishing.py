@@ -114,6 +114,8 @@ class OutputImage:
         """For each message tag that a program reads: the index of its counter of consumed messages in OUTPUTS, its reader, and
         its name.
         """
+        self.withheld = False
+        """Whether every tag is published as BAD, because a scan was stopped by a debugger and its inputs are old."""
         self._forced = False
         """Whether the last publication had forced outputs."""
         self._bind(programs, image.reader(INPUTS).shape)
@@ -268,6 +270,9 @@ class OutputImage:
     def publish(self, now_ns: int) -> None:
         """Publish what was collected. Raises `ProgramFailed` with the name of a program whose value does not fit its
         tag."""
+        if self.withheld:
+            self.stop(now_ns)
+            return
         values = self._values
         messages = {}
         for output, outbox in self.outboxes:

@@ -216,9 +216,9 @@ class Scan:
             settling.disturbed()
         return settling.settled
 
-    def execute_always(self) -> None:
-        """From now on skip no scan."""
-        self._settling = Settling((), _state_of)
+    def may_skip(self, *, skip: bool) -> None:
+        """Determine whether a scan that would change nothing may be skipped from now on."""
+        self._settling = Settling(self._programs if skip else (), _state_of)
 
     def programs_changed(self) -> None:
         """Execute the logic of the next scan in any case, because programs of this task were replaced."""

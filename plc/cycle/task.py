@@ -120,6 +120,8 @@ class CyclicTask:
         """A description of the task that was still running when this one became due, for messages. A runner of several tasks
         sets it; empty if there was none.
         """
+        self.excused = False
+        """Whether the next scan does not count as an overrun, because a debugger has stopped a scan."""
         self.began_ns = 0
         """The time (monotonic ns) at which the last scan began."""
         self.ended_ns = 0
@@ -175,14 +177,17 @@ class CyclicTask:
             return
         self.scans += 1
         ended_ns = self.ended_ns = self._now_ns()
-        self.duration.record(ended_ns - began_ns)
+        if not self.excused:
+            self.duration.record(ended_ns - began_ns)
         due_ns = self.deadline_ns = self.deadline_ns + self._cycle_ns
         missed = 0
         if ended_ns >= due_ns:
             missed = (ended_ns - due_ns) // self._cycle_ns + 1
             self.missed_periods += missed
             self.deadline_ns += missed * self._cycle_ns
-        if missed or late_ns > self._late_ns:
+        if self.excused:
+            self.excused, self._overruns_in_a_row = False, 0
+        elif missed or late_ns > self._late_ns:
             self._overrun(late_ns, ended_ns - began_ns)
         else:
             self._overruns_in_a_row = 0

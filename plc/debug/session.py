@@ -93,6 +93,15 @@ class Session:
     def do_initialize(self, given: dict[str, Any]) -> dict[str, Any]:
         return CAPABILITIES
 
+    def do_configurationDone(self, given: dict[str, Any]) -> None:
+        """Accept the end of the configuration. A program that is not running yet starts now."""
+
+    def do_terminate(self, given: dict[str, Any]) -> None:
+        """Accept the request to end the program."""
+
+    def do_disconnect(self, given: dict[str, Any]) -> None:
+        """Accept the end of the session."""
+
     def output(self, text: str, category: str = "stdout", **more: Any) -> None:
         """Send a line of text to the editor."""
         self.send("event", event="output", body={"category": category, "output": f"{text}\n", **more})

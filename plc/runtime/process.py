@@ -21,6 +21,7 @@ Commands on the control channel (fieldtwin.gateway.core.control, on the configur
               {"number": ...}: replace the programs as prepared, between two scans, all or none (fieldtwin.plc.runtime.online)
     about     of each program: variables, states with transitions, and the text of its source; this changes only when programs
               are replaced or restarted
+    debug     requests of the Debug Adapter Protocol, and the messages for the editor (fieldtwin.plc.runtime.debugging)
     trace_begin
               {"names": [...], "before": n, "after": n, "when": ...}: record variables after each scan in a ring, if wanted around
               the first scan in which a condition in Structured Text is TRUE (fieldtwin.plc.runtime.variable_trace)
@@ -57,6 +58,7 @@ from fieldtwin.plc.cycle.task import StopReason
 from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.plc.runtime.acts import Acts
 from fieldtwin.plc.runtime.config import PlcConfig
+from fieldtwin.plc.runtime.debugging import Debugging, DebugGuard, Waiting
 from fieldtwin.plc.runtime.drawings import drawings_of_programs, present_values
 from fieldtwin.plc.runtime.online.changes import OnlineChanges
 from fieldtwin.plc.runtime.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
@@ -74,12 +76,16 @@ class PlcProcess:
     def __init__(self, config: PlcConfig, image: Image) -> None:
         self._config = config
         self._alarm = StuckAlarm(config.stuck_ms) if config.stuck_ms and hasattr(signal, "setitimer") else None
-        self._runner = TaskRunner(config, image, monotonic_ns, self._alarm)
+        self._guard = DebugGuard(self._alarm) if config.debuggable else None
+        self._runner = TaskRunner(config, image, monotonic_ns, self._guard or self._alarm)
         self._view = TagView(image, self._runner)
         self._acts = Acts(config.audit_path)
         self._changing = OnlineChanges(self._runner, self._note)
         self._traces = Traces(self._runner, monotonic_ns)
         self._loop = asyncio.new_event_loop()
+        self._debugging = Debugging(
+            self._runner, self._guard, Waiting(self._loop, monotonic_ns, lambda: self._stopping), self._note
+        )
         self._server = ControlServer(
             {
                 "ready": self._ready,
@@ -96,8 +102,9 @@ class PlcProcess:
                 "limits": self._limits,
                 "restart": self._restart,
                 "prepare_change": self._changing.prepare,
-                "apply_change": self._changing.apply,
+                "apply_change": self._apply_change,
                 "about": self._about,
+                "debug": self._debugging.command,
                 "trace_begin": self._traces.begin,
                 "trace_read": self._traces.read,
                 "trace_end": self._traces.end,
@@ -161,6 +168,7 @@ class PlcProcess:
             pid=os.getpid(),
             realtime=self._realtime.status(),
             acts=dict(self._acts.counts),
+            debugger=self._debugging.status,
             programs={p.name: type(p.program).__name__ for p in runner.programs},
             changes=self._changing.status,
             duration_buckets=first.duration.buckets_us() if with_buckets else [],
@@ -258,11 +266,18 @@ class PlcProcess:
     async def _drawn(self, args: dict[str, Any]) -> dict[str, Any]:
         return present_values(self._runner.programs, args.get("program"), args.get("number"))
 
+    async def _apply_change(self, args: dict[str, Any]) -> dict[str, Any]:
+        done = await self._changing.apply(args)
+        self._debugging.programs_changed()
+        return done
+
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
         cold = args.get("cold") is True
+        self._debugging.refuse_in_a_scan("a restart")
         self._note("restart", args, cold=cold)
         self._runner.restart(cold=cold)
         self._changing.forget()
+        self._debugging.programs_changed()
         self._loop.call_soon(self._loop.stop)  # a wait that began while no task ran is too long now
         return {"start": self._runner.retained.start}
 

@@ -235,11 +235,19 @@ class TaskRunner:
             action, self._between = self._between, None
             action()
 
-    def execute_every_scan(self) -> None:
-        """From now on execute the logic of each scan, also if that changes nothing, because a debugger looks at it."""
-        self._every_scan = True
+    def execute_every_scan(self, *, always: bool = True) -> None:
+        """From now on execute the logic of each scan, also if that changes nothing, because a debugger or a trace looks at it.
+
+        With `always` False, end that.
+        """
+        self._every_scan = always
         for entry in self.entries:
-            entry.scan.execute_always()
+            entry.scan.may_skip(skip=len(self.entries) == 1 and not always)
+
+    def excuse(self) -> None:
+        """Count no overrun for the next scan of each task, because a debugger has stopped the present one."""
+        for entry in self.entries:
+            entry.task.excused = True
 
     def programs_changed(self, read: Sequence[ProgramSource]) -> None:
         """Continue with programs that were replaced in place. `read` are their files."""
@@ -527,8 +535,8 @@ class TaskRunner:
         return self._stopped is not None or self._ended is not None
 
     def _as_read(self, value: TagValue) -> TagValue:
-        """Return the value of an input, with bad quality while the PLC is halted, because no task reads inputs then."""
-        if not self.halted:
+        """Return the value of an input, with bad quality while the PLC is halted or stopped by a debugger."""
+        if not (self.halted or self.outputs.withheld):
             return value
         return TagValue(value.value, Quality.BAD, Reason.NOT_OPERATIONAL, value.t_ns)
 
@@ -537,7 +545,7 @@ class TaskRunner:
 
     def substituted_values(self, tag: str) -> dict[str, TagValue]:
         """Return `Scan.substituted_values` of all tasks."""
-        if self.halted:  # no program reads inputs
+        if self.halted or self.outputs.withheld:  # no program reads inputs
             return {}
         return {name: seen for entry in self.entries for name, seen in entry.scan.substituted_values(tag).items()}
 

@@ -166,6 +166,8 @@ def print_status(status: PlcStatus) -> None:
     stdout.print(f"PLC: {head}", markup=False)
     if status.error:
         stdout.print(f"  {status.error}", markup=False, soft_wrap=True)
+    if status.debugger:
+        stdout.print(f"  DEBUGGER: {status.debugger}", style="yellow", markup=False, soft_wrap=True)
     for text in [*waiting_texts(status.waiting), *without_texts(status.started_without)]:
         stdout.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
     stdout.print(f"gateway: {'alive' if status.gateway_alive else 'DEAD: every input is bad'}", markup=False)

@@ -15,6 +15,7 @@ from fieldtwin.plc.debug.session import Session
 from fieldtwin.plc.debug.tracer import Resume, Tracer
 from fieldtwin.run.debug.messages import Messages
 from fieldtwin.run.debug.programs import Debuggee
+from fieldtwin.run.debug.relay import Relay, attach
 
 ENDING_S = 5.0
 """How long the end of a session waits for its program, in seconds."""
@@ -31,12 +32,20 @@ class Adapter(Session):
         self._messages, self._launch = messages, launch
         self._debuggee = Debuggee([], lambda say: True)
         self._thread: threading.Thread | None = None
+        self._relay: Relay | None = None
+        """To the PLC of a running instance, whose session answers the requests after the editor has attached to it."""
         self._ended = False
 
     def serve(self) -> None:
         """Answer requests until the editor disconnects."""
         while not self._ended and (request := self._messages.receive()) is not None:
-            self.answer(request)
+            if self._relay is not None and self._relay.is_alive():
+                self._relay.pass_on(request)
+                self._ended = request.get("command") == "disconnect"
+            else:
+                self.answer(request)
+        if self._relay is not None:
+            self._relay.end()
         self._end_program()
         if self._thread is not None:
             self._thread.join(ENDING_S)
@@ -55,6 +64,11 @@ class Adapter(Session):
             self.tracer.step_first()
         if given.get("noDebug") is True:
             self.tracer.files = frozenset()
+
+    def do_attach(self, given: dict[str, Any]) -> None:
+        if self._thread is not None:
+            raise UsageError("a program has been launched before")
+        self._relay = attach(str(given.get("instance", "")), self.send)
 
     def do_configurationDone(self, given: dict[str, Any]) -> None:
         self._thread = threading.Thread(target=self._run, name="debugged program", daemon=True)

@@ -155,7 +155,8 @@ def editor_on_socket(launch: Launch) -> Iterator[Editor]:
         ):
             editor = Editor(reading, writing)
             yield editor
-            editor.ask("disconnect")
+            if thread.is_alive():
+                editor.ask("disconnect")
             thread.join(20)
             assert not thread.is_alive()
 

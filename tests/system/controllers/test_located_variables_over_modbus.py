@@ -182,4 +182,4 @@ def test_the_variables_of_an_instance_have_the_registers_of_var_config(
     assert not client.write_register(1024 + 20, 5).isError()
     assert struct.unpack(">h", words(client, 20, 1)) == (51,)
     plc = run.control("p", "plc")
-    assert [row["value"] for row in plc("watch", tags=["main.gain.y", "main.gain.x"])["tags"]] == [51, 10]
+    assert [row["value"] for row in plc("image", tags=["main.gain.y", "main.gain.x"])["tags"]] == [51, 10]

@@ -51,8 +51,10 @@ class MbapFramer(Framer):
         self._unit = unit
         self._awaiting = True
         self._seen = ""
-        # The rest of an ADU that has been incomplete for a whole exchange may never arrive; search instead of counting.
+        # The rest of an ADU that has been incomplete for a whole exchange may never arrive, so search instead of counting.
+        # Bytes from before the request do not belong to its reply, even if they begin with the new transaction ID.
         self._lost = self._lost or bool(self._buffer)
+        self._skip(len(self._buffer))
         pdu = request.encode()
         return _HEADER.pack(self._transaction, 0, len(pdu) + 1, unit) + pdu
 

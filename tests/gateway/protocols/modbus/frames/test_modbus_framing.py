@@ -267,6 +267,14 @@ def test_mb_055_an_adu_that_never_ends_costs_one_exchange(cut: int) -> None:
     assert registers(ask(framer, adu(3)[cut:] + adu(4))) == REGISTERS  # the rest came late
 
 
+@pytest.mark.parametrize("cut", range(1, 15))
+def test_mb_055_bytes_from_before_a_request_do_not_belong_to_its_reply(cut: int) -> None:
+    framer = MbapFramer()
+    with pytest.raises(ReplyTimeout):
+        ask(framer, adu(2)[:cut])  # the beginning of a reply with the ID that the next request will have
+    assert registers(ask(framer, adu(2))) == REGISTERS
+
+
 def test_mb_056_a_late_reply_is_recognised_by_its_transaction_id() -> None:
     framer = MbapFramer()
     with pytest.raises(ReplyTimeout):

@@ -241,7 +241,7 @@ def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path
             gateway.publish()
             status = await got(client, lambda s: s["state"] == "stopped")
             assert status["stop_reason"] == "failed"
-            assert f"program f, {tmp_path}/faulty_program.py:{line}: ValueError: five" in status["error"]
+            assert f"program f, faulty_program.py:{line}: ValueError: five" in status["error"]
             out = gateway.reader.snapshot()
             assert out.stopped
             assert out.value("f.out").quality is Quality.BAD

@@ -94,12 +94,17 @@ _QUALITIES: dict[Quality, tuple[str, str]] = {
     ),
 }
 
+
+def _spellings(reason: Reason) -> tuple[str, ...]:
+    """Return the spellings of a reason other than its ID."""
+    id = reason.name.lower()
+    return tuple(dict.fromkeys(word for word in (str(reason), id.replace("_", "-")) if word != id))
+
+
 QUALITIES: tuple[Explanation, ...] = (
     *(Explanation(str(q), "quality", str(q), *_QUALITIES[q], _SOURCE) for q in Quality if q in _QUALITIES),
     *(
-        Explanation(
-            r.name.lower(), "quality reason", str(r), *_REASONS[r], _SOURCE, (str(r), r.name.lower().replace("_", "-"))
-        )
+        Explanation(r.name.lower(), "quality reason", str(r), *_REASONS[r], _SOURCE, _spellings(r))
         for r in Reason
         if r is not Reason.NONE
     ),

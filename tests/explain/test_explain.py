@@ -119,3 +119,8 @@ def test_a_case_that_the_standard_requires_on_one_transport_says_so() -> None:
     [entry] = [entry for entry in everything() if entry.id == "MB-013"]
     assert "No clause requires it" in entry.meaning
     assert "On TCP: The standard requires it: a failure is a deviation." in entry.meaning
+
+
+def test_no_entry_lists_a_spelling_twice() -> None:
+    for entry in everything():
+        assert len({entry.id, *entry.also}) == 1 + len(entry.also), entry

@@ -176,6 +176,8 @@ class Block:
     actions: frozenset[str] = frozenset()
     publics: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
     """The variables in VAR PUBLIC."""
+    hidden: frozenset[str] = frozenset()
+    """The variables that only the block itself can use."""
     bases: frozenset[str] = frozenset()
     """The blocks and classes that this one extends, directly or through others."""
     interfaces: frozenset[str] = frozenset()

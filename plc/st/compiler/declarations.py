@@ -352,6 +352,7 @@ class Declarations:
     def _block(self, pou: t.Pou) -> ty.Block:
         members: dict[str, dict[str, tuple[str, ty.Type]]] = {"VAR_INPUT": {}, "VAR_OUTPUT": {}, "VAR_IN_OUT": {}}
         publics: dict[str, tuple[str, ty.Type]] = {}
+        hidden: set[str] = set()
         held: list[ty.Type] = []
         with self.within(pou):
             for block in pou.blocks:
@@ -365,6 +366,8 @@ class Declarations:
                         members[block.kind][v.name.lower()] = (v.name, kind)
                     elif block.qualifiers & {"PUBLIC", "INTERNAL"} and "CONSTANT" not in block.qualifiers:
                         publics[v.name.lower()] = (v.name, kind)
+                    else:
+                        hidden.add(v.name.lower())
         total, nested = self.bounded(pou.pos, held)
         inputs, outputs, in_outs = members.values()
         base = self.named(pou.extends[0].name, pou.extends[0].pos) if pou.extends else None
@@ -377,7 +380,7 @@ class Declarations:
         return ty.Block(
             pou.name, inputs,
             outputs,
-            in_outs, elements=total, nested=nested + 1, actions=actions, publics=publics,
+            in_outs, elements=total, nested=nested + 1, actions=actions, publics=publics, hidden=frozenset(hidden),
             bases=bases, interfaces=interfaces, refers=any(map(ty.holds_interface, held)), is_class=pou.kind == "CLASS",
             abstract="ABSTRACT" in pou.modifiers, created=created or (isinstance(base, ty.Block) and base.created),
         )  # fmt: skip

@@ -155,6 +155,9 @@ def _member(x: Compiling, value: Value, ref: t.Ref, member: t.Member) -> Value:
     found = property_value(x, value, ref, member)
     if found is not None:
         return found
+    if isinstance(kind, ty.Block) and name in kind.hidden:
+        hint = f"declare it in VAR_OUTPUT, or in VAR PUBLIC, of {kind}"
+        x.env.fail(member.pos, f"{member.name} is a local variable of {kind}", hint=hint)
     known: list[str] = []
     if isinstance(kind, ty.Struct):
         known = [f for f, _ in kind.fields.values()]

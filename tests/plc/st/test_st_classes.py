@@ -336,7 +336,7 @@ def used(statement: str, variables: str = "b : Base;") -> str:
     [
         (used("b.Guarded();"), "10:2", r"Base\.Guarded is PROTECTED .*METHOD PUBLIC can be called everywhere"),
         (used("b.Own();"), "10:2", r"Base\.Own is PRIVATE \(only Base itself can use it\)"),
-        (used("n := b.hidden;"), "10:7", "hidden"),
+        (used("n := b.hidden;"), "10:7", r"hidden is a local variable of Base \(declare it in VAR_OUTPUT"),
         (used("b.Walk();"), "10:2", "in Base, a member 'Walk' is not declared"),
         (used("n := b.Run('x');"), "10:12", r"a of Run; expected INT; got STRING"),
         (used("b.Run(1, 2);"), "10:10", r"arguments of Run; expected 1 \(a\); got 2"),

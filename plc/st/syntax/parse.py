@@ -30,6 +30,12 @@ _ENDS = re.compile(
 """The ends of POUs and TYPE blocks, and the end of the text. Strings are skipped. Methods after a POU belong to it."""
 
 _NAMESPACE = re.compile(r"\bEND_NAMESPACE\b", re.IGNORECASE)
+_OF_NAMESPACES = re.compile(
+    r"""'(?:[^$'\n]|\$.)*'|"(?:[^$"\n]|\$.)*"
+    |\b(?P<words>NAMESPACE\s+(?:INTERNAL\s+)?[A-Za-z_][\w.]*|END_NAMESPACE\b|USING\s[^;]*;)""",
+    re.IGNORECASE | re.VERBOSE,
+)
+"""The words of namespaces around and in POUs. Strings are skipped."""
 
 _DECLARED = re.compile(
     r"\b(?:FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE)\s+(?:(?:PUBLIC|INTERNAL|ABSTRACT|FINAL)\s+)*([A-Za-z_]\w*)",
@@ -91,7 +97,7 @@ def _parsed(text: str, at: t.Pos, start: str) -> Any:
 def parse_all(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
     """Return the tree of `text`. Raises `FileInvalid` for its first error, with the first errors of the other POUs and types.
 
-    A parser cannot go on after an error. So after one, each POU and each TYPE block is parsed alone.
+    A parser cannot go on after an error. So after one, each POU and each TYPE block is parsed alone, without its namespace.
     """
     try:
         return parse(text, path, dialect)
@@ -101,7 +107,7 @@ def parse_all(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.Sourc
         except FileInvalid:  # a comment or a literal does not end
             raise whole from None
         found = ErrorCollector()
-        for part, line, column in _parts(blank):
+        for part, line, column in _parts(_OF_NAMESPACES.sub(_spaces, blank)):
             try:
                 parse(part, path)
             except FileInvalid as e:
@@ -140,6 +146,11 @@ def _parts(text: str) -> Iterator[tuple[str, int, int]]:
         line += text.count("\n", begin, end)
         line_begin = max(line_begin, text.rfind("\n", begin, end) + 1)
         begin = end
+
+
+def _spaces(found: re.Match[str]) -> str:
+    """Return spaces and line ends in place of the words of a namespace; strings as they are."""
+    return found[0] if found["words"] is None else re.sub(r"[^\n]", " ", found[0])
 
 
 def _moved(error: FileInvalid, lines: int, columns: int) -> FileInvalid:

@@ -11,6 +11,7 @@ from st_bench import program, run, scan
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.st.compiler.compile import compile_text
+from fieldtwin.plc.st.syntax.parse import parse_all
 
 PLANT = """
 NAMESPACE Plant
@@ -165,3 +166,19 @@ END_PROGRAM
     for number in (1, 2, 3):
         scan(made, number)
     assert (made.seen, made.count, made.large) == (26, True, True)
+
+
+def test_every_declaration_of_a_namespace_has_its_own_syntax_error() -> None:
+    text = """NAMESPACE Plant.Pumps
+        USING Plant.Tools;
+        TYPE Mode : (Off, On) END_TYPE
+        FUNCTION A : INT USING Plant.More; A := LEN('NAMESPACE b') + ; END_FUNCTION
+        NAMESPACE Inner
+          FUNCTION B : INT B := 1; END_FUNCTION
+          FUNCTION C : INT C := := 2; END_FUNCTION
+        END_NAMESPACE
+        END_NAMESPACE"""
+    with pytest.raises(FileInvalid) as caught:
+        parse_all(text)
+    errors = (caught.value, *caught.value.others)
+    assert [(e.line, e.got) for e in errors] == [(3, "END_TYPE"), (4, ";"), (7, ":=")]

@@ -92,6 +92,15 @@ def site(folder: Path, extra: str = "") -> Path:
     return path
 
 
+def test_an_invariant_about_an_unknown_text_is_open(tmp_path: Path) -> None:
+    text = "PROGRAM P\nVAR_INPUT n : INT; END_VAR\nVAR s : STRING; END_VAR\ns := INT_TO_STRING(n);\nEND_PROGRAM"
+    (tmp_path / "text.st").write_text(text)
+    code, shown = prove(tmp_path / "text.st", "--invariant", "LEN(s) < 9")
+    assert code == 1
+    assert "  not exact: the length of a STRING may have any result" in shown
+    assert "  OPEN, neither proved nor violated (the model has no exact result of the length of a STRING" in shown
+
+
 def test_invariants_and_assumptions_of_a_system_are_proved(tmp_path: Path) -> None:
     extra = (
         "      invariants: {not above 2 m: NOT (run AND level > 2.0)}\n      assumptions: {in the tank: level <= 2.3}\n"

@@ -67,9 +67,11 @@ def _print_result(report: Report, result: Result) -> None:
             stdout.print(f"    then {shown}", markup=False, soft_wrap=True)
     elif answer.proved is not None:
         stdout.print(f"  PROVED for all scans{_by(answer)}: {name}", markup=False, soft_wrap=True)
-    else:
+    elif answer.scans:
         text = f"no violation within {_scans(answer.scans)}, no proof for later ones ({answer.reason})"
         stdout.print(f"  BOUNDED, {text}: {name}", markup=False, soft_wrap=True)
+    else:
+        stdout.print(f"  OPEN, neither proved nor violated ({answer.reason}): {name}", markup=False, soft_wrap=True)
 
 
 def _by(answer: Answer) -> str:

@@ -69,7 +69,7 @@ class PlcConfig:
     a stop by the watchdog, the programs start again `restart_after_ms` later, at most `max_restarts` times in a row.
     `retain_path`: the file of retained variables, ``""`` for none; with `cold` they begin with their initial values.
     `outputs_first`: outputs are published at the start of the cycle. `audit_path`: the file that records what users do to the
-    PLC, ``""`` for none. `debuggable`: whether a debugger may stop programs in a scan, which is for simulated plants only.
+    PLC, ``""`` for none.
     """
 
     image_path: str
@@ -90,7 +90,6 @@ class PlcConfig:
     cold: bool = False
     outputs_first: bool = False
     audit_path: str = ""
-    debuggable: bool = False
 
     def image_layout(self) -> ImageLayout:
         return ImageLayout.from_description(self.layout)

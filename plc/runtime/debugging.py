@@ -1,7 +1,8 @@
 """A debugger that is attached to the PLC of a running prototype: the command ``debug`` of the control channel.
 
-A debugger stops the programs inside a scan, which a plant must not allow, so the PLC's configuration has to permit it. While a
-scan is stopped, the control channel still answers, and:
+A debugger stops the programs inside a scan, which must not happen in a plant. The PLC does not know whether its plant is
+simulated, so `fieldtwin.run.debug.relay` asks the record of the run before it attaches. While a scan is stopped, the control
+channel still answers, and:
 
 - the outputs are published as those of a stopped PLC, so that the gateway writes their safe values and publishes nothing of the
   programs as good. This lasts until a scan was executed without a stop, because the inputs of the others are old.
@@ -74,9 +75,9 @@ class Note(Protocol):
 
 
 class Debugging:
-    """The debugger of one PLC process. `guard` is None if the configuration does not permit stops."""
+    """The debugger of one PLC process, whose tasks have `guard`."""
 
-    def __init__(self, runner: TaskRunner, guard: DebugGuard | None, waiting: Waiting, note: Note) -> None:
+    def __init__(self, runner: TaskRunner, guard: DebugGuard, waiting: Waiting, note: Note) -> None:
         self._runner, self._guard, self._waiting, self._note = runner, guard, waiting, note
         self._number = 0
         self._session: Session | None = None
@@ -136,13 +137,6 @@ class Debugging:
             self._detach()
 
     def _attach(self, args: dict[str, Any]) -> None:
-        guard = self._guard
-        if guard is None:
-            raise UsageError(
-                "a debugger stops the programs of this PLC, and its plant is not simulated",
-                expected="a prototype whose devices are all emulated, or that writes to no real device",
-                hint="fieldtwin plc trace and fieldtwin plc watch do not stop a program",
-            )
         if self._session is not None and self._waiting.now_ns() - self._seen_ns <= LEASE_NS:
             raise UsageError("another debugger is attached", got=str(self._by.get("by") or "unknown"))
         from fieldtwin.plc.debug.session import Session
@@ -156,7 +150,7 @@ class Debugging:
         self._session = Session(self._send, tracer, self._resume)
         self.programs_changed()
         self._runner.execute_every_scan()
-        guard.tracer, guard.passed = tracer, self._scan_ended
+        self._guard.tracer, self._guard.passed = tracer, self._scan_ended
 
     def programs_changed(self) -> None:
         """Use the programs that run now, after they were created again or replaced."""
@@ -167,7 +161,7 @@ class Debugging:
     def _detach(self) -> None:
         """End the session; a stopped scan goes on."""
         session, self._session = self._session, None
-        if session is None or self._guard is None:
+        if session is None:
             return
         session.tracer.release()
         self._runner.execute_every_scan(always=False)
@@ -206,7 +200,6 @@ class Debugging:
         from fieldtwin.plc.debug.tracer import Resume
 
         guard, waiting, outputs = self._guard, self._waiting, self._runner.outputs
-        assert guard is not None
         if guard.inner is not None:
             guard.inner.disarm()
         self._was_stopped = outputs.withheld = True
@@ -232,5 +225,5 @@ class Debugging:
         self._was_stopped = False
         if self._session is not None and self._waiting.now_ns() - self._seen_ns > LEASE_NS:
             self._detach()
-        if self._session is None and self._guard is not None and not self._runner.outputs.withheld:
+        if self._session is None and not self._runner.outputs.withheld:
             self._guard.tracer = None

@@ -76,8 +76,8 @@ class PlcProcess:
     def __init__(self, config: PlcConfig, image: Image) -> None:
         self._config = config
         self._alarm = StuckAlarm(config.stuck_ms) if config.stuck_ms and hasattr(signal, "setitimer") else None
-        self._guard = DebugGuard(self._alarm) if config.debuggable else None
-        self._runner = TaskRunner(config, image, monotonic_ns, self._guard or self._alarm)
+        self._guard = DebugGuard(self._alarm)
+        self._runner = TaskRunner(config, image, monotonic_ns, self._guard)
         self._view = TagView(image, self._runner)
         self._acts = Acts(config.audit_path)
         self._changing = OnlineChanges(self._runner, self._note)

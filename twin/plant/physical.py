@@ -423,13 +423,13 @@ class EmbeddedControlSystem:
         """Return the commands that the driver of each device can send."""
         return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
 
-    def prepare(self, run_dir: Path, *, cold: bool = False, debuggable: bool = False) -> PlcConfig:
+    def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
         """Create the process image in `run_dir` and return the PLC process's configuration.
 
-        With `cold`, retained values are discarded. With `debuggable`, a debugger may stop the programs.
+        With `cold`, retained values are discarded.
         """
         make_image(self.layout, run_dir / "image")
-        return replace(plc_config(self.system, run_dir, cold=cold), debuggable=debuggable)
+        return plc_config(self.system, run_dir, cold=cold)
 
 
 class PhysicalTwin:

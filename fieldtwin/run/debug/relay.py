@@ -10,9 +10,10 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from fieldtwin.gateway.core.control import ControlClient
-from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.plc.debug.session import Send
 from fieldtwin.run.processes.plc_client import choose, talk_to
+from fieldtwin.run.processes.run_record import read_record
 
 ASK_S = 0.05
 """The longest time in seconds between two queries for messages."""
@@ -23,9 +24,17 @@ ENDING_S = 5.0
 def attach(instance: str, send: Send) -> Relay:
     """Begin a session with the PLC of an instance, which may be empty for the only one. `send` sends messages to the editor.
 
-    Raises `UsageError` or `Unreachable` if the instance does not run, and `RemoteError` if its PLC refuses.
+    Raises `UsageError` if the programs of the instance must not be stopped, because it can write to real devices. Raises
+    `UsageError` or `Unreachable` if the instance does not run, and `RemoteError` if its PLC refuses.
     """
     path = choose(instance)
+    record = read_record(path.parent)
+    if record is None or not record.writes_only_simulated:
+        raise UsageError(
+            "a debugger stops the programs of this PLC, and its plant is not simulated",
+            expected="a prototype whose devices are all emulated, or that writes to no real device",
+            hint="fieldtwin plc trace and fieldtwin plc watch do not stop a program",
+        )
     begun = talk_to(instance, lambda client: client.call("debug", attach=True, by=getpass.getuser()))
     relay = Relay(path, int(begun["number"]), send)
     relay.start()

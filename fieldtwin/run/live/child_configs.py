@@ -147,4 +147,5 @@ def run_record(o: RunOptions, system: System, capture: Path | None, started_ns: 
         pid=os.getpid(),
         capture=str(capture.resolve()) if capture else "",
         field_elsewhere=bool(o.field_host),
+        writes_only_simulated=o.prototype and not o.allow_writes,
     )

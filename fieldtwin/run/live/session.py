@@ -212,8 +212,7 @@ class RunSession(AsyncResource):
         self._stack.enter_context(self.instance)
         run_dir = self.instance.dir
         ecs = self.twin.ecs
-        simulated = self.options.prototype and not self.options.allow_writes
-        plc = ecs.prepare(run_dir, cold=self.options.cold, debuggable=simulated)
+        plc = ecs.prepare(run_dir, cold=self.options.cold)
         if self.options.prototype:
             await self._start_field(run_dir)
             await self._lay_cables(run_dir)

@@ -37,6 +37,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The file with the traffic of all buses (`--capture`), empty if it is not recorded."""
     field_elsewhere: bool = False
     """Whether the simulated devices run on another host (`--field`)."""
+    writes_only_simulated: bool = False
+    """Whether no real device can be written: it is a prototype, and real devices in it are read only."""
 
 
 def write_record(run_dir: Path, record: RunRecord) -> None:

@@ -20,11 +20,13 @@ from shed_site import write_shed
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.plc.binding import image_for
-from fieldtwin.plc.runtime.config import PlcConfig
-from fieldtwin.plc.runtime.debugging import Debugging, Waiting
-from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.run.debug.programs import Debuggee
+from fieldtwin.run.debug.relay import attach
+from fieldtwin.run.live.child_configs import run_record
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.processes.run_record import write_record
+from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.site.system import load_system
 
 PROGRAM = """FUNCTION Twice : INT
 VAR_INPUT x : INT; END_VAR
@@ -180,17 +182,18 @@ def test_the_watchdogs_do_not_end_a_stopped_scan(editor: Editor, shed: Path, ask
     assert after["overruns"] < 3  # a busy host may cause some, but stopped scans do not
 
 
-def test_the_plc_of_a_plant_refuses_a_debugger(tmp_path: Path) -> None:
-    layout = image_for([], {})
-    memory = memoryview(bytearray(layout.size))
-    layout.format(memory)
-    with layout.attach(memory) as image:
-        runner = TaskRunner(PlcConfig("", layout.describe(), "", ()), image, lambda: 0)
-        loop = asyncio.new_event_loop()
-        debugging = Debugging(runner, None, Waiting(loop, lambda: 0, lambda: False), lambda *_, **__: None)
+def test_no_debugger_attaches_to_a_run_that_can_write_to_real_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    run_dir = runtime_root() / "plant"
+    run_dir.mkdir(parents=True)
+    (run_dir / "plc.sock").touch()
+    system = load_system("observatory")
+    for options in (RunOptions("", prototype=False), RunOptions("", prototype=True, allow_writes=True)):
+        write_record(run_dir, run_record(options, system, None, 0, 0))
         with pytest.raises(UsageError, match="its plant is not simulated"):
-            loop.run_until_complete(debugging.command({"attach": True}))
-        loop.close()
+            attach("plant", lambda *_, **__: None)
 
 
 def test_a_client_that_goes_loses_its_session_and_the_plc_goes_on(shed: Path, ask: Ask) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from importlib import import_module
+from itertools import pairwise
 
 import pytest
 from page_runner import ROOT
@@ -37,6 +38,16 @@ def test_links_are_those_of_the_book():
     text, beside = book.with_links(shown, "README.md", "readme.md", book.pages())
     assert text == "[a](reference/plc.md#x) ![b](pictures/picture.svg)"
     assert beside == {"docs/pictures/picture.svg": "pictures/picture.svg"}
+
+
+def test_a_heading_is_at_most_one_level_below_the_heading_before_it():
+    for source in book.pages():
+        if not source.endswith(".md"):
+            continue
+        text = re.sub(r"^( *)(`{3,}).*?^\1\2", "", (ROOT / source).read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+        headings = re.findall(r"^(#+) (.*)", text, re.MULTILINE)
+        for (before, _), (level, title) in pairwise(headings):
+            assert len(level) <= len(before) + 1, f"{source}: {title}"
 
 
 def test_every_page_is_in_one_table_of_contents(staged):

@@ -77,8 +77,8 @@ def test_a_value_set_in_the_simulated_device_arrives_over_the_bus_until_it_is_re
             lambda: 7 in [row["tags"].get("sample_period_s") for row in latest(client, device="ctd")],
             "the frame that carried the value is shown",
         )
-        history = client.get(f"{NAME}/tags/ctd.sample_period_s/history").json()
-        assert history["points"][-1][1:3] == [7, "good"]
+        history = f"{NAME}/tags/ctd.sample_period_s/history"
+        until(lambda: client.get(history).json()["points"][-1][1:3] == [7, "good"], "the history has the set value")
         client.delete(f"{NAME}/tags/ctd.sample_period_s/set").raise_for_status()
         until(lambda: tag(observatory, "ctd.sample_period_s")["value"] != 7, "the device has its own value again")
 

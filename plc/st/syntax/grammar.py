@@ -21,6 +21,7 @@ _UNSUPPORTED = {
     for construct, words in {
         "labels and jumps": "JMP",
         "exceptions (__TRY, __CATCH)": "__TRY __CATCH __FINALLY __ENDTRY",
+        "unions (UNION)": "UNION END_UNION",
         "bodies in instruction list (IL)": "LD LDN ST STN CAL CALC CALCN JMPC JMPCN RETC RETCN ANDN ORN XORN",
     }.items()
     for word in words.split()

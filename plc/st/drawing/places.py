@@ -11,6 +11,7 @@ from itertools import pairwise
 
 from fieldtwin.plc.st.drawing.canvas import CHAR
 from fieldtwin.plc.st.drawing.figures import PIN, RAILS, SYMBOLS, VARIABLE_H, Figure
+from fieldtwin.plc.st.plcopen.nodes import connected
 
 MOST_STRETCHED = 3.0
 """The largest factor by which a drawing with positions is stretched. Longer texts are shortened."""
@@ -26,26 +27,9 @@ _SOURCES = ("inVariable", "continuation")
 
 def networks_of(figures: Mapping[str, Figure]) -> list[list[Figure]]:
     """Return the groups of connected elements from top to bottom, without power rails and comments."""
-    neighbours: dict[str, set[str]] = {
-        n: set() for n, one in figures.items() if one.tag not in RAILS and one.tag != "comment"
-    }
-    for one in figures.values():
-        for link in (link for port in one.inputs for link in port.links):
-            if one.id in neighbours and link.source in neighbours:
-                neighbours[one.id].add(link.source)
-                neighbours[link.source].add(one.id)
-    found: list[list[Figure]] = []
-    seen: set[str] = set()
-    for start in neighbours:
-        waiting, network = [start], []
-        while waiting:
-            one_id = waiting.pop()
-            if one_id not in seen:
-                seen.add(one_id)
-                network.append(figures[one_id])
-                waiting += neighbours[one_id]
-        if network:
-            found.append(network)
+    ids = [n for n, one in figures.items() if one.tag not in RAILS and one.tag != "comment"]
+    links = ((one.id, link.source) for one in figures.values() for port in one.inputs for link in port.links)
+    found = [[figures[n] for n in network] for network in connected(ids, links)]
     order = list(figures)
     for network in found:
         network.sort(key=lambda one: order.index(one.id))

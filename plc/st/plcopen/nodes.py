@@ -210,25 +210,31 @@ def _before(node: Node, rest: dict[str, Node]) -> list[Node]:
 
 def _networks(nodes: dict[str, Node]) -> list[list[Node]]:
     """Return the groups of connected elements, from top to bottom."""
-    neighbours: dict[str, set[str]] = {n: set() for n in nodes}
-    for node in nodes.values():
-        for need in node.needs:
-            if need in nodes:
-                neighbours[node.id].add(need)
-                neighbours[need].add(node.id)
-    networks: list[list[Node]] = []
+    links = ((node.id, need) for node in nodes.values() for need in node.needs)
+    networks = [[nodes[one] for one in network] for network in connected(nodes, links)]
+    return sorted(networks, key=lambda network: min(node.place for node in network))
+
+
+def connected(ids: Iterable[str], links: Iterable[tuple[str, str]]) -> list[list[str]]:
+    """Return the groups of `ids` that are connected by `links`, directly or through others. Links to other ids do not count."""
+    neighbours: dict[str, set[str]] = {one: set() for one in ids}
+    for first, second in links:
+        if first in neighbours and second in neighbours:
+            neighbours[first].add(second)
+            neighbours[second].add(first)
+    groups: list[list[str]] = []
     seen: set[str] = set()
-    for start in nodes:
-        waiting, network = [start], []
+    for start in neighbours:
+        waiting, group = [start], list[str]()
         while waiting:
             one = waiting.pop()
             if one not in seen:
                 seen.add(one)
-                network.append(nodes[one])
+                group.append(one)
                 waiting += neighbours[one]
-        if network:
-            networks.append(network)
-    return sorted(networks, key=lambda network: min(node.place for node in network))
+        if group:
+            groups.append(group)
+    return groups
 
 
 def _by_flow(nodes: Iterable[Node]) -> list[Node]:

@@ -145,8 +145,8 @@ def instance(reference: Instance | None, name: str) -> Any:
     return reference.of
 
 
-class Single:
-    """A variable as an array with one element, because a pointer to it was moved."""
+class _Parts:
+    """An array whose elements are those of the variable to which the reference `of` refers."""
 
     __slots__ = ("_of",)
 
@@ -155,6 +155,12 @@ class Single:
 
     def key(self) -> Key:
         return self._of.key()
+
+
+class Single(_Parts):
+    """A variable as an array with one element, because a pointer to it was moved."""
+
+    __slots__ = ()
 
     def __len__(self) -> int:
         return 1
@@ -166,20 +172,18 @@ class Single:
         self._of.v = value
 
 
-class Characters:
+class Characters(_Parts):
     """A string as an array of its bytes. The byte after its last character, and those after that one, are 0.
 
     An assigned 0 ends the string. A character can be assigned up to the end of the string; one that would be after the end raises
     `LogicError`, because a string has no bytes there.
     """
 
-    __slots__ = ("_length", "_of")
+    __slots__ = ("_length",)
 
     def __init__(self, of: Reference, length: int) -> None:
-        self._of, self._length = of, length
-
-    def key(self) -> Key:
-        return self._of.key()
+        super().__init__(of)
+        self._length = length
 
     def __len__(self) -> int:
         return self._length + 1
@@ -200,16 +204,10 @@ class Characters:
             self._of.v = text[:at] + chr(value) + text[at + 1 :]
 
 
-class Letters:
+class Letters(_Parts):
     """A string as an array of its characters (IEC 61131-3:2013, 6.4.2). Raises `LogicError` for one after its end."""
 
-    __slots__ = ("_of",)
-
-    def __init__(self, of: Reference) -> None:
-        self._of = of
-
-    def key(self) -> Key:
-        return self._of.key()
+    __slots__ = ()
 
     def __len__(self) -> int:
         return len(self._of.v)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from fieldtwin.gateway.core.image.layout import MAX_DEPTH, MAX_MESSAGE_BYTES
@@ -79,9 +80,11 @@ class Declarations:
             enum = self.type_of(v.type)
             for name, number in enum.values.items() if isinstance(enum, ty.Enum) else ():
                 value = Symbol(name, enum, repr(number), writable=False, constant=number)
-                if found.setdefault(name.lower(), value) != value:
-                    other, hint = found[name.lower()].type, "declare the enumerations in TYPE and write TYPE#VALUE"
-                    self.env.fail(v.pos, f"{name} is a value of {other} and of {enum}", hint=hint)
+                before = found.setdefault(name.lower(), value)
+                if before != value:
+                    several = f"{name} is a value of {before.type} and of {enum}"
+                    refused = f"{several}; declare them in TYPE and write TYPE#{name}"
+                    found[name.lower()] = replace(before, refused=refused)
         return found
 
     def enumerated(self, pou: t.Pou) -> dict[str, Symbol]:

@@ -70,6 +70,8 @@ def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
     symbol, selectors = lookup(x, ref)
     if symbol is None or (x.env.dialect.vendor and isinstance(symbol.type, ty.Enum) and selectors):
         return _enum_value(x, ref), ()
+    if _is_enum_value(symbol, ref) and _is_value_of(x.wanted, ref):
+        return _enum_value(x, ref), ()
     if symbol.refused:
         x.env.fail(ref.pos, symbol.refused)
     if ref.name.lower() in x.env.ambiguous and ref.name.lower() not in x.symbols:
@@ -106,6 +108,16 @@ def pointed(reference: str, of: ty.Type) -> Value:
     return Value(code, of, None, True, True, reference, view=view)
 
 
+def _is_value_of(kind: ty.Type | None, ref: t.Ref) -> bool:
+    """Return whether a name is a value of an enumeration."""
+    return isinstance(kind, ty.Enum) and not ref.selectors and ref.name.lower() in map(str.lower, kind.values)
+
+
+def _is_enum_value(symbol: Symbol, ref: t.Ref) -> bool:
+    """Return whether a symbol is a value of an enumeration without a name. The type that its context demands has precedence."""
+    return not symbol.writable and symbol.constant is not None and _is_value_of(symbol.type, ref)
+
+
 def _enum_value(x: Compiling, ref: t.Ref) -> Value:
     first = ref.selectors[0] if ref.selectors else None
     if len(ref.selectors) == 1 and isinstance(first, t.Member):
@@ -117,8 +129,8 @@ def _enum_value(x: Compiling, ref: t.Ref) -> Value:
             x.env.unknown(first.pos, f"in {ref.name}, a variable", first.name, known)
     found = x.env.enum_values.get(ref.name.lower(), [])
     wanted = x.wanted
-    if isinstance(wanted, ty.Enum) and not ref.selectors:
-        found = [(wanted, n) for name, n in wanted.values.items() if name.lower() == ref.name.lower()] or found
+    if isinstance(wanted, ty.Enum) and _is_value_of(wanted, ref):
+        found = [(wanted, n) for name, n in wanted.values.items() if name.lower() == ref.name.lower()]
     if not found or ref.selectors:
         known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
         x.env.unknown(ref.pos, "a variable", ref.name, known)

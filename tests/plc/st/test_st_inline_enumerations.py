@@ -34,6 +34,16 @@ def test_two_pous_may_use_one_name_for_different_values() -> None:
     assert (found["f"].v_s, found["m"], found["t"]) == (1, 1, 1)
 
 
+@pytest.mark.parametrize("dialect", ["standard", "codesys"])
+def test_the_type_that_a_value_must_have_decides_which_enumeration_is_meant(dialect: str) -> None:
+    """In `codesys`, which converts enumerations, the number of the local enumeration was assigned."""
+    before = """TYPE Lamp : (off, amber, green); END_TYPE
+    FUNCTION f : INT VAR_INPUT l : Lamp; END_VAR f := SEL(l = Lamp#green, 1, 2); END_FUNCTION"""
+    variables = "local : (green, red); l : Lamp := green; m : Lamp; a : (up, down); b : (down, up) := up; n : INT;"
+    found = run(variables, "m := green; local := green; a := down; b := down; n := f(green);", before, dialect=dialect)
+    assert [found[name] for name in ("l", "m", "local", "a", "b", "n")] == [2, 2, 0, 1, 0, 2]
+
+
 def test_a_value_is_known_to_callers_where_a_parameter_demands_it() -> None:
     before = """FUNCTION_BLOCK fb VAR_INPUT s : (idle, run); END_VAR VAR_OUTPUT on : BOOL; END_VAR
     on := s = run; END_FUNCTION_BLOCK"""
@@ -58,7 +68,7 @@ def test_an_output_is_bound_with_the_names_of_its_values() -> None:
 @pytest.mark.parametrize(
     ("variables", "body", "message"),
     [
-        ("a : (x, y); b : (y, z);", ";", "y is a value of \\(x, y\\) and of \\(y, z\\)"),
+        ("a : (x, y); b : (y, z); c : BOOL;", "c := a = y;", "y is a value of \\(x, y\\) and of \\(y, z\\)"),
         ("a : (x, y); x : INT;", ";", "x is declared twice"),
         ("a : (x, X);", ";", "has the value X twice"),
         ("a : (x, y) := z;", ";", "'z' is not declared"),

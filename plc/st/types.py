@@ -22,6 +22,8 @@ MAX_ELEMENTS = 1_000_000
 """The limit for an array over all its dimensions, and for all elements of a structure, a block or a program."""
 MAX_NESTED = 32
 """How deep structures, arrays and blocks may be nested."""
+GIVEN = ("VAR_INPUT", "VAR_IN_OUT")
+"""The kinds of variables that a call gives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +171,8 @@ class Block:
     name: str
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
     outputs: Mapping[str, tuple[str, Type]] = field(hash=False)
+    order: tuple[str, ...]
+    """The names of inputs and VAR_IN_OUT as declared, in the order of the declaration, which positional arguments have."""
     in_outs: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
     standard: type[FunctionBlock] | None = None
     elements: int = 8
@@ -390,6 +394,6 @@ def standard_blocks(blocks: Mapping[str, type[FunctionBlock]]) -> dict[str, Bloc
         return {name.lower(): (name, ELEMENTARY[kind]) for name, kind in declared.items()}
 
     return {
-        name.lower(): Block(name, members(block.inputs), members(block.outputs), standard=block)
+        name.lower(): Block(name, members(block.inputs), members(block.outputs), tuple(block.inputs), standard=block)
         for name, block in blocks.items()
     }

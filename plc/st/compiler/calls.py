@@ -124,7 +124,7 @@ class Calls(Expressions):
 
     def _user_function(self, call: t.Call, signature: Signature, method: Selected | None = None) -> Value:
         """Compile the call of a function or method."""
-        given = bind(self.env, call, [p.name for p in (*signature.inputs, *signature.in_outs)], signature.name)
+        given = bind(self.env, call, signature.order, signature.name)
         codes: list[str] = []
         for p in signature.inputs:
             expr, mark = _value_of(given.get(p.name.lower())), len(self.out.lines)

@@ -373,6 +373,7 @@ class Declarations:
                         hidden.add(v.name.lower())
         total, nested = self.bounded(pou.pos, held)
         inputs, outputs, in_outs = members.values()
+        order = tuple(v.name for block in pou.blocks if block.kind in ty.GIVEN for v in block.variables)
         base = self.named(pou.extends[0].name, pou.extends[0].pos) if pou.extends else None
         actions = frozenset(action.name.lower() for action in pou.actions)
         bases, interfaces = frozenset[str](), self._interfaces(pou.implements)
@@ -381,9 +382,8 @@ class Declarations:
             actions |= base.actions
         created = self.env.dialect.vendor and _fb_init(pou) is not None
         return ty.Block(
-            pou.name, inputs,
-            outputs,
-            in_outs, elements=total, nested=nested + 1, actions=actions, publics=publics, hidden=frozenset(hidden),
+            pou.name, inputs, outputs, order, in_outs,
+            elements=total, nested=nested + 1, actions=actions, publics=publics, hidden=frozenset(hidden),
             bases=bases, interfaces=interfaces, refers=any(map(ty.holds_interface, held)), is_class=pou.kind == "CLASS",
             abstract="ABSTRACT" in pou.modifiers, created=created or (isinstance(base, ty.Block) and base.created),
         )  # fmt: skip

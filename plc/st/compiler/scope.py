@@ -79,6 +79,8 @@ class Signature:
     inputs: tuple[Parameter, ...]
     in_outs: tuple[Parameter, ...]
     outputs: tuple[Parameter, ...]
+    order: tuple[str, ...]
+    """The names of inputs and VAR_IN_OUT in the order of the declaration, which positional arguments have."""
 
     def names(self) -> set[str]:
         """Return the names of all parameters in lower case."""

@@ -222,8 +222,7 @@ class Statements(Calls):
             self.out.line(f"{place} = {code}", call.pos)
             code = place
         cells: dict[str, str] = {}
-        names = [member for member, _ in (*block.inputs.values(), *block.in_outs.values())]
-        given = bind(self.env, call, names, str(block))
+        given = bind(self.env, call, block.order, str(block))
         for name, argument in given.items():
             assert argument.value is not None
             if name in block.inputs:

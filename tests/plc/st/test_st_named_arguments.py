@@ -254,3 +254,29 @@ def test_operators_are_functions_too() -> None:
     assert value("BOOL", "AND(TRUE, OR(FALSE, TRUE), XOR(TRUE, FALSE)) AND NOT (FALSE)") is True
     with pytest.raises(FileInvalid, match="is not declared"):
         value("BOOL", "AND_THEN(TRUE, TRUE)")
+
+
+ORDER = "VAR_IN_OUT sum : INT; END_VAR VAR_INPUT add : INT; END_VAR VAR_IN_OUT last : INT; END_VAR"
+
+
+@pytest.mark.parametrize(
+    ("before", "call"),
+    [
+        (f"FUNCTION f : INT {ORDER} sum := sum + add; last := add; END_FUNCTION", "n := f(x, y, z)"),
+        (f"FUNCTION_BLOCK f {ORDER} sum := sum + add; last := add; END_FUNCTION_BLOCK", "b(x, y, z)"),
+        (
+            f"FUNCTION_BLOCK f METHOD PUBLIC m : INT {ORDER} sum := sum + add; last := add; END_METHOD END_FUNCTION_BLOCK",
+            "n := b.m(x, y, z)",
+        ),
+        (
+            f"FUNCTION_BLOCK base VAR_INPUT first : INT; END_VAR END_FUNCTION_BLOCK"
+            f" FUNCTION_BLOCK f EXTENDS base {ORDER} sum := sum + add; last := add; END_FUNCTION_BLOCK",
+            "b(9, x, y, z)",
+        ),
+    ],
+)
+def test_positional_arguments_have_the_order_of_the_declaration(before: str, call: str) -> None:
+    """Defect: VAR_IN_OUT came after all VAR_INPUT, so that two parameters of one type were exchanged."""
+    block = "b : f;" if "_BLOCK f" in before else ""
+    found = run(f"{block} x : INT := 1; y : INT := 20; z, n : INT;", f"{call};", before)
+    assert (found["x"], found["y"], found["z"]) == (21, 20, 20)

@@ -34,6 +34,7 @@ class Functions:
             tuple(found["VAR_INPUT"]),
             tuple(found["VAR_IN_OUT"]),
             tuple(found["VAR_OUTPUT"]),
+            tuple(v.name for block in pou.blocks if block.kind in ty.GIVEN for v in block.variables),
         )
 
     def write(self, pou: t.Pou) -> None:

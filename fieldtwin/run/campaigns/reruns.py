@@ -1,4 +1,4 @@
-"""Further runs of failed seeds with a part of their faults, which find the causes of failures.
+"""Further runs of failed seeds, which find the causes of failures: to know their faults, and with a part of these.
 
 The runs use the workers of the campaign. Their number and their order have no effect on the causes that are found.
 """
@@ -49,6 +49,26 @@ class Rerun:
 
 
 @dataclass(frozen=True, slots=True)
+class FaultsOf:
+    """The faults of the run of a seed, as a unit. Guided faults are known only after a run, so a worker makes it again."""
+
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.seed} to know its faults"
+
+
+_Unit = Rerun | FaultsOf
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSchedule:
+    """The faults of a run."""
+
+    faults: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Unfinished:
     """A run that no process could finish."""
 
@@ -65,14 +85,16 @@ class Reruns(Generic[RESULT]):
     def virtual_s(self) -> float:
         return self.work.virtual_s
 
-    def run(self, unit: Rerun) -> RESULT | Unfinished:
+    def run(self, unit: _Unit) -> RESULT | FaultSchedule | Unfinished:
+        if isinstance(unit, FaultsOf):
+            return FaultSchedule(tuple(self.work.faults_of(unit.seed)))
         faults = unit.faults if unit.shape is None else of_shape(self.work.faults_of(unit.seed), unit.shape)
         return self.work.run_with(unit.seed, faults)
 
-    def unfinished(self, unit: Rerun, reason: str) -> RESULT | Unfinished:
+    def unfinished(self, unit: _Unit, reason: str) -> RESULT | FaultSchedule | Unfinished:
         return Unfinished(f"the run of seed {unit} did not finish: {reason}")
 
-    def hash_of(self, result: RESULT | Unfinished) -> str:
+    def hash_of(self, result: RESULT | FaultSchedule | Unfinished) -> str:
         """Return an empty text: no further run is repeated."""
         return ""
 
@@ -107,7 +129,10 @@ class CauseSearch(Generic[RESULT]):
     """The search for the causes of failed runs. `further` limits the number of its runs."""
 
     def __init__(
-        self, work: FaultyWork[RESULT], opened: OpenWork[Rerun, RESULT | Unfinished], further: FurtherRuns
+        self,
+        work: FaultyWork[RESULT],
+        opened: OpenWork[_Unit, RESULT | FaultSchedule | Unfinished],
+        further: FurtherRuns,
     ) -> None:
         self._work, self._opened, self._further = work, opened, further
 
@@ -127,7 +152,7 @@ class CauseSearch(Generic[RESULT]):
 
     def _shrunk(self, seed: int, wanted: Sequence[str]) -> Shrunk[RESULT]:
         small = shrunk_run(
-            self._work.faults_of(seed),
+            self._faults_of(seed),
             lambda parts: self._each(
                 [Rerun(n, seed, tuple(part)) for n, part in enumerate(parts)], lambda _, result: result
             ),
@@ -136,6 +161,17 @@ class CauseSearch(Generic[RESULT]):
             self._parallel,
         )
         return Shrunk(seed, *small)
+
+    def _faults_of(self, seed: int) -> tuple[dict[str, Any], ...]:
+        """Return the faults of the run of a seed. Raises `SearchStopped`."""
+        found: list[FaultSchedule] = []
+
+        def ended(_: _Unit, result: RESULT | FaultSchedule) -> None:
+            assert isinstance(result, FaultSchedule)
+            found.append(result)
+
+        self._run([FaultsOf(seed)], ended)
+        return found[0].faults
 
     def _suffices(self, shape: frozenset[str], seeds: Sequence[int], errors: Mapping[int, Sequence[str]]) -> list[bool]:
         """Return for each seed whether its run fails in the same way with its faults of this shape only."""
@@ -148,14 +184,24 @@ class CauseSearch(Generic[RESULT]):
         """Return, in the order of `reruns`, what `kept` returns for each of them. Raises `SearchStopped`."""
         found: dict[int, KEPT] = {}
 
-        def ended(one: Ended[Rerun, RESULT | Unfinished]) -> None:
+        def ended(unit: _Unit, result: RESULT | FaultSchedule) -> None:
+            assert isinstance(unit, Rerun)
+            assert not isinstance(result, FaultSchedule)
+            found[unit.number] = kept(unit, result)
+
+        self._run(reruns, ended)
+        return [found[n] for n in range(len(reruns))]
+
+    def _run(self, units: Sequence[_Unit], on_ended: Callable[[_Unit, RESULT | FaultSchedule], None]) -> None:
+        """Run units on the workers. Raises `SearchStopped`, also for a unit that did not finish."""
+
+        def ended(one: Ended[_Unit, RESULT | FaultSchedule | Unfinished]) -> None:
             if isinstance(one.result, Unfinished):
                 raise SearchStopped(one.result.reason)
-            found[one.unit.number] = kept(one.unit, one.result)
+            on_ended(one.unit, one.result)
 
         with _stopped_by_errors():
-            self._opened.run(reruns, ended)
-        return [found[n] for n in range(len(reruns))]
+            self._opened.run(units, ended)
 
     def _parallel(self) -> int:
         with _stopped_by_errors():
@@ -165,7 +211,7 @@ class CauseSearch(Generic[RESULT]):
 @contextmanager
 def open_search(place: Place, work: FaultyWork[RESULT], further: FurtherRuns) -> Iterator[CauseSearch[RESULT]]:
     """Prepare the workers of a place for a search. Raises `SearchStopped` if the place is gone."""
-    reruns: UnitWork[Rerun, RESULT | Unfinished] = Reruns(work)
+    reruns: UnitWork[_Unit, RESULT | FaultSchedule | Unfinished] = Reruns(work)
     with ExitStack() as stack:
         with _stopped_by_errors():
             opened = stack.enter_context(place.open(reruns))

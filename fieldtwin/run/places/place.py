@@ -1,6 +1,6 @@
 """The seam between a campaign and the computers on which it runs.
 
-The unit of work is one run of a scenario or system: a seed of the campaign, or a failed seed with a part of its faults. A
+The unit of work is one run of a scenario or system: a seed of the campaign, or a failed seed whose causes are searched. A
 `UnitWork` runs a unit, and a `Place` decides where. A place returns each unit's result exactly once, whatever happens to the
 workers.
 """

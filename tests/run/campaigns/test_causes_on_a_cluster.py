@@ -52,6 +52,8 @@ class Pump(Program):
     last = losses = 0
 
     def execute(self, scan: ScanInfo) -> None:
+        if scan.first_scan and "RAN" in os.environ:
+            open(os.environ["RAN"], "w").close()
         now, bad = scan.now_ns, self.tag("level").quality.name != "GOOD"
         if bad and not self.was_bad and now > self.last + 15_000_000_000:
             self.last, self.losses = now, self.losses + 1
@@ -70,6 +72,9 @@ steps:
 FAULTS = ("--for", "6min", "--faults", "random", "--fault-kinds", "silence,reset", "--fault-every", "20s")
 DEFECT = {"PUMP": "defect"}
 RUNS = SeedRuns(VirtualOptions("plant.yaml", 360.0, random_faults=RandomFaults(20.0, ("silence", "reset"))))
+GUIDED = SeedRuns(
+    VirtualOptions("plant.yaml", 360.0, random_faults=RandomFaults(20.0, ("silence", "reset"), guided=True))
+)
 
 
 @pytest.fixture
@@ -107,9 +112,9 @@ class WatchedRuns(SeedRuns):
         return SeedRuns.errors_of(self, result)
 
 
-def failed_runs() -> dict[int, SeedResult]:
+def failed_runs(work: SeedRuns = RUNS) -> dict[int, SeedResult]:
     failed: dict[int, SeedResult] = {}
-    run_units(LocalPlace(2), RUNS, [1, 2, 3], lambda one: failed.update({one.unit: one.result}))
+    run_units(LocalPlace(2), work, [1, 2, 3], lambda one: failed.update({one.unit: one.result}))
     return {seed: result for seed, result in sorted(failed.items()) if not result.ok}
 
 
@@ -141,6 +146,30 @@ def test_killed_and_added_workers_change_neither_the_causes_nor_the_count_of_run
 
     assert found_causes(cluster.place(), WatchedRuns(RUNS.options, heard), failed) == (here, left_here)
     assert count > max(kills)
+
+
+def test_guided_faults_are_found_again_on_the_workers_and_not_on_this_computer(
+    cluster: Cluster, site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PUMP", "defect")
+    failed = failed_runs(GUIDED)
+    here, left_here = found_causes(LocalPlace(1), GUIDED, failed)
+    assert here[0].small.faults
+    cluster.add("w1", "w2", "w3")
+    monkeypatch.setenv("RAN", str(site / "ran"))  # not in the environment of the workers
+    count = 0
+
+    def heard() -> None:
+        nonlocal count
+        count += 1
+        if count == len(failed):  # the next unit finds the faults of the first seed
+            cluster.kill("w1")
+
+    assert found_causes(cluster.place(), WatchedRuns(GUIDED.options, heard), failed) == (here, left_here)
+    assert count > len(failed)
+    assert not (site / "ran").exists()
+    GUIDED.faults_of(1)
+    assert (site / "ran").exists()  # such a run on this computer would have been seen
 
 
 def invoke(*words: str) -> str:

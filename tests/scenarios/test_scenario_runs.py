@@ -29,7 +29,7 @@ def run(folder: Path, steps: str, head: str = "") -> ScenarioResult:
     return run_virtual(load_scenario(written(folder, steps, head)))
 
 
-LONG = ("ocean-loss.scenario.yaml", "ocean-silent.scenario.yaml")
+LONG = ("ocean-front.scenario.yaml", "ocean-loss.scenario.yaml", "ocean-silent.scenario.yaml")
 
 
 @pytest.mark.parametrize(

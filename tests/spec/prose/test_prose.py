@@ -248,6 +248,7 @@ def write_first(folder: Path) -> Path:
     return folder / "first.yaml"
 
 
+@pytest.mark.long
 def test_prose_11_a_first_useful_prototype_is_one_driver_and_one_emulator(tmp_path: Path) -> None:
     ended = Ended(tmp_path / "run", str(write_first(tmp_path)), "--prototype", "--for", "3s")
     assert ended.code == 0, ended.err + json.dumps(ended.summary.get("errors"))
@@ -275,6 +276,7 @@ def test_prose_11_devices_are_added_one_at_a_time(tmp_path: Path) -> None:
     assert ended.summary["tags"]["incl.slope_long"]["quality"] == "good"
 
 
+@pytest.mark.long
 def test_prose_2_a_plant_needs_no_emulators(deserted: Path, tmp_path: Path) -> None:
     """With that folder removed, a plant without hardware behaves as with it: same exit code, same output."""
     bare = tmp_path / "bare"

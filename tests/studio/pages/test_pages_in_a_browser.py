@@ -197,6 +197,7 @@ def test_a_violation_of_the_policy_is_a_complaint(page: Window) -> None:
     assert not page.script("return window.bad")
 
 
+@pytest.mark.long
 def test_a_prototype_is_started_from_the_list_and_old_values_are_named_when_the_server_is_lost(
     chromium: Window, tmp_path: Path
 ) -> None:

@@ -6,6 +6,7 @@ import json
 import signal
 from pathlib import Path
 
+import pytest
 from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 SYSTEM = """\
@@ -46,6 +47,7 @@ END_PROGRAM
 """
 
 
+@pytest.mark.long
 def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
     for name, text in (("nodes.yaml", SYSTEM), ("nodes.prototype.yaml", PROTOTYPE), ("watch.st", PROGRAM)):
         (tmp_path / name).write_text(text, encoding="utf-8")

@@ -117,6 +117,7 @@ def test_a_run_in_processes_reports_the_line_and_its_capture_has_the_refusal(tmp
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.long
 def test_a_scenario_in_processes_fails_on_a_refused_output(tmp_path: Path) -> None:
     written(tmp_path)
     # The refusal ends the scenario, even if it came before the scenario's first observation. The pause is only the limit.
@@ -143,6 +144,7 @@ def test_a_read_only_plant_lists_its_unwritten_outputs_and_is_ok(tmp_path: Path)
     assert {e["tag"] for e in refused if e["action"] == "refuse"} == {"drive.speed", "drive.run"}
 
 
+@pytest.mark.long
 def test_a_refused_force_is_recorded(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, "run", str(written(tmp_path)), "--prototype", "--instance", "f") as run:
         plc = run.control("f", "plc")

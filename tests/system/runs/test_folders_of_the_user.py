@@ -150,6 +150,7 @@ def test_a_command_runs(site: Path, environment: dict[str, str], words: tuple[st
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.long
 def test_the_plugin_runs(site: Path, environment: dict[str, str]) -> None:
     plugins = ("-p", "fieldtwin.pytest_plugin", "-p", "no:cacheprovider")
     done = did(site, environment, "pytest", "-q", *plugins, "--timeout=40", "tests")

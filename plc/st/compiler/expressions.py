@@ -93,6 +93,8 @@ class Expressions:
 
     def condition(self, expr: t.Expr, what: str) -> str:
         value = self.value(expr)
+        if isinstance(value.type, ty.AnyInt):  # 0 and 1 are literals of BOOL (Table 5)
+            return self.coerced(value, ty.BOOL, expr.pos, f"the condition of {what}")
         if not ty.is_kind(value.type, "bool"):
             self.env.fail(expr.pos, f"the condition of {what}", expected="BOOL", got=str(value.type))
         return value.code

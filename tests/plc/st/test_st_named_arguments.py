@@ -116,7 +116,8 @@ WITH_A_VARIABLE = {
 }  # fmt: skip
 """Functions of this PLC that refer to an input or a mailbox of the program."""
 ELSEWHERE = {"CONCAT_DT", "CONCAT_LDT", "SPLIT_DATE", "SPLIT_TOD", "SPLIT_LTOD", "SPLIT_DT", "SPLIT_LDT",
-             "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF", "__QUERYINTERFACE"}  # fmt: skip
+             "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF", "__QUERYINTERFACE",
+             "NOT"}  # fmt: skip
 """Functions with outputs, or with seven parameters, which have too many orders, and functions of variables. They are in
 test_st_dates_and_bcd.py, test_st_references.py, test_st_pointers.py and test_st_open_arrays.py."""
 ALL = {**SAMPLES, **CONVERSIONS}
@@ -254,6 +255,15 @@ def test_operators_are_functions_too() -> None:
     assert value("BOOL", "AND(TRUE, OR(FALSE, TRUE), XOR(TRUE, FALSE)) AND NOT (FALSE)") is True
     with pytest.raises(FileInvalid, match="is not declared"):
         value("BOOL", "AND_THEN(TRUE, TRUE)")
+
+
+def test_not_is_an_operator_and_a_function() -> None:
+    body = """b := NOT(IN := a); x := NOT(in := n = 1) AND NOT(n = 1); c := NOT(EN := x AND 0, IN := a, ENO => ok);
+              y := NOT(x); d := NOT (a) AND 16#FF;"""
+    found = run("a : WORD := 16#F0F0; b, c, d : WORD; n : INT; x, y, ok : BOOL;", body)
+    assert [found[name] for name in ("b", "c", "d", "x", "y", "ok")] == [0x0F0F, 0, 0x0F, True, False, False]
+    with pytest.raises(FileInvalid, match="in NOT, a parameter 'WRONG' is not declared"):
+        run("x : BOOL;", "x := NOT(WRONG := x);")
 
 
 ORDER = "VAR_IN_OUT sum : INT; END_VAR VAR_INPUT add : INT; END_VAR VAR_IN_OUT last : INT; END_VAR"

@@ -376,3 +376,15 @@ def test_an_enumeration_may_state_the_type_of_its_values() -> None:
     ):
         with pytest.raises(FileInvalid, match=reason):
             run("", "", types)
+
+
+def test_0_and_1_are_literals_of_bool_in_conditions() -> None:
+    """IEC 61131-3:2013, table 5, feature 7."""
+    body = """IF 1 THEN n := 1; END_IF
+      WHILE 1 DO n := n + 1; IF n = 3 THEN EXIT; END_IF; END_WHILE; WHILE 0 DO n := -1; END_WHILE
+      REPEAT n := n + 1; UNTIL BOOL#1 END_REPEAT; REPEAT n := n + 1; UNTIL 1 END_REPEAT
+      a := SEL(0, 10, 20); b := SEL(G := 1, IN0 := 10, IN1 := 20);"""
+    found = run("n, a, b : INT;", body)
+    assert (found["n"], found["a"], found["b"]) == (5, 10, 20)
+    with pytest.raises(FileInvalid, match="the condition of IF; expected BOOL; got 2"):
+        run("n : INT;", "IF 2 THEN n := 1; END_IF")

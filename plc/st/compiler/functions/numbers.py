@@ -84,6 +84,11 @@ def _operator(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     return x.value(made, x.wanted)
 
 
+@NUMBERS.add("NOT", takes=ONE)
+def _not(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+    return x.value(t.Unary(call.pos, "NOT", given[0]), x.wanted)
+
+
 @NUMBERS.add(*_SEQUENCES, takes=_SOME)
 def _sequence(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     """Write a comparison of each argument with the next one (Table 33). For example, GT is true for a decreasing sequence."""

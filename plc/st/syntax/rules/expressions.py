@@ -30,6 +30,10 @@ class ExpressionRules(Rules):
         arguments = tuple(each for each in given if not isinstance(each, t.Pos))
         return t.Call(self._pos(meta), ref, arguments, empty)
 
+    def negation(self, meta: Meta, items: list[Any]) -> t.Call:
+        operator, *arguments = items
+        return t.Call(self._pos(meta), t.Ref(self._pos(meta), str(operator)), tuple(arguments))
+
     def left_out(self, meta: Meta, items: list[Any]) -> t.Pos:
         return self._pos(meta)
 

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
-STANDARD_NAMES = frozenset({"standard", "tc2_standard"})
+STANDARD_NAMES = frozenset({"standard", "tc2_standard", "tc2_system", "sysmem"})
 """The names in lower case under which CODESYS and TwinCAT have the standard functions and function blocks."""
 Declaration = t.TypeDecl | t.VarBlock | t.Pou
 

@@ -20,6 +20,7 @@ from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT
 from fieldtwin.plc.st.compiler.pous.inlining import NAMES
+from fieldtwin.plc.st.runtime.layouts import Stored, Union
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
@@ -167,6 +168,9 @@ def _numbered(roots: tuple[Any, ...]) -> dict[int, int]:
         value = waiting.pop()
         if isinstance(value, REFERENCES) or id(value) in numbers:
             continue
+        if isinstance(value, Stored):
+            numbers[id(value.memory)] = len(numbers)
+            continue
         if isinstance(value, list):
             waiting += value
         elif hasattr(value, "__dict__"):
@@ -188,6 +192,8 @@ def state_of(value: Any, now_ns: int, numbers: dict[int, int]) -> Any:
     if isinstance(value, REFERENCES):
         owner, *where = value.key()
         return "reference", numbers.get(owner, owner), *where
+    if isinstance(value, Union):
+        return value.content
     if isinstance(value, FunctionBlock):
         return type(value).__name__, *value.state(now_ns)
     if isinstance(value, Instance):

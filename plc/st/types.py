@@ -150,7 +150,7 @@ class OpenArray:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """A structure. `fields` maps the name of each field, in lower case, to the name as declared and the type."""
+    """A structure or union. `fields` maps the name of each field, in lower case, to the name as declared and the type."""
 
     name: str
     fields: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -158,6 +158,10 @@ class Struct:
     nested: int = 1
     refers: bool = False
     """Whether it contains a reference to an instance."""
+    union: bool = False
+    """Whether its fields have the same memory (UNION of the dialects of CODESYS)."""
+    packed: int = 8
+    """The largest multiple of bytes at which a field begins in memory (``pack_mode`` of CODESYS)."""
 
     def __str__(self) -> str:
         return self.name
@@ -343,6 +347,13 @@ def holds_interface(kind: Type) -> bool:
     if isinstance(kind, Array):
         return holds_interface(kind.of)
     return isinstance(kind, Interface) or (isinstance(kind, Struct | Block) and kind.refers)
+
+
+def holds_union(kind: Type) -> bool:
+    """Return whether a variable of this type is, or contains, a union."""
+    if isinstance(kind, Array):
+        return holds_union(kind.of)
+    return isinstance(kind, Struct) and (kind.union or any(holds_union(of) for _, of in kind.fields.values()))
 
 
 def _widens(source: Elementary, target: Elementary) -> bool:

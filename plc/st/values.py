@@ -15,7 +15,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.plc.st.runtime import copying, layouts
 from fieldtwin.plc.st.runtime.arrays import OpenArray, bound
+from fieldtwin.plc.st.runtime.layouts import Stored
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.moments import (
     date_of,
@@ -67,6 +69,7 @@ __all__ = [  # and all names that compiled code calls
     "attempted",
     "bound",
     "characters",
+    "copying",
     "cut",
     "date_of",
     "date_text",
@@ -75,6 +78,7 @@ __all__ = [  # and all names that compiled code calls
     "first",
     "from_beginning",
     "instance",
+    "layouts",
     "memory",
     "moment_text",
     "moved",
@@ -199,6 +203,9 @@ def shaped(x: list[Any], sizes: tuple[int, ...]) -> list[Any]:
 def put(target: Any, source: Any) -> None:
     """Assign a structure in place: `target` and the objects inside it stay the same objects, because a VAR_IN_OUT may
     refer to them. `source` is a copy."""
+    if isinstance(target, Stored):
+        target.assign(source)
+        return
     for name in target.__slots__:
         held = getattr(target, name)
         if isinstance(held, list):
@@ -211,6 +218,9 @@ def put(target: Any, source: Any) -> None:
 
 def fill(target: list[Any], source: list[Any]) -> None:
     """Assign an array in place, as `put` does."""
+    if isinstance(target, Stored):
+        target.assign(source)
+        return
     if target and not isinstance(target[0], list) and not hasattr(target[0], "copy"):
         target[:] = source
         return

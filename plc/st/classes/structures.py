@@ -1,6 +1,6 @@
-"""Structures that extend others (``TYPE Big EXTENDS Small : STRUCT``), an addition of CODESYS and TwinCAT to the standard.
+"""Structures and unions that extend others (``TYPE Big EXTENDS Small : STRUCT``), additions of CODESYS and TwinCAT.
 
-A structure gets the members of its base before its own. A structure without members is also an addition of these dialects.
+They get the members of their base before their own. A structure without members is also an addition of these dialects.
 """
 
 from __future__ import annotations
@@ -24,10 +24,15 @@ def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit
     errors = ErrorCollector()
     hint = "the dialects codesys and twincat accept it"
     for one in structures.values() if not dialect.vendor else ():
-        if one.extends:
+        if one.union:
+            errors.add(invalid(one.pos, f"{one.name} is a UNION, which is not in the standard", hint=hint))
+        elif one.extends:
             errors.add(invalid(one.extends[0].pos, "EXTENDS of a structure is not in the standard", hint=hint))
         elif not one.fields:
             errors.add(invalid(one.pos, f"the structure {one.name} has no members", "at least one member", hint=hint))
+    for one in structures.values():
+        if one.union and not (one.extends or one.fields):
+            errors.add(invalid(one.pos, f"the union {one.name} has no members", "at least one member"))
     errors.raise_all()
     missing = {one.name.lower() for one in unit.missing}
     done: dict[str, t.StructDecl] = {}
@@ -43,12 +48,20 @@ def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit
                 errors.add(invalid(base.pos, f"{one.name} extends itself"))
             elif len(one.extends) > 1:
                 errors.add(invalid(one.extends[1].pos, f"{one.name} extends two structures", "one name after EXTENDS"))
+            elif of is not None and of.union != one.union:
+                what, other = ("UNION", "STRUCT") if one.union else ("STRUCT", "UNION")
+                errors.add(invalid(base.pos, f"{one.name} is a {what} and extends a {other}", f"the name of a {what}"))
             elif of is not None:
                 members = extended(of, (*below, key)).fields
             elif base.name.lower() not in missing:
                 hint = did_you_mean(base.name, [each.name for each in structures.values()])
                 errors.add(
-                    invalid(base.pos, f"EXTENDS {base.name}: {base.name!r} is not declared", "a STRUCT", hint=hint)
+                    invalid(
+                        base.pos,
+                        f"EXTENDS {base.name}: {base.name!r} is not declared",
+                        "a UNION" if one.union else "a STRUCT",
+                        hint=hint,
+                    )
                 )
         done[key] = replace(one, fields=(*members, *one.fields))
         return done[key]

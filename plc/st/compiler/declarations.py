@@ -13,6 +13,7 @@ from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED, InitialValues
+from fieldtwin.plc.st.compiler.pointers.memory import layout, members
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, identifier
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import nodes
@@ -260,13 +261,19 @@ class Declarations:
                 if field.name.lower() in fields:
                     self.env.fail(field.pos, f"{field.name} is declared twice")
                 kind = self.type_of(field.type)
+                if field.location and (declared.union or ty.holds_union(kind)):
+                    what = "is a member of a union" if declared.union else "is or contains a union"
+                    self.env.fail(field.pos, f"{field.name} {what} and has an address", expected="no AT")
                 if isinstance(field.type, t.EnumType) and isinstance(kind, ty.Enum):
                     self.register(kind)
                 fields[field.name.lower()] = (field.name, kind)
             total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
             refers = any(ty.holds_interface(kind) for _, kind in fields.values())
-            struct = ty.Struct(declared.name, fields, total, nested + 1, refers)
-            self._write_struct(struct, declared)
+            struct = ty.Struct(declared.name, fields, total, nested + 1, refers, declared.union, declared.packed)
+            if declared.union:
+                self._write_union(struct, declared)
+            else:
+                self._write_struct(struct, declared)
             return struct
         if isinstance(declared, t.EnumDecl):
             return self._registered(declared)
@@ -423,6 +430,23 @@ class Declarations:
     def needed(self, block: ty.Block) -> list[str]:
         """Return the names of the parameters of FB_init that have no initial value."""
         return [v.name for v in self.creation(block) if v.initial is None] if block.created else []
+
+    def _write_union(self, union: ty.Struct, declared: t.StructDecl) -> None:
+        """Write the class of a union, whose members are bytes of the same memory."""
+        out, name = self.out, f"S_{identifier(union.name)}"
+        for field in declared.fields:
+            layout(self.env, union.fields[field.name.lower()][1], field.pos, f"{union.name}.{field.name}")
+        code = members(self.env, union, declared.pos, union.name)
+        out.line(f"{name} = _v.layouts.union({name!r}, {code})", declared.pos)
+        stated = [field for field in declared.fields if field.initial is not None]
+        if stated:
+            with out.block(f"def _{name}_initialise(self):", declared.pos):
+                for field in stated:
+                    kind = union.fields[field.name.lower()][1]
+                    out.line(
+                        f"self.m_{field.name.lower()} = {self.initial(kind, field.initial, field.type)}", field.pos
+                    )
+            out.line(f"{name}.initialise = _{name}_initialise", declared.pos)
 
     def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
         out, names = self.out, [f"m_{name}" for name in struct.fields]

@@ -27,6 +27,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
     negated,
     width,
 )
+from fieldtwin.plc.st.runtime.layouts import Stored
 from fieldtwin.plc.st.runtime.lines import is_line
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
@@ -84,7 +85,7 @@ def _parts(owner: Any) -> list[tuple[Any, Any]]:
 
 def _is_object(value: Any) -> bool:
     """Return whether a value is an object with variables. References do not count."""
-    plain = bool | int | float | str | Text | Int | Choice | floats.Float | z3.AstRef | Instance
+    plain = bool | int | float | str | Text | Int | Choice | floats.Float | z3.AstRef | Instance | Stored
     return value is not None and not isinstance(value, plain) and not isinstance(value, REFERENCES)
 
 
@@ -132,6 +133,8 @@ class Domain:
             raise NotModelled("a variable of an interface type")
         if isinstance(value, REFERENCES):
             raise NotModelled("a reference or pointer that keeps its value")
+        if isinstance(value, Stored):
+            raise NotModelled("a union")
         raise NotModelled(f"a variable of the type {type(value).__name__}")
 
     def joined(self, other: Domain) -> Domain:

@@ -2,8 +2,9 @@
 
 A variable keeps its value if its name (in any case of letters), its kind of block (VAR_INPUT, VAR_OUTPUT or another) and its
 type are the same. Structures and function blocks are compared member by member, so a member that is added or removed does not
-affect the others. A block of the standard, such as a timer, is taken over as it is, with its hidden state. The value of an
-enumeration is taken over by its name, because a value that is inserted changes the numbers of those after it.
+affect the others; a union keeps its memory if all its members are the same. A block of the standard, such as a timer, is taken
+over as it is, with its hidden state. The value of an enumeration is taken over by its name, because a value that is inserted
+changes the numbers of those after it.
 
 IEC 61131-3 does not define online changes; these are the rules that other PLC systems document.
 """
@@ -110,7 +111,8 @@ class Carrying:
             elif before is None:
                 _note(found.new, of, after)
             else:
-                _note(found.changed, of, after, f" ({before} -> {after})")
+                change = f"{before} -> {after}" if str(before) != str(after) else f"the members of {after.kind} differ"
+                _note(found.changed, of, after, f" ({change})")
         removed = [before for key, before in old.items() if key not in new]
         for before in removed:
             _note(found.removed, of, before)
@@ -133,6 +135,8 @@ class Carrying:
         if isinstance(old, ty.Array) and isinstance(new, ty.Array):
             return self._array(old, new) if old.ranges == new.ranges else None
         if isinstance(old, ty.Struct) and isinstance(new, ty.Struct):
+            if old.union or new.union:
+                return _same_memory if old == new else None
             return self._members("structure", old, new)
         if isinstance(old, ty.Block) and isinstance(new, ty.Block):
             if old.standard is not None or new.standard is not None:
@@ -205,6 +209,12 @@ def _note(names: list[str], of: str, declared: _Declared, more: str = "") -> Non
 def _taken(present: Any, initial: Any) -> Any:
     """Take over a value of the same type: the object itself, because the old version is not executed again."""
     return present
+
+
+def _same_memory(present: Any, initial: Any) -> Any:
+    """Take over the bytes of a union whose members are the same."""
+    initial.assign(present)
+    return initial
 
 
 def _enumerated(old: ty.Enum, new: ty.Enum) -> Move:

@@ -26,7 +26,7 @@ class Memory:
 
     def key(self) -> tuple[Any, ...]:
         owner = self._owner
-        return (id(owner) if isinstance(owner, list) else owner.key(), self._shown)
+        return (*((id(owner),) if isinstance(owner, list) else owner.key()), self._shown)
 
     def __len__(self) -> int:
         return len(self._owner) * self._step // self._size

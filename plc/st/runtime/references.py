@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from fieldtwin.plc.st.runtime.layouts import Overlay, Row, Stored
 from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
@@ -46,7 +47,7 @@ class Whole(Cell):
     __slots__ = ()
 
     def key(self) -> Key:
-        return self.v.key() if isinstance(self.v, Characters | Memory) else (id(self.v),)
+        return self.v.key() if isinstance(self.v, Characters | Memory | Stored) else (id(self.v),)
 
 
 class MemberReference:
@@ -58,6 +59,8 @@ class MemberReference:
         self.owner, self.name = owner, name
 
     def key(self) -> Key:
+        if isinstance(self.owner, Overlay):
+            return id(self.owner.memory), self.owner.at + self.owner.offsets[self.name]
         return id(self.owner), self.name
 
     @property
@@ -84,6 +87,8 @@ class Element:
         self.owner, self.at = owner, at
 
     def key(self) -> Key:
+        if isinstance(self.owner, Row):
+            return id(self.owner.memory), self.owner.at + self.owner.offset(self.at)
         named = isinstance(self.owner, Single | Characters | Letters | Memory)
         owner = self.owner.key() if named else (id(self.owner),)
         return *owner, self.at

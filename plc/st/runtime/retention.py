@@ -7,6 +7,7 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.blocks import FunctionBlock
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.runtime.layouts import Union
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
 
@@ -15,7 +16,8 @@ def described(kind: ty.Type) -> Any:
     if isinstance(kind, ty.Array):
         return [kind.ranges, described(kind.of)]
     if isinstance(kind, ty.Struct):
-        return [[name, described(of)] for name, (_, of) in kind.fields.items()]
+        fields = [[name, described(of)] for name, (_, of) in kind.fields.items()]
+        return {"union": fields, "packed": kind.packed} if kind.union else fields
     if isinstance(kind, ty.Block):
         members = {**kind.inputs, **kind.outputs}
         return [kind.name.lower(), [[name, described(of)] for name, (_, of) in members.items()]]
@@ -28,6 +30,8 @@ def most_bytes(kind: ty.Type, now: Any) -> int:
     """Return the largest size in bytes that a value can have as MessagePack. `now` is the present data of the value."""
     if isinstance(kind, ty.String):
         return 5 + 3 * kind.length
+    if isinstance(now, str):  # a character, or the bytes of a union
+        return 5 + 3 * len(now)
     if isinstance(now, list):
         of = kind.of if isinstance(kind, ty.Array) else kind
         return 5 + len(now) * max((most_bytes(of, item) for item in now[:1]), default=0)
@@ -41,9 +45,11 @@ def most_bytes(kind: ty.Type, now: Any) -> int:
 
 
 def dump(value: Any) -> Any:
-    """Return the plain data of a value: objects by their slots (`_own`), references as None."""
+    """Return the plain data of a value: objects by their slots (`_own`), unions by their bytes, references as None."""
     if isinstance(value, REFERENCES):
         return None
+    if isinstance(value, Union):
+        return value.content.hex()
     if isinstance(value, list):
         return [dump(v) for v in value]
     slots = getattr(value, "__slots__", None)
@@ -57,7 +63,7 @@ def retained_part(value: Any) -> Any:
     if isinstance(value, list):
         parts = [retained_part(v) for v in value]
         return parts if any(part is not None for part in parts) else None
-    if isinstance(value, (*REFERENCES, Instance, FunctionBlock, str)) or not hasattr(value, "__slots__"):
+    if isinstance(value, (*REFERENCES, Instance, FunctionBlock, Union, str)) or not hasattr(value, "__slots__"):
         return None
     found = {}
     whole = getattr(value, "retain", ())
@@ -81,6 +87,9 @@ def _own(value: Any) -> list[str]:
 def load(into: Any, kept: Any) -> Any:
     """Return `kept` in the form of `into`; raises `FileInvalid` if the forms differ. References stay as they are."""
     if isinstance(into, REFERENCES):
+        return into
+    if isinstance(into, Union) and isinstance(kept, str):
+        into.content = bytes.fromhex(kept)
         return into
     if isinstance(into, list) and isinstance(kept, list) and len(into) == len(kept):
         return [load(a, b) for a, b in zip(into, kept, strict=True)]

@@ -21,7 +21,6 @@ _UNSUPPORTED = {
     for construct, words in {
         "labels and jumps": "JMP",
         "exceptions (__TRY, __CATCH)": "__TRY __CATCH __FINALLY __ENDTRY",
-        "unions (UNION)": "UNION END_UNION",
         "bodies in instruction list (IL)": "LD LDN ST STN CAL CALC CALCN JMPC JMPCN RETC RETCN ANDN ORN XORN",
     }.items()
     for word in words.split()
@@ -38,7 +37,7 @@ _READABLE = {
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
     "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT", "SET_ASSIGN": "S=",
     "METHOD": "METHOD", "PROPERTY": "PROPERTY", "GET": "GET", "SET": "SET", "MODIFIER": "PUBLIC", "OWN": "THIS^",
-    "USING": "USING",
+    "USING": "USING", "UNION": "UNION", "PACKED": "TYPE",
     "PARTIAL": "%X0", "TYPED_TEXT": "a string", "POINTER": "POINTER TO", "REFERENCE": "REFERENCE TO", "_REF_ASSIGN": "REF=",
 }  # fmt: skip
 

@@ -21,6 +21,11 @@ MAX_SHOWN = 60
 
 _HARMLESS = re.compile(r"\{\s*(attribute|region|endregion|text|info|warning|error)\b", re.IGNORECASE)
 """Pragmas of CODESYS without effect on what a program computes; `qualified_only` is read by `project`."""
+_PACKED = re.compile(
+    r"\{\s*attribute\s+'pack_mode'\s*:=\s*'[01248]'\s*\}(?=(?:\s|\{[^}]*\}|//[^\n]*\n|\(\*.*?\*\))*TYPE\b)",
+    re.IGNORECASE | re.DOTALL,
+)
+"""The pragma of CODESYS that states how the members of the type after it are packed. It is a token of the grammar."""
 _MARKS = re.compile(r"""\(\*|\*\)|/\*|\*/|//[^\n]*|'|"|\{""")
 _CLOSING = {"(*": "*)", "/*": "*/"}
 _ENDS = {quote: re.compile(rf"[{quote}\n]|\$.", re.DOTALL) for quote in "'\""}
@@ -71,7 +76,8 @@ def blanked(text: str, path: str = "", dialect: Dialect = STANDARD, warnings: li
             else:
                 end = found.end() if mark.startswith("//") else _end_of_comment(text, found, path)
             out.append(text[at:start])
-            out.append(_NOT_A_LINE.sub(" ", text[start:end]))
+            packed = dialect.vendor and conditions.active and _PACKED.match(text, start)
+            out.append(text[start:end] if packed else _NOT_A_LINE.sub(" ", text[start:end]))
         at = end
     if conditions.parts:
         raise _error(text, conditions.parts[-1].at, "an {IF} that does not end", path, hint="write {END_IF}")

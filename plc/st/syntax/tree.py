@@ -127,13 +127,18 @@ class Within:
 
 @dataclass(frozen=True, slots=True)
 class StructDecl:
-    """A structure. `extends` is the name after EXTENDS, in the dialects of CODESYS, if any."""
+    """A structure or a union. `extends` is the name after EXTENDS, in the dialects of CODESYS, if any.
+
+    `packed` is the largest multiple of bytes at which a field begins in memory.
+    """
 
     pos: Pos
     name: str
     fields: tuple[VarDecl, ...]
     within: Within = Within()
     extends: tuple[NamedType, ...] = ()
+    union: bool = False
+    packed: int = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,6 +185,33 @@ def test_members_of_blocks_structures_arrays_and_global_variables_keep_their_val
     assert plc.value("meters[1].scans") == 21
 
 
+UNIONS = f"""{BLOCKS}
+TYPE Data : UNION word : WORD; real : REAL; END_UNION END_TYPE
+TYPE Pair : STRUCT data : Data; n : INT; END_STRUCT END_TYPE
+"""
+
+
+def test_a_union_keeps_its_bytes_if_its_members_are_the_same(tmp_path: Path) -> None:
+    body = edited(
+        ("mode : Mode;", "mode : Mode; data : Data; pairs : ARRAY[0..1] OF Pair;"),
+        (
+            "n := n + 1;",
+            "IF n = 0 THEN data.real := 1.5; pairs[1].data.word := 16#1234; pairs[1].n := 4; END_IF n := n + 1;",
+        ),
+    )
+    programs = (program("control", dialect="codesys"),)
+    plc = Plc(tmp_path, body, UNIONS, programs=programs)
+    plc.until(30)
+    plc.change(edited(("n := n + 1;", "n := n + 2;"), text=body), UNIONS)
+    assert (plc.value("data.real"), plc.value("pairs[1].data.word"), plc.value("pairs[1].n")) == (1.5, 0x1234, 4)
+    change = plc.change(body, edited(("word : WORD; real", "word : WORD; dint : DINT; real"), text=UNIONS))
+    assert (plc.value("data.real"), plc.value("pairs[1].data.word"), plc.value("pairs[1].n")) == (0.0, 0, 4)
+    assert change.changes[0].differences.changed == [
+        "data (the members of Data differ)",
+        "Pair.data (the members of Data differ)",
+    ]
+
+
 def test_a_member_whose_kind_of_block_changes_begins_with_its_initial_value(tmp_path: Path) -> None:
     plc = Plc(tmp_path)
     plc.until(100)

@@ -14,6 +14,7 @@ import pytest
 from st_bench import program, run, value
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.compiler.functions.memory import MEMORY
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
 from fieldtwin.plc.st.types import ELEMENTARY
 
@@ -116,10 +117,10 @@ WITH_A_VARIABLE = {
 }  # fmt: skip
 """Functions of this PLC that refer to an input or a mailbox of the program."""
 ELSEWHERE = {"CONCAT_DT", "CONCAT_LDT", "SPLIT_DATE", "SPLIT_TOD", "SPLIT_LTOD", "SPLIT_DT", "SPLIT_LDT",
-             "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF", "__QUERYINTERFACE",
-             "NOT"}  # fmt: skip
+             *MEMORY.names(), "REF", "ADR", "LOWER_BOUND", "UPPER_BOUND", "SIZEOF", "XSIZEOF", "__ISVALIDREF",
+             "__QUERYINTERFACE", "NOT"}  # fmt: skip
 """Functions with outputs, or with seven parameters, which have too many orders, and functions of variables. They are in
-test_st_dates_and_bcd.py, test_st_references.py, test_st_pointers.py and test_st_open_arrays.py."""
+test_st_dates_and_bcd.py, test_st_references.py, test_st_pointers.py, test_st_copied_memory.py and test_st_open_arrays.py."""
 ALL = {**SAMPLES, **CONVERSIONS}
 
 

@@ -278,10 +278,3 @@ def test_a_conversion_of_a_number_that_does_not_fit_stops_the_task() -> None:
             codesys("n : INT;", f"n := STRING_TO_INT('{text}');")
     with pytest.raises(LogicError, match="not a whole number"):
         run("n : INT;", "n := STRING_TO_INT('12abc');")
-
-
-def test_a_union_is_refused_by_name() -> None:
-    with pytest.raises(FileInvalid, match=r"unions \(UNION\) are not supported"):
-        program(
-            "TYPE Bits : UNION whole : DWORD; part : WORD; END_UNION END_TYPE PROGRAM p END_PROGRAM", "p", "codesys"
-        )

@@ -21,14 +21,14 @@ def _ref(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 
 @REFERENCES.add("ADR", takes=ONE)
 def _adr(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-    _only_in_dialects(x, call, "the standard has REF")
+    only_in_dialects(x, call, "the standard has REF")
     return adr(x, given[0])
 
 
 @REFERENCES.add("SIZEOF", "XSIZEOF", takes=ONE)
 def _sizeof(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     """Write the size of a variable or of a type, which is known to the compiler."""
-    _only_in_dialects(x, call, "")
+    only_in_dialects(x, call, "")
     (expr,) = given
     if not isinstance(expr, t.Ref):
         x.env.fail(expr.pos, f"the argument of {call.ref.name}", expected="a variable or a type")
@@ -43,7 +43,7 @@ def _sizeof(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 
 @REFERENCES.add("__ISVALIDREF", takes=ONE)
 def _is_valid(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-    _only_in_dialects(x, call, "")
+    only_in_dialects(x, call, "")
     (expr,) = given
     found = place(x, expr) if isinstance(expr, t.Ref) else None
     if found is None or not (isinstance(found.type, ty.Pointer) and found.type.word == REFERENCE):
@@ -54,7 +54,7 @@ def _is_valid(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 @REFERENCES.add("__QUERYINTERFACE", takes=Formals(("IN", "OUT")))
 def _query_interface(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     """Write the assignment of an instance to a variable of an interface; the result is whether the instance implements it."""
-    _only_in_dialects(x, call, "the standard has ?=")
+    only_in_dialects(x, call, "the standard has ?=")
     source, target = given
     kind = x.type_of(target) if isinstance(target, t.Ref) else None
     if not (isinstance(target, t.Ref) and isinstance(kind, ty.Interface)):
@@ -65,7 +65,8 @@ def _query_interface(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     return Value(f"({found} is not None)", ty.BOOL)
 
 
-def _only_in_dialects(x: Compiling, call: t.Call, instead: str) -> None:
+def only_in_dialects(x: Compiling, call: t.Call, instead: str) -> None:
+    """Raise `FileInvalid` for a call in a dialect without this function. `instead` is what the standard has, if anything."""
     if not x.env.dialect.vendor:
         hint = "; ".join(each for each in (instead, "the dialects codesys and twincat accept it") if each)
         x.env.fail(call.pos, f"{call.ref.name.upper()} is not in the standard", hint=hint)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fieldtwin.plc.st.compiler.functions.arrays import ARRAYS
 from fieldtwin.plc.st.compiler.functions.conversions import conversion
 from fieldtwin.plc.st.compiler.functions.library import ONE, Library, Standard
+from fieldtwin.plc.st.compiler.functions.memory import MEMORY
 from fieldtwin.plc.st.compiler.functions.numbers import NUMBERS
 from fieldtwin.plc.st.compiler.functions.references import REFERENCES
 from fieldtwin.plc.st.compiler.functions.scan import SCAN
@@ -21,4 +22,4 @@ class _Functions(Library):
         return found
 
 
-FUNCTIONS = _Functions(NUMBERS, ARRAYS, TIMES, STRINGS, SCAN, REFERENCES)
+FUNCTIONS = _Functions(NUMBERS, ARRAYS, TIMES, STRINGS, SCAN, REFERENCES, MEMORY)

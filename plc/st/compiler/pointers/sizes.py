@@ -1,7 +1,8 @@
 """The sizes of variables in bytes, as SIZEOF and the arithmetic of pointers count them in the dialects of CODESYS.
 
 A member of a structure begins at a multiple of the size of its type, and a structure ends at a multiple of its largest member, as
-in CODESYS 3 and TwinCAT 3. TIME and the dates have 4 bytes there, although they have 8 in this PLC.
+in CODESYS 3 and TwinCAT 3; ``{attribute 'pack_mode' := '1'}`` before the type leaves no gaps. TIME and the dates have 4 bytes
+there, although they have 8 in this PLC.
 """
 
 from __future__ import annotations
@@ -36,10 +37,19 @@ def _layout(env: Environment, kind: ty.Type, pos: Pos) -> tuple[int, int]:
         size, step = _layout(env, kind.of, pos)
         return size * prod(high - low + 1 for low, high in kind.ranges), step
     if isinstance(kind, ty.Struct):
-        end, widest = 0, 1
-        for _, of in kind.fields.values():
-            size, step = _layout(env, of, pos)
-            end = -(-end // step) * step + size
-            widest = max(widest, step)
-        return -(-end // widest) * widest, widest
+        size, step, _ = places_of(env, kind, pos)
+        return size, step
     raise env.error(pos, f"the size of a {kind} depends on the controller and is not supported")
+
+
+def places_of(env: Environment, kind: ty.Struct, pos: Pos) -> tuple[int, int, dict[str, int]]:
+    """Return the size of a structure or union, the multiple of bytes at which it begins, and the first byte of each member."""
+    end, used, widest = 0, 0, 1
+    places = {}
+    for name, (_, of) in kind.fields.items():
+        size, step = _layout(env, of, pos)
+        step = min(step, kind.packed)
+        places[name] = 0 if kind.union else -(-end // step) * step
+        end = places[name] + size
+        used, widest = max(used, end), max(widest, step)
+    return -(-used // widest) * widest, widest, places

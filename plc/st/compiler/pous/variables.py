@@ -192,6 +192,9 @@ class Variables:
 
     def _symbol(self, v: t.VarDecl, block: t.VarBlock, code: str) -> Symbol:
         kind = self.declarations.type_of(v.type, block.kind)
+        if v.location and ty.holds_union(kind):
+            hint = "declare a variable at the address, and assign it to a member of the union"
+            self.env.fail(v.pos, f"{v.name} is or contains a union and has an address", hint=hint)
         if "CONSTANT" not in block.qualifiers:
             is_input = block.kind == "VAR_INPUT" or (area_of(v.location) == "I" and block.kind != "VAR_GLOBAL")
             return Symbol(v.name, kind, code, writable=not is_input, is_input=is_input)

@@ -33,7 +33,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
     negated,
     width,
 )
-from fieldtwin.plc.st.runtime import moments
+from fieldtwin.plc.st.runtime import copying, layouts, moments
 from fieldtwin.plc.st.runtime.references import MemberReference
 
 _OPERATORS: dict[type, str] = {
@@ -303,6 +303,12 @@ class Evaluation:
         name, module = getattr(function, "__name__", ""), getattr(function, "__module__", None)
         if module in (values.__name__, moments.__name__) and not isinstance(function, type):
             return self._of_values(function, name, given, dict(named or {}))
+        if isinstance(function, type) and issubclass(function, layouts.Union):
+            raise NotModelled("a union")
+        if module == layouts.__name__:
+            return function(*given)
+        if module == copying.__name__:
+            raise NotModelled(str(given[0]))
         if isinstance(function, type) and function not in (bool, int, float, range, str, zip):
             return function(*given, **(named or {}))
         if self.sources.is_own(function) or ((module or "").startswith("fieldtwin.") and name != "is_good"):

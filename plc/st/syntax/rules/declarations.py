@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from lark import Token, v_args
@@ -47,13 +48,20 @@ class DeclarationRules(Rules):
         return self.var_decl(meta, items)
 
     def type_block(self, meta: Meta, items: list[Any]) -> list[Any]:
-        return items
+        if not (items and isinstance(items[0], Token)):
+            return items
+        pragma, *types = items
+        packed = max(1, int(pragma.rstrip("} \t\n")[-2]))
+        return [replace(one, packed=packed) if isinstance(one, t.StructDecl) else one for one in types]
 
     def struct_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
         name, *rest = items
         fields = tuple(v for group in rest if isinstance(group, list) for v in group)
         bases = next((i.names for i in rest if isinstance(i, Bases)), ())
         return t.StructDecl(self._pos(name), str(name), fields, extends=bases)
+
+    def union_decl(self, meta: Meta, items: list[Any]) -> t.StructDecl:
+        return replace(self.struct_decl(meta, items), union=True)
 
     def enum_decl(self, meta: Meta, items: list[Any]) -> t.EnumDecl:
         name, *rest = items

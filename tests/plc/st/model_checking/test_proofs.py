@@ -308,6 +308,24 @@ def test_a_construct_without_a_model_is_refused_by_name(text: str, what: str) ->
         proved(text)
 
 
+UNION = "TYPE U : UNION w : WORD; b : BYTE; END_UNION END_TYPE"
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (f"{UNION} PROGRAM P VAR u : U; END_VAR u.w := 1; END_PROGRAM", "no model of a union: u"),
+        (f"{UNION} FUNCTION F : INT VAR u : U; END_VAR u.w := 1; END_FUNCTION PROGRAM P VAR n : INT; END_VAR n := F(); "
+         "END_PROGRAM",
+         r":1:\d+: .*no model of a union"),
+        ("PROGRAM P VAR a, b : INT; END_VAR MEMCPY(ADR(a), ADR(b), 2); END_PROGRAM", r":1:\d+: .*no model of MEMCPY"),
+    ],
+)  # fmt: skip
+def test_memory_that_variables_share_is_refused_by_name(text: str, what: str) -> None:
+    with pytest.raises(FileInvalid, match=what):
+        proved(text, dialect=dialect_of("codesys"))
+
+
 TEXT = "PROGRAM P VAR_INPUT n : INT; on : BOOL; END_VAR VAR s : STRING; b : BOOL; i : INT; END_VAR {} END_PROGRAM"
 
 

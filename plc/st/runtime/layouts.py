@@ -90,7 +90,7 @@ class Letter:
 class Text:
     """The layout of a STRING with `length` characters of `width` bytes, and a 0 after them.
 
-    A text ends at the first 0. What follows keeps its value when a shorter text is written.
+    A text ends at the first 0. The bytes after the 0 keep their values when a shorter text is written.
     """
 
     def __init__(self, length: int, width: int) -> None:
@@ -241,7 +241,7 @@ class StructureInMemory(Overlay):
 
 
 class Union(Overlay):
-    """A union. Without arguments, it has a memory of its own with the initial values of the members."""
+    """A union. Without arguments, a union has its own memory, with the initial values of the members."""
 
     __slots__ = ()
 

@@ -3,7 +3,7 @@
 Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
 the user's file. Bodies in FBD and LD become statements of the tree (`networks`), and bodies in SFC become charts (`charts`).
 A POU, an action or a type with a part that is not supported is left out and listed in `Export.missing`. Drawings and vendors'
-additions are ignored.
+additions are ignored, except methods, properties, bases and qualifiers of CODESYS.
 """
 
 from __future__ import annotations
@@ -31,6 +31,11 @@ _QUALIFIED = re.compile(
 )
 """A name before a dot; comments and strings are skipped."""
 _POUS = {"program": "PROGRAM", "function": "FUNCTION", "functionBlock": "FUNCTION_BLOCK"}
+_ACCESSORS = {"GetAccessor": "GET", "SetAccessor": "SET"}
+_QUALIFIERS = {"constant": "CONSTANT", "retain": "RETAIN", "persistent": "PERSISTENT", "nonretain": "NON_RETAIN"}
+"""The attributes of a block of variables."""
+_MODIFIERS = ("Public", "Protected", "Private", "Internal", "Final")
+"""The attributes of an element AccessModifiers."""
 _LANGUAGES = ("ST", "FBD", "LD", "SFC", "IL")
 
 
@@ -74,8 +79,10 @@ class _Converter:
         for pou in self.project.every("pou"):
             with self._whole(pou, _kind(pou).lower().replace("_", " "), pou.attributes.get("name", "")):
                 self._pou(pou)
+        parts = {id(b) for mixed in self.project.every("MixedAttrsVarList") for b in mixed.children}
         for block in self.project.every("globalVars"):
-            self._variables(block)
+            if id(block) not in parts:
+                self._variables(block)
         programs = {
             pou.attributes.get("name", "").lower() for pou in self.project.every("pou") if _kind(pou) == "PROGRAM"
         }
@@ -147,11 +154,11 @@ class _Converter:
             raise self._fail(
                 pou, "a POU of unknown kind", expected=", ".join(_POUS), got=pou.attributes.get("pouType", "")
             )
-        for found in pou.every("Property"):
-            raise self._unsupported(found, f"{self._name(pou)} has a property, which is not supported")
         interface = pou.find("interface")
         result = interface.inside("returnType") if kind == "FUNCTION" and interface is not None else []
         self._put(pou.line, f"{kind} {self._name(pou)}" + (f" : {self._type_of(result[0])}" if result else ""))
+        for base in interface.every("Extends") if interface is not None else ():
+            self._put(pou.line, f"EXTENDS {''.join(text for _, text in base.texts()).strip()}")
         for block in interface.children if interface else ():
             if block.tag in _BLOCKS:
                 self._variables(block)
@@ -162,26 +169,46 @@ class _Converter:
                 self._body(pou, part)
             elif part.tag == "actions":
                 self._actions(pou, part)
-        for method in pou.every("Method"):
-            self._method(pou, method)
+        for added in sorted((*pou.every("Method"), *pou.every("Property")), key=lambda one: (one.line, one.column)):
+            (self._method if added.tag == "Method" else self._property)(pou, added)
         self._put(pou.end_line, f"END_{kind}")
 
     def _method(self, pou: Element, method: Element) -> None:
         """Write a method, which CODESYS adds to a POU after its body."""
-        name, interface, body = self._name(method), method.find("interface"), method.find("body")
-        of = f"{self._name(pou)}.{name}"
+        name, interface = self._name(method), method.find("interface")
+        result = interface.inside("returnType") if interface is not None else []
+        kind = f" : {self._type_of(result[0])}" if result else ""
+        self._put(method.line, f"METHOD {_modifiers(method) or 'PUBLIC'} {name}{kind}")
+        self._own_body(pou, method, f"the method {self._name(pou)}.{name}")
+        self._put(method.end_line, "END_METHOD")
+
+    def _property(self, pou: Element, found: Element) -> None:
+        """Write a property, which CODESYS adds in the same way as a method. Its accessors stand in any order."""
+        name, interface = self._name(found), found.find("interface")
+        of = f"the property {self._name(pou)}.{name}"
+        result = interface.inside("returnType") if interface is not None else []
+        accessors = [part for part in found.children if part.tag in _ACCESSORS]
+        if not result or not accessors:
+            raise self._unsupported(found, f"{of} has no type and no accessor, which is not supported")
+        self._put(found.line, f"PROPERTY {_modifiers(found) or 'PUBLIC'} {name} : {self._type_of(result[0])}")
+        for accessor in accessors:
+            word = _ACCESSORS[accessor.tag]
+            self._put(accessor.line, f"{word} {_modifiers(accessor)}".strip())
+            self._own_body(pou, accessor, f"{word} of {of}")
+            self._put(accessor.end_line, f"END_{word}")
+        self._put(found.end_line, "END_PROPERTY")
+
+    def _own_body(self, pou: Element, part: Element, of: str) -> None:
+        """Write the variables and the body of a method or an accessor `of` a POU."""
+        interface, body, whole = part.find("interface"), part.find("body"), pou.find("interface")
         text = body.find("ST") if body is not None else None
         if interface is None or text is None:
-            raise self._unsupported(method, f"the method {of} has no interface and body in ST, which is not supported")
-        result = interface.inside("returnType")
-        self._put(method.line, f"METHOD PUBLIC {name}" + (f" : {self._type_of(result[0])}" if result else ""))
+            raise self._unsupported(part, f"{of} has no interface and body in ST, which is not supported")
         for block in interface.children:
             if block.tag in _BLOCKS:
                 self._variables(block)
-        whole = pou.find("interface")
         variables = [*interface.every("variable"), *(whole.every("variable") if whole is not None else ())]
         self._statements(text, {v.attributes.get("name", "").lower() for v in variables})
-        self._put(method.end_line, "END_METHOD")
 
     def _actions(self, pou: Element, actions: Element) -> None:
         for action in actions.children:
@@ -203,14 +230,16 @@ class _Converter:
                     self._put(action.end_line, "END_ACTION")
 
     def _variables(self, block: Element) -> None:
+        """Write a block of variables. CODESYS adds its parts with different qualifiers, such as CONSTANT, if it has several."""
         if block.tag == "globalVars":
             self.last = block.line
+        if mixed := next(block.every("MixedAttrsVarList"), None):
+            for part in mixed.children:
+                if part.tag in _BLOCKS:
+                    self._variables(part)
+            return
         words = [_BLOCKS[block.tag]]
-        words += [
-            word
-            for flag, word in (("constant", "CONSTANT"), ("retain", "RETAIN"))
-            if block.attributes.get(flag) == "true"
-        ]
+        words += [word for flag, word in _QUALIFIERS.items() if block.attributes.get(flag) == "true"]
         self._put(block.line, " ".join(words))
         for v in block.children:
             if v.tag == "variable":
@@ -321,6 +350,13 @@ class _Converter:
             return name + mark + found[0][len(name) + 1 :] if mark else " " * len(found[0])
 
         return _QUALIFIED.sub(standard, text)
+
+
+def _modifiers(element: Element) -> str:
+    """Return the access and other modifiers of a method, a property or an accessor; "" for none."""
+    found = {word for interface in (element.find("interface"),) if interface for one in interface.every("AccessModifiers")
+             for word, value in one.attributes.items() if value == "true"}  # fmt: skip
+    return " ".join(word.upper() for word in _MODIFIERS if word in found)
 
 
 def _kind(pou: Element) -> str:

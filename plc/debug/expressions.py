@@ -14,6 +14,7 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.classes.instance_variables import beginning
 from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.classes.members import method_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
@@ -119,8 +120,8 @@ def instance_variables(pou: str, symbols: Iterable[Symbol]) -> list[Symbol]:
     method, accessor = pou, "method"
     if pou.rpartition(".")[2] in ("get", "set"):
         method, _, accessor = pou.rpartition(".")
-    before = f"0inst_{accessor}_{method.rpartition('.')[2]}_"
-    return [replace(one, name=one.name.removeprefix(before)) for one in symbols if one.name.startswith(before)]
+    before = beginning(accessor, method.rpartition(".")[2]).lower()
+    return [replace(one, name=one.name[len(before) :]) for one in symbols if one.name.lower().startswith(before)]
 
 
 def known_part(key: str, known: Container[str]) -> str:

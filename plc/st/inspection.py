@@ -1,6 +1,7 @@
 """The variables of a running program that are not tags, by their paths: members of blocks and structures, arrays, strings.
 
-A path is written as in the source: ``delay.ET``, ``levels[3]``, ``pumps[2].hours``, in any case of letters.
+A path is written as in the source: ``delay.ET``, ``levels[3]``, ``pumps[2].hours``, in any case of letters. The VAR_INST ``n`` of
+a method ``Next`` is ``pump.Next.n``, in an instance of the method's owner.
 Nothing is changed, and only the wanted variables are read, because this happens between two scans.
 """
 
@@ -15,11 +16,13 @@ from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import InternalVariable
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
+from fieldtwin.plc.st.classes.instance_variables import is_instance_variable, own_name, shown_name
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 
 SHOWN_ELEMENTS = 6
 """How many elements of an array are shown in one text."""
 _STEP = re.compile(r"\.(\w+)|\[\s*(-?\d+(?:\s*,\s*-?\d+)*)\s*\]")
+_MEMBER = re.compile(r"\.(\w+)")
 _DATES: dict[str, Callable[[int], str]] = {
     "date": values.date_text,
     "tod": values.tod_text,
@@ -44,7 +47,7 @@ class Inspection:
 
     def find(self, body: Any, path: str) -> InternalVariable | None:
         """Return the variable with this path in `body`, and None for a path that names no variable, or one with members."""
-        name, rest = first_name(path)
+        name, rest = self.first(path)
         top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
         if top is None:
             return None
@@ -60,9 +63,20 @@ class Inspection:
             step = _STEP.match(rest, at)
             if step is None:
                 return None
-            at = step.end()
-            found = self._member(found, step[1]) if step[1] else _element(found, step[2])
+            member, at = self._with_method(found[0], step, rest)
+            found = self._member(found, member) if member else _element(found, step[2])
         return found
+
+    def first(self, path: str) -> tuple[str, str]:
+        """Return the name of the variable with which a path begins, also that of a VAR_INST, and the rest."""
+        name, rest = first_name(path)
+        name, at = _joined(name, rest, 0, self._variables)
+        return name, rest[at:]
+
+    def _with_method(self, kind: ty.Type, step: re.Match[str], rest: str) -> tuple[str, int]:
+        """Return the member that a step selects, with the name of its method if it is a VAR_INST, and where the step ends."""
+        declared = self._blocks.get(kind.name.lower(), ()) if isinstance(kind, ty.Block) else ()
+        return _joined(step[1], rest, step.end(), declared) if step[1] else ("", step.end())
 
     def assigning(self, owner: Typed, step: str) -> Callable[[Any], None] | None:
         """Return the function that assigns a part of `owner`, such as ``.PT`` or ``[3]``.
@@ -99,9 +113,9 @@ class Inspection:
 
     def code(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes and indices of a path, such as ``v_levels[2]``, and its type; None for an unknown path."""
-        name, rest = first_name(path)
+        name, rest = self.first(path)
         top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
-        return self.code_within(f"v_{name.lower()}", top[1], rest) if top is not None else None
+        return self.code_within(f"v_{own_name(name).lower()}", top[1], rest) if top is not None else None
 
     def code_within(self, code: str, kind: ty.Type, rest: str) -> tuple[str, ty.Type] | None:
         """Return the Python code and the type of a part of a variable, whose own `code` and `kind` are given, as `code` does."""
@@ -110,9 +124,9 @@ class Inspection:
             step = _STEP.match(rest, at)
             if step is None:
                 return None
-            at = step.end()
-            if step[1]:
-                member = self._member_attribute(kind, step[1])
+            named, at = self._with_method(kind, step, rest)
+            if named:
+                member = self._member_attribute(kind, named)
                 if member is None:
                     return None
                 code, kind = f"{code}.{member[0]}", member[1]
@@ -132,7 +146,8 @@ class Inspection:
             return None
         if kind.standard is not None:
             return {**kind.inputs, **kind.outputs}.get(key)
-        return next(((f"v_{key}", of) for name, of in self._blocks[kind.name.lower()] if name.lower() == key), None)
+        own = own_name(key)
+        return next(((f"v_{own}", of) for name, of in self._blocks[kind.name.lower()] if name.lower() == key), None)
 
     def variables_of(self, kind: ty.Block) -> Sequence[tuple[str, ty.Type]]:
         """Return the variables of a function block of the user, with their types."""
@@ -171,7 +186,17 @@ class Inspection:
 
 def _declared(variables: Sequence[tuple[str, ty.Type]]) -> list[tuple[str, ty.Type]]:
     """Return the variables that a source declares. The compiler adds blocks for drawn edges, whose names begin with a number."""
-    return [(name, kind) for name, kind in variables if not name[0].isdigit()]
+    return [(shown_name(name), kind) for name, kind in variables if not name[0].isdigit() or is_instance_variable(name)]
+
+
+def _joined(name: str, rest: str, at: int, declared: Sequence[tuple[str, ty.Type]]) -> tuple[str, int]:
+    """Return a name with the members after it, from `at` on, that belong to the name of a VAR_INST, and where these end."""
+    while any(known.lower().startswith(f"{name.lower()}.") for known, _ in declared):
+        following = _MEMBER.match(rest, at)
+        if following is None:
+            break
+        name, at = f"{name}.{following[1]}", following.end()
+    return name, at
 
 
 def first_name(path: str) -> tuple[str, str]:
@@ -187,7 +212,7 @@ def last_step(rest: str) -> tuple[str, str]:
 
 
 def _of(body: Any, name: str) -> Any:
-    return getattr(body, f"v_{name.lower()}")
+    return getattr(body, f"v_{own_name(name).lower()}")
 
 
 def _element(found: Typed, index: str) -> Typed | None:

@@ -29,6 +29,7 @@ from fieldtwin.plc.program import (
 )
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
+from fieldtwin.plc.st.classes.instance_variables import is_instance_variable
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
@@ -371,7 +372,8 @@ def program_class(
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )
     named = instance.name if instance is not None and connected else ""
-    return _class_of(unit, found, decided, tags, frozenset(), named, pictures)
+    internal = frozenset(v.name for v in found.variables if is_instance_variable(v.name))
+    return _class_of(unit, found, decided, tags, internal, named, pictures)
 
 
 def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:
@@ -429,7 +431,7 @@ def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:
     if isinstance(v.kind, ty.MessagesOut):
         return message_output(v.kind.max_bytes, v.kind.depth)  # type: ignore[no-any-return]
     kind = _tag_kind(v.kind)
-    if kind is None:
+    if kind is None or is_instance_variable(v.name):
         return None
     return Variable(
         v.name,

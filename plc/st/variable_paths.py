@@ -10,6 +10,7 @@ from typing import Any
 
 from fieldtwin.plc.program import InternalVariable
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.classes.instance_variables import shown_name
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
 from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable
@@ -26,7 +27,7 @@ class VariablePaths:
         self._hidden = Inspection(unit, [(v.name, v.kind) for v in hidden])
         self._every = Inspection(unit, [(v.name, v.kind) for v in program.variables if not v.shared and not v.steps])
         self._shared = {v.name.lower(): v for v in program.variables if v.shared and not v.steps}
-        self._own = {v.name.lower(): v for v in program.variables if not v.steps}
+        self._own = {shown_name(v.name).lower(): v for v in program.variables if not v.steps}
         self._globals = _globals_of(unit, program)
 
     def internal_names(self, body: Any, shared: Any) -> Iterator[str]:
@@ -56,7 +57,7 @@ class VariablePaths:
 
     def typed(self, path: str, body: Any, shared: Any) -> Typed | None:
         """Return the type and the value of any variable, also of a structure or block; None for a path that names none."""
-        name, rest = first_name(path)
+        name, rest = self._every.first(path)
         of = self._own.get(name.lower())
         if of is not None:  # without steps, the attribute is a name
             return self.within((of.kind, getattr(shared if of.shared else body, str(of.attribute))), rest)

@@ -1,11 +1,13 @@
 """Variables of a method that keep their values (``VAR_INST``), an addition of CODESYS and TwinCAT to the standard.
 
 Each instance of the owner has such a variable. So it is translated into a variable of the owner, whose name begins with 0, so no
-source can contain it.
+source can contain it. Users see it as a part of the owner: ``pump.Next.n`` is the variable ``n`` of the method ``Next``, and
+``pump.Level.Get.n`` one of a property.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +18,7 @@ from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import with_parts
 
 _KIND = "VAR_INST"
+_NAME = re.compile(r"0inst_(\w+?)(\d+)_(.+)")
 
 
 def without_instance_variables(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit:
@@ -35,6 +38,31 @@ def without_instance_variables(unit: t.SourceUnit, dialect: Dialect) -> t.Source
     return replace(unit, pous=tuple(pous))
 
 
+def beginning(kind: str, method: str) -> str:
+    """Return with what the names of a method's variables begin in its owner. `kind`: METHOD, GET or SET."""
+    return f"0inst_{kind.lower()}{len(method)}_{method}_"  # the length, because names may contain underscores
+
+
+def is_instance_variable(name: str) -> bool:
+    """Return whether a variable of a POU is the VAR_INST of one of its methods."""
+    return _NAME.fullmatch(name) is not None
+
+
+def shown_name(name: str) -> str:
+    """Return the name of a variable of a POU as users see it: ``Next.n`` for a VAR_INST, any other unchanged."""
+    found = _NAME.fullmatch(name)
+    if found is None:
+        return name
+    method, variable = found[3][: int(found[2])], found[3][int(found[2]) + 1 :]
+    return f"{method}.{variable}" if found[1] == "method" else f"{method}.{found[1].capitalize()}.{variable}"
+
+
+def own_name(shown: str) -> str:
+    """Return the name in the POU of a variable that users see as `shown`."""
+    method, *accessor, variable = ("", *shown.split(".")) if "." not in shown else shown.split(".")
+    return f"{beginning(accessor[0] if accessor else 'method', method)}{variable}" if method else shown
+
+
 def _moved(pou: t.Pou) -> t.Pou:
     kept: list[t.VarBlock] = []
     methods = []
@@ -42,7 +70,7 @@ def _moved(pou: t.Pou) -> t.Pou:
         names: dict[str, str] = {}
         for block in (b for b in method.blocks if b.kind == _KIND):
             found = {
-                v.name.lower(): f"0inst_{method.kind.lower()}_{method.name.lower()}_{v.name.lower()}"
+                v.name.lower(): f"{beginning(method.kind, method.name)}{v.name}"
                 for v in block.variables
             }
             variables = tuple(replace(v, name=found[v.name.lower()]) for v in block.variables)

@@ -404,6 +404,29 @@ def test_variables_in_var_inst_keep_their_values_in_each_instance() -> None:
             compile_text(refused, "", DIALECTS[dialect])
 
 
+def test_displays_see_variables_in_var_inst_below_their_method_and_no_tags() -> None:
+    made = vendor("""
+        FUNCTION_BLOCK Base
+          METHOD Next_One : INT VAR_INST last_n : INT := 10; after : TON; END_VAR last_n := last_n + 1; Next_One := last_n; END_METHOD
+          PROPERTY Level : INT GET VAR_INST n : INT := 5; END_VAR Level := n; END_GET END_PROPERTY
+        END_FUNCTION_BLOCK
+        PROGRAM Main VAR a : ARRAY[1..2] OF Base; x, y : INT; END_VAR
+          x := a[2].Next_One(); y := Twice();
+        METHOD Twice : INT VAR_INST n : INT; END_VAR n := n + 2; Twice := n; END_METHOD
+        END_PROGRAM""")
+    assert (made.x, made.y) == (11, 2)
+    assert list(made.variables) == ["x", "y"]
+    own = ["Level.Get.n", "Next_One.after.ET", "Next_One.after.IN", "Next_One.after.PT", "Next_One.after.Q"]
+    every = sorted(f"a[{n}].{name}" for n in (1, 2) for name in [*own, "Next_One.last_n"])
+    assert sorted(made.internal_names()) == [*sorted(["Twice.n", *every])]
+    values = {"A[2].next_one.LAST_N": 11, "a[1].Next_One.last_n": 10, "a[1].Level.Get.n": 5, "twice.N": 2}
+    for path, value in values.items():
+        found, reader = made.internal(path), made.variable_reader(path)
+        assert (found.value, reader.read(), found.type) == (value, value, "INT")
+    for unknown in ("a[1].Next_One", "a[1].Next_One.m", "a[1].last_n", "a[1].Level.n", "Twice"):
+        assert (made.internal(unknown), made.variable_reader(unknown)) == (None, None)
+
+
 def test_a_program_has_methods_in_codesys() -> None:
     made = vendor("""PROGRAM Main VAR n : INT; END_VAR
         n := Twice(4);

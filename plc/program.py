@@ -107,6 +107,8 @@ class Variable:
     address: str = ""
     needs_tag: bool = True
     located: bool = False
+    type: str = ""
+    """The type of the variable in the source; empty if the language of the program has no types of IEC 61131-3."""
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:

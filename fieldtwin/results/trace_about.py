@@ -36,13 +36,15 @@ class CheckAbout(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class VariableAbout(msgspec.Struct, frozen=True, kw_only=True):
-    """A variable of a program. `words` are the names of its values, `tag` is the name under which it is published."""
+    """A variable of a program. `words` are the names of its values, `tag` is the name under which it is published, and `type` its
+    IEC type, empty for a program in Python."""
 
     tag: str
     role: str
     kind: str
     unit: str
     words: dict[str, str] = {}
+    type: str = ""
 
 
 class TransitionAbout(msgspec.Struct, frozen=True, kw_only=True):

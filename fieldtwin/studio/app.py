@@ -28,6 +28,7 @@ from fieldtwin.studio.replay.traces import Traces
 from fieldtwin.studio.scenarios.recordings import Recordings
 from fieldtwin.studio.scenarios.runner import ScenarioRunner
 from fieldtwin.studio.twin.forecast import Forecaster
+from fieldtwin.studio.variables import api as variables
 
 STATIC = Path(__file__).parent / "static"
 OPERATIONS: tuple[Operation, ...] = (
@@ -38,6 +39,7 @@ OPERATIONS: tuple[Operation, ...] = (
     *plc.OPERATIONS,
     *faults.OPERATIONS,
     *alarms.OPERATIONS,
+    *variables.OPERATIONS,
     *scenarios.OPERATIONS,
     *traces.OPERATIONS,
     *campaigns.OPERATIONS,

@@ -44,6 +44,7 @@ def _variables(bound: BoundProgram) -> dict[str, Any]:
             "role": v.role.value,
             "kind": v.kind.value,
             "unit": v.unit,
+            "type": v.type,
             "words": {str(code): word for code, word in v.words},
         }
         for v in bound.program.variables.values()

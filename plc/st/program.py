@@ -444,6 +444,7 @@ def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:
         address=v.location,
         needs_tag=not (v.optional or v.name.lower() in connected),
         located=v.optional,
+        type=str(ty.plain(v.kind)),
     )
 
 

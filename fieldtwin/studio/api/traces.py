@@ -122,6 +122,12 @@ async def get_trace_programs(request: Request) -> dict[str, Any]:
     return msgspec.to_builtins(replay.about.programs) if replay.about is not None else {}
 
 
+async def list_trace_variables(request: Request) -> list[str]:
+    """Return the names of the programs' variables that the run has recorded, as `PROGRAM.VARIABLE`."""
+    replay = await _opened(request)
+    return [name for name in replay.log.states if name.partition(".")[0] in replay.system.plc.programs]
+
+
 async def get_trace_transitions(request: Request) -> dict[str, Any]:
     """Return the last transitions of each program up to an instant, the oldest first."""
     replay = await _opened(request)
@@ -184,6 +190,7 @@ OPERATIONS = (
     ),
     Operation("GET", TRACE + "/frames/{number}", get_trace_frame, "Read one frame of a trace"),
     Operation("GET", f"{TRACE}/plc/programs", get_trace_programs, "Describe the programs of a trace"),
+    Operation("GET", f"{TRACE}/plc/variables", list_trace_variables, "List the variables of programs of a trace"),
     Operation(
         "GET", f"{TRACE}/plc/transitions", get_trace_transitions, "Read the transitions before an instant", (AT,)
     ),

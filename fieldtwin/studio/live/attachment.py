@@ -21,6 +21,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, TagStatus
 from fieldtwin.plc.runtime.about import STATE
 from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE
@@ -36,6 +37,7 @@ from fieldtwin.studio.live.process_image import ProcessImage
 from fieldtwin.studio.live.state_history import StateHistory
 from fieldtwin.studio.live.subscription import Publisher
 from fieldtwin.studio.live.tag_history import Point, TagHistory
+from fieldtwin.studio.live.variable_recorder import VariableRecorder
 from fieldtwin.twin.plant.channel import Channel
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.resolved import read_resolved
@@ -115,6 +117,7 @@ class Attachment:
         self._image = ProcessImage(found.dir)
         self._buckets_ns = 0
         """Time at which the distribution of scan times was last read."""
+        self.variables = VariableRecorder(self.plc_channel, self._task_of, self.now_ns)
         self._nursery = Nursery()
 
     def _read_system(self) -> System:
@@ -131,6 +134,7 @@ class Attachment:
         self._nursery.start(self._repeat("tags", self._read_tags, TAGS_EVERY_S), "tags")
         self._nursery.start(self._repeat("gateway", self._read_gateway, GATEWAY_EVERY_S), "gateway")
         self._nursery.start(self._repeat("plc", self._read_plc, PLC_EVERY_S), "plc")
+        self._nursery.start(self.variables.follow(), "variables")
         if self.record.prototype and not self.record.field_elsewhere:
             self._nursery.start(self._repeat("field", self._read_field, FIELD_EVERY_S), "field")
         if self.frames is not None:
@@ -224,6 +228,28 @@ class Attachment:
             rows += (await self.plc_channel.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
         shown = [{"name": row["tag"], "type": row["kind"], "value": row["value"], "unit": row["unit"]} for row in rows]
         return {"variables": shown, "more": len(names) - len(rows)}
+
+    async def variable_names(self) -> list[str]:
+        """Return the names of the programs' variables that have a value, those that are tags first."""
+        tags = [
+            f"{program}.{name}"
+            for program, described in self.programs.items()
+            for name, about in described["variables"].items()
+            if about["kind"] != TagKind.MESSAGE.value and about["tag"] not in self.secrets
+        ]
+        internal: list[str] = (await self.plc_channel.call("image"))["internal"]
+        return tags + internal
+
+    def is_secret_variable(self, name: str) -> bool:
+        """Return whether a program's variable has the value of a secret tag."""
+        program, _, variable = name.partition(".")
+        described = self.programs.get(program, {"variables": {}})["variables"]
+        return any(of.lower() == variable.lower() and about["tag"] in self.secrets for of, about in described.items())
+
+    def _task_of(self, program: str) -> str:
+        """Return the name of the task of a program, "" for the first one."""
+        form = self.system.plc.programs.get(program)
+        return (form.task if form is not None else None) or ""
 
     async def read_drawings(self) -> dict[str, Any]:
         """Return the drawings of each program: number, name and SVG text."""

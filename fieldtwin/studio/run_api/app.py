@@ -15,6 +15,7 @@ from fieldtwin.studio.api import faults, frames, instances, plc, tags
 from fieldtwin.studio.api_application import api_application
 from fieldtwin.studio.live.gallery import Gallery
 from fieldtwin.studio.scenarios.recordings import Recordings
+from fieldtwin.studio.variables import api as variables
 from fieldtwin.twin.site.servers.serving_http import HttpServeConfig
 
 OPERATIONS = (
@@ -24,6 +25,7 @@ OPERATIONS = (
     *plc.OPERATIONS,
     *faults.OPERATIONS,
     *alarms.OPERATIONS,
+    *variables.OPERATIONS,
 )
 TITLE = "fieldtwin run"
 

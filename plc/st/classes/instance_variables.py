@@ -69,10 +69,7 @@ def _moved(pou: t.Pou) -> t.Pou:
     for method in pou.methods:
         names: dict[str, str] = {}
         for block in (b for b in method.blocks if b.kind == _KIND):
-            found = {
-                v.name.lower(): f"{beginning(method.kind, method.name)}{v.name}"
-                for v in block.variables
-            }
+            found = {v.name.lower(): f"{beginning(method.kind, method.name)}{v.name}" for v in block.variables}
             variables = tuple(replace(v, name=found[v.name.lower()]) for v in block.variables)
             kept.append(replace(block, kind="VAR", variables=variables))
             names.update(found)

@@ -64,6 +64,7 @@ def test_a_state_table_is_described_with_its_initial_state_and_transitions(folde
         "role": "input",
         "kind": "message",
         "unit": "",
+        "type": "",
         "words": {},
     }
 

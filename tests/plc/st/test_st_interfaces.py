@@ -407,7 +407,8 @@ def test_variables_in_var_inst_keep_their_values_in_each_instance() -> None:
 def test_displays_see_variables_in_var_inst_below_their_method_and_no_tags() -> None:
     made = vendor("""
         FUNCTION_BLOCK Base
-          METHOD Next_One : INT VAR_INST last_n : INT := 10; after : TON; END_VAR last_n := last_n + 1; Next_One := last_n; END_METHOD
+          METHOD Next_One : INT VAR_INST last_n : INT := 10; after : TON; END_VAR
+            last_n := last_n + 1; Next_One := last_n; END_METHOD
           PROPERTY Level : INT GET VAR_INST n : INT := 5; END_VAR Level := n; END_GET END_PROPERTY
         END_FUNCTION_BLOCK
         PROGRAM Main VAR a : ARRAY[1..2] OF Base; x, y : INT; END_VAR

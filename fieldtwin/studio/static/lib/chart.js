@@ -3,9 +3,17 @@
 import { html, useEffect, useRef, useState } from "../vendor/preact.js";
 import uPlot from "../vendor/uplot.js";
 import { clock, number, reason } from "./format.js";
+import { completeness, shown } from "./series.js";
 
 const COLOURS = ["#2f77d0", "#c2571a", "#1d8a57", "#8b4fc0", "#b0892a", "#c23b6b", "#2a8fa0", "#6b7280"];
 const HEIGHT = 220;
+const AXIS_PX = 96; // the width of the axis of values; all charts have the same, so that their times are below each other
+const LABEL_PX_OF_UNIT = 24; // of that width, what the unit takes
+const TIMES_PX = 34; // the height of the axis of times
+const NAMES_PX = [7, 24, 170]; // of an axis with names: for each letter, besides, and at most
+const LEVEL_PX = [26, 12]; // the height of a chart with names for each of them, and for how many at most
+const BESIDE_PX = 48; // and what it has above and below
+const NARROW = 600; // on a page that is narrower than this, names take less room
 const NEAR_PX = 6; // a mark as near as this to the pointer is named
 const LABEL_PX = 54; // a narrower gap has no text
 const JUST_BEFORE_NS = 1000;
@@ -25,11 +33,12 @@ function indexAt(points, t) {
 }
 
 /** The value of a series at a time in words. */
-function textAt(points, t, unit) {
+function textAt(series, t, unit) {
+  const { points } = series;
   const point = points[indexAt(points, t)];
   if (!point) return "no value yet";
   const [, value, quality, why] = point;
-  if (isGood(point)) return `${number(typeof value === "boolean" ? value : Number(value))} ${unit}`.trim();
+  if (isGood(point)) return `${number(shown(series, value))} ${unit}`.trim();
   return `${quality}${reason(why) ? `: ${reason(why)}` : ""}`;
 }
 
@@ -69,16 +78,27 @@ function gapsOf(tags, data, started) {
   });
 }
 
+const NO_SERIES = { points: [], now_ns: 0 };
+
+/** The height of a chart: with names, so much that each has a line. */
+const heightOf = (levels) => (levels ? BESIDE_PX + LEVEL_PX[0] * Math.min(Math.max(levels.length, 2), LEVEL_PX[1]) : HEIGHT);
+
+const short = (name, width) => {
+  const most = Math.floor((width - NAMES_PX[1]) / NAMES_PX[0]);
+  return name.length > most ? `${name.slice(0, Math.max(1, most - 1))}…` : name;
+};
+
 /**
- * `data`: by tag {points: [[time in ns, value, quality, reason]], now_ns}. `view`: {zoom: [from, to] in s or null, a, b: cursors in s
+ * `data`: by tag a series (series.js). `range`: the time from and to in s of all charts. `axis`: the width of the axis of values. `view`: {zoom: [from, to] in s or null, a, b: cursors in s
  * or null}, and `setView` changes it. `marks`: [{t_ns, kind, text}]. `instant`: the time in s of a further line, or null.
  */
-function Chart({ started, unit, tags, data, marks = [], view, setView, instant = null }) {
+function Chart({ started, unit, tags, colours, data, range, axis: room, marks = [], view, setView, instant = null }) {
   const place = useRef(null);
   const plot = useRef(null);
   const now = useRef({}); // what the hooks of uPlot draw
   const [near, setNear] = useState("");
-  now.current = { gaps: gapsOf(tags, data, started), marks, view, data, setView, instant };
+  const levels = data[tags[0]]?.levels;
+  now.current = { gaps: gapsOf(tags, data, started), marks, view, data, setView, instant, levels, room };
   useEffect(() => {
     // A canvas takes no variables of the style sheet, so colours are read from elements that use them.
     const colour = (name) => getComputedStyle(place.current.querySelector(`.c-${name}`)).color;
@@ -147,20 +167,23 @@ function Chart({ started, unit, tags, data, marks = [], view, setView, instant =
     plot.current = new uPlot(
       {
         width: place.current.clientWidth,
-        height: HEIGHT,
+        height: heightOf(levels),
         padding: [12, 12, 0, 0],
         cursor: { sync: { key: "trends" }, drag: { x: true, y: false, setScale: false } },
-        scales: { x: { time: false } },
-        axes: [{ ...axis, values: (_, ticks) => ticks.map((t) => clock(t * 1e9).replace(/\.?0+$/, (zeros) => (zeros.includes(".") ? "" : zeros))) }, { ...axis, label: unit, size: 70 }],
+        scales: { x: { time: false }, ...(levels && { y: { range: () => [-0.5, Math.max(1, now.current.levels.length - 1) + 0.5] } }) },
+        axes: [{ ...axis, size: TIMES_PX, values: (_, ticks) => ticks.map((t) => clock(t * 1e9).replace(/\.?0+$/, (zeros) => (zeros.includes(".") ? "" : zeros))) }, { ...axis, ...(levels ? namesAxis(now) : unit
+              ? { label: unit, labelSize: LABEL_PX_OF_UNIT, size: () => now.current.room - LABEL_PX_OF_UNIT }
+              : { size: () => now.current.room }) }],
         series: [
           { label: "time", value: (_, v) => (v === null ? "" : clock(v * 1e9)) },
           ...tags.map((tag, n) => ({
             label: tag,
-            stroke: COLOURS[n % COLOURS.length],
+            stroke: colours[n],
+            ...(levels && { fill: `${colours[n]}1f`, fillTo: 0 }),
             width: 1.8,
             paths: uPlot.paths.stepped({ align: 1 }),
             points: { show: false },
-            value: (u, _v, _series, k) => (k === null || k === undefined ? "" : textAt(now.current.data[tag]?.points ?? [], u.data[0][k] * 1e9 + started, unit)),
+            value: (u, _v, _series, k) => (k === null || k === undefined ? "" : textAt(now.current.data[tag] ?? NO_SERIES, u.data[0][k] * 1e9 + started, unit)),
           })),
         ],
         hooks: {
@@ -195,7 +218,7 @@ function Chart({ started, unit, tags, data, marks = [], view, setView, instant =
       set(seen.a === null || seen.b !== null ? { ...seen, a: at, b: null } : { ...seen, b: at });
     });
     u.over.addEventListener("dblclick", () => now.current.setView({ ...now.current.view, zoom: null, a: null, b: null }));
-    const observer = new ResizeObserver(() => u.setSize({ width: place.current.clientWidth, height: HEIGHT }));
+    const observer = new ResizeObserver(() => u.setSize({ width: place.current.clientWidth, height: heightOf(now.current.levels) }));
     observer.observe(place.current);
     const redraw = () => u.redraw(); // a canvas keeps its colours when the theme changes
     const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -211,31 +234,56 @@ function Chart({ started, unit, tags, data, marks = [], view, setView, instant =
   }, []);
   useEffect(() => {
     const u = plot.current;
+    const height = heightOf(levels);
+    if (u.height !== height) u.setSize({ width: place.current.clientWidth, height });
     u.batch(() => {
-      u.setData(joined(tags, data, started), view.zoom === null);
-      if (view.zoom !== null) u.setScale("x", { min: view.zoom[0], max: view.zoom[1] });
+      u.setData(joined(tags, data, started), false);
+      const [min, max] = view.zoom ?? range;
+      u.setScale("x", { min, max: Math.max(max, min + 1e-6) });
     });
-  }, [data, marks, view, instant]);
+  }, [data, marks, view, instant, range.join(), room]);
+  const complete = tags.map((tag) => data[tag] && completeness(tag, data[tag])).filter(Boolean);
   return html`<section class="trend" aria-label="Trend of ${tags.join(", ")}">
     <div ref=${place}>
       <div class="plot"></div>
       ${["ink", "edge", "gap", "bad", "mark-fault", "mark-cleared", "mark-state"].map((name) => html`<i class="c-${name}" hidden></i>`)}
     </div>
-    <p class="mark-note" role="status">${near}</p>
+    <footer>${complete.length > 0 && html`<p class="scans">${complete.join(" · ")}</p>`}<p class="mark-note" role="status">${near}</p></footer>
   </section>`;
 }
 
-/** A chart for each unit. */
-export function Charts({ tags, unitOf, ...others }) {
-  const byUnit = new Map();
-  for (const tag of tags) byUnit.set(unitOf(tag), [...(byUnit.get(unitOf(tag)) ?? []), tag]);
-  return [...byUnit].map(([unit, some]) => html`<${Chart} key=${some.join()} unit=${unit} tags=${some} ...${others} />`);
+/** An axis with the names of levels, of which every n-th is shown if there are many. */
+const namesAxis = (now) => ({
+  size: () => now.current.room,
+  grid: { show: false },
+  splits: () => {
+    const { levels } = now.current;
+    const every = Math.ceil(levels.length / LEVEL_PX[1]);
+    return levels.map((_, n) => n).filter((n) => n % every === 0);
+  },
+  values: (_, splits) => splits.map((n) => short(now.current.levels[n] ?? "", now.current.room)),
+});
+
+/** A chart for each unit, and one for each series of values with names. */
+export function Charts({ tags, data, ...others }) {
+  const groups = new Map();
+  for (const tag of tags) {
+    const key = data[tag]?.levels ? `names of ${tag}` : (data[tag]?.unit ?? "");
+    groups.set(key, [...(groups.get(key) ?? []), tag]);
+  }
+  const longest = Math.max(0, ...tags.flatMap((tag) => data[tag]?.levels ?? []).map((name) => name.length));
+  const [least, most] = innerWidth < NARROW ? [AXIS_PX - 20, AXIS_PX] : [AXIS_PX, NAMES_PX[2]];
+  const axis = Math.min(most, Math.max(least, longest * NAMES_PX[0] + NAMES_PX[1]));
+  return [...groups].map(
+    ([key, some]) => html`<${Chart} key=${`${key} ${some.join()}`} unit=${data[some[0]]?.unit ?? ""} tags=${some} data=${data} axis=${axis}
+      colours=${some.map((tag) => COLOURS[tags.indexOf(tag) % COLOURS.length])} ...${others} />`,
+  );
 }
 
 const named = ({ kind, text }) => (kind === "cleared" ? `${text}, cleared` : text);
 
 /** The values of all series at the two cursors, with the differences. The sliders move the cursors without a pointer. */
-export function Cursors({ started, tags, data, unitOf, view, setView, from, to }) {
+export function Cursors({ started, tags, data, view, setView, from, to }) {
   if (view.a === null) return null;
   const [low, high] = view.zoom ?? [from, to];
   const slider = (name) =>
@@ -246,11 +294,11 @@ export function Cursors({ started, tags, data, unitOf, view, setView, from, to }
         onInput=${(e) => setView({ ...view, [name]: low + (Number(e.target.value) / 1000) * (high - low) })} />
       <span class="mono">${clock(view[name] * 1e9)}</span>
     </label>`;
-  const at = (tag, s) => textAt(data[tag]?.points ?? [], s * 1e9 + started, "");
+  const at = (tag, s) => textAt(data[tag] ?? NO_SERIES, s * 1e9 + started, "");
   const difference = (tag) => {
     const points = data[tag]?.points ?? [];
     const [a, b] = [view.a, view.b].map((s) => points[indexAt(points, s * 1e9 + started)]);
-    return a && b && isGood(a) && isGood(b) ? number(Number(b[1]) - Number(a[1])) : "–";
+    return a && b && isGood(a) && isGood(b) && !data[tag].levels ? number(Number(b[1]) - Number(a[1])) : "–";
   };
   return html`<section class="card cursors" aria-label="Cursors">
     <div class="bar">
@@ -267,7 +315,7 @@ export function Cursors({ started, tags, data, unitOf, view, setView, from, to }
           (tag) => html`<tr key=${tag}>
             <td>${tag}</td><td class="number">${at(tag, view.a)}</td>
             ${view.b !== null && html`<td class="number">${at(tag, view.b)}</td><td class="number">${difference(tag)}</td>`}
-            <td>${unitOf(tag)}</td>
+            <td>${data[tag]?.unit ?? ""}</td>
           </tr>`,
         )}
       </tbody>

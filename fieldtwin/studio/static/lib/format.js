@@ -8,6 +8,45 @@ export function number(value) {
   return String(Number(value.toPrecision(6)));
 }
 
+const DURATION = [["d", 86_400_000_000_000n], ["h", 3_600_000_000_000n], ["m", 60_000_000_000n], ["s", 1_000_000_000n], ["ms", 1_000_000n], ["us", 1_000n], ["ns", 1n]];
+const LONG_NS = 1e6; // from this on, a duration is shown in whole microseconds
+
+/** A number of ns as IEC 61131-3 writes a duration: T#1m2s500ms. */
+function duration(ns) {
+  const size = Math.abs(ns);
+  let rest = BigInt(size < LONG_NS ? Math.round(size) : Math.round(size / 1000) * 1000);
+  let text = "";
+  for (const [unit, of] of DURATION) {
+    if (rest >= of) text += `${rest / of}${unit}`;
+    rest %= of;
+  }
+  return `T#${ns < 0 ? "-" : ""}${text || "0s"}`;
+}
+
+const moment = (ns, from, to) => new Date(ns / 1e6).toISOString().slice(from, to);
+const LITERALS = {
+  TIME: duration,
+  LTIME: duration,
+  DATE: (ns) => `D#${moment(ns, 0, 10)}`,
+  LDATE: (ns) => `LD#${moment(ns, 0, 10)}`,
+  TOD: (ns) => `TOD#${moment(ns, 11, 19)}`,
+  LTOD: (ns) => `LTOD#${moment(ns, 11, 19)}`,
+  DT: (ns) => `DT#${moment(ns, 0, 10)}-${moment(ns, 11, 19)}`,
+  LDT: (ns) => `LDT#${moment(ns, 0, 10)}-${moment(ns, 11, 19)}`,
+};
+LITERALS.TIME_OF_DAY = LITERALS.TOD;
+LITERALS.DATE_AND_TIME = LITERALS.DT;
+const MOST_MS = 8.64e15; // the limit of a Date
+
+/** A value of a variable of an IEC type: times and dates, which are numbers of ns, as literals. */
+export function typed(value, type) {
+  const literal = typeof value === "number" && Math.abs(value) / 1e6 <= MOST_MS && LITERALS[type];
+  return literal ? literal(value) : number(value);
+}
+
+/** The unit to show after a value that `typed` shows: a literal has its own. */
+export const unitAfter = (unit, type) => (type in LITERALS ? "" : (unit ?? ""));
+
 /** A tag's value: with the name that the profile gives to it, if there is one. */
 export function value(seen, tag) {
   if (!seen) return "–";

@@ -2,7 +2,7 @@
 
 import { useEffect, useState } from "../vendor/preact.js";
 import { follow, get, of } from "./api.js";
-import { number } from "./format.js";
+import { number, typed } from "./format.js";
 
 const RECENT_MS = 60_000;
 const MOST_RECENT = 600;
@@ -123,15 +123,16 @@ export class Store {
     this.tell();
   }
 
-  /** A value of a program's variable: by its name, if the program gives names to its values. */
+  /** A value of a program's variable: by its name, if the program gives names to its values; a time as a literal. */
   word(program, variable, value) {
-    return this.programs[program]?.variables[variable]?.words[String(value)] ?? number(value);
+    const about = this.programs[program]?.variables[variable];
+    return about?.words[String(value)] ?? typed(value, about?.type);
   }
 
   /** A value of a tag: by its name, if a program or the profile gives names to its values. */
   wordOf(tag, value) {
     for (const { variables } of Object.values(this.programs))
-      for (const v of Object.values(variables)) if (v.tag === tag && v.words[String(value)]) return v.words[String(value)];
+      for (const v of Object.values(variables)) if (v.tag === tag && (v.words[String(value)] || v.type)) return v.words[String(value)] ?? typed(value, v.type);
     return this.tagOf(tag)?.values[String(value)] ?? number(value);
   }
 

@@ -1,8 +1,9 @@
 // The PLC: states, cycle time, variables, forces, and the source of its programs with live values.
 
 import { html, useEffect, useState } from "../vendor/preact.js";
+import { address } from "../lib/address.js";
 import { get, post } from "../lib/api.js";
-import { number } from "../lib/format.js";
+import { number, typed, unitAfter } from "../lib/format.js";
 import { Failure, Quality, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { ForceDialog, ReleaseDialog, Why } from "./plc_dialogs.js";
@@ -70,23 +71,23 @@ function Program({ store, name, plc, changes }) {
 const COUNTER = /\.(taken|consumed)$/; // counts the messages of a mailbox
 const ORDER = ["output", "local", "input", "messages", "watched", "counter"];
 
-/** The tags in the PLC: [kind, name, present value, names of its values, unit], those that programs use first. */
+/** The tags in the PLC: [kind, name, present value, its description], those that programs use first. */
 function tagsOf(store, plc) {
   const known = new Map();
-  const read = new Set();
+  const read = new Map();
   for (const { variables } of Object.values(store.programs)) {
     for (const v of Object.values(variables)) {
-      if (v.role === "input") read.add(v.tag);
+      if (v.role === "input") read.set(v.tag, v);
       else known.set(v.tag, v);
     }
   }
   const inputs = Object.entries(plc.inputs).map(([name, v]) => {
-    return [COUNTER.test(name) ? "counter" : read.has(name) ? "input" : "watched", name, v, {}, ""];
+    return [COUNTER.test(name) ? "counter" : read.has(name) ? "input" : "watched", name, v, { words: {}, unit: "", type: read.get(name)?.type }];
   });
   const outputs = Object.entries(plc.outputs).map(([name, value]) => {
     const v = known.get(name);
     const kind = COUNTER.test(name) ? "counter" : v?.kind === "message" ? "messages" : (v?.role ?? "output");
-    return [kind, name, { value }, v?.words ?? {}, v?.unit ?? ""];
+    return [kind, name, { value }, v ?? { words: {}, unit: "" }];
   });
   return [...outputs, ...inputs].sort(([a], [b]) => ORDER.indexOf(a) - ORDER.indexOf(b));
 }
@@ -96,9 +97,10 @@ function Tags({ store, plc, onOpen }) {
     <table class="list one-line">
       <thead><tr><th>Tag</th><th>Kind</th><th class="number">Value</th><th>Quality</th><th><span class="visually-hidden">Actions</span></th></tr></thead>
       <tbody>
-        ${tagsOf(store, plc).map(([kind, name, v, words, unit]) => {
+        ${tagsOf(store, plc).map(([kind, name, v, { words, type, unit: given }]) => {
           const force = plc.forces[name];
-          const word = (value) => words[String(value)] ?? number(value);
+          const word = (value) => words[String(value)] ?? typed(value, type);
+          const unit = unitAfter(given, type);
           return html`<tr key=${kind + name} data-tag=${name}>
             <td title=${name}>${name}</td><td class="soft">${kind}</td>
             <td class="number">${word(force ? force.value : v.value)}${unit && html` <span class="soft">${unit}</span>`}</td>
@@ -107,8 +109,8 @@ function Tags({ store, plc, onOpen }) {
               ${!store.isTrace && html`<button class="quiet" onClick=${() => onOpen(Why, { tag: name, input: "quality" in v, word })}>Why?</button>`}
               ${store.mayOperate &&
               (force
-                ? html`<button class="quiet" onClick=${() => onOpen(ReleaseDialog, { name, words })}>Release …</button>`
-                : html`<button class="quiet" onClick=${() => onOpen(ForceDialog, { name, words, now: v.value })}>Force …</button>`)}
+                ? html`<button class="quiet" onClick=${() => onOpen(ReleaseDialog, { name })}>Release …</button>`
+                : html`<button class="quiet" onClick=${() => onOpen(ForceDialog, { name, words, unit: given, now: v.value })}>Force …</button>`)}
             </td>
           </tr>`;
         })}
@@ -135,13 +137,14 @@ function Internal({ store }) {
     found.variables.length > 0 &&
     html`<div class="scroll">
       <table class="list one-line">
-        <thead><tr><th>Variable</th><th>Type</th><th class="number">Value</th></tr></thead>
+        <thead><tr><th>Variable</th><th class="iec-type">Type</th><th class="number">Value</th><th><span class="visually-hidden">Actions</span></th></tr></thead>
         <tbody>
           ${found.variables.map((v) => {
-            const [value, unit] = v.unit === "ns" ? [v.value / 1e9, "s"] : [v.value, v.unit];
+            const unit = unitAfter(v.unit, v.type);
             return html`<tr key=${v.name} data-variable=${v.name}>
-              <td title=${v.name}>${v.name}</td><td class="soft">${v.type}</td>
-              <td class="number" title=${v.value}>${number(value)}${unit && html` <span class="soft">${unit}</span>`}</td>
+              <td title=${v.name}>${v.name}</td><td class="soft iec-type">${v.type}</td>
+              <td class="number" title=${v.value}>${typed(v.value, v.type)}${unit && html` <span class="soft">${unit}</span>`}</td>
+              <td><a class="quiet" href="${address(store.name, "trends")}?variable=${encodeURIComponent(v.name)}" aria-label="Trend of ${v.name}">Trend</a></td>
             </tr>`;
           })}
         </tbody>

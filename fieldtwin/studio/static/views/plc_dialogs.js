@@ -82,7 +82,7 @@ function FromProgram({ store, tag, word }) {
 const shown = (v) => (v !== null && typeof v === "object" ? JSON.stringify(v) : number(v));
 
 /** Force a tag. `words`: the names of its values, if it has such. */
-export function ForceDialog({ store, name, now, words, onClose }) {
+export function ForceDialog({ store, name, now, words, unit, onClose }) {
   const [text, setText] = useState(now === null || now === undefined ? "" : String(now));
   const [run, error, busy] = useAction();
   const plant = !store.isPrototype;
@@ -99,10 +99,10 @@ export function ForceDialog({ store, name, now, words, onClose }) {
       ${plant && html`<p class="error">This is a plant: the force acts on real devices until you remove it.</p>`}
       <${Failure} text=${error} />
       <p>
-        now ${words?.[String(now)] ?? number(now)} →${" "}
+        now ${store.wordOf(name, now)} →${" "}
         ${choices.length
           ? html`<select aria-label="New value" value=${text} onChange=${change}>${choices.map(([v, label]) => html`<option value=${v}>${label}</option>`)}</select>`
-          : html`<input autofocus aria-label="New value" value=${text} onInput=${change} />`}
+          : html`<input autofocus aria-label="New value${unit && ` in ${unit}`}" value=${text} onInput=${change} /> ${unit}`}
       </p>
       <footer>
         <button type="button" onClick=${onClose}>Cancel</button>
@@ -113,12 +113,12 @@ export function ForceDialog({ store, name, now, words, onClose }) {
 }
 
 /** Release a forced tag, with the value that it has now and the source of the next one. */
-export function ReleaseDialog({ store, name, words, onClose }) {
+export function ReleaseDialog({ store, name, onClose }) {
   const [run, error, busy] = useAction();
   const plc = store.status.plc;
   const force = plc.forces[name];
   const seen = store.tags[name];
-  const word = (v) => words?.[String(v)] ?? number(v);
+  const word = (v) => store.wordOf(name, v);
   const next = name in plc.inputs ? (seen ? `${word(seen.value)}, the device's value` : "the device's value") : "the value that the program computes in the next scan";
   const send = async (e) => {
     e.preventDefault();

@@ -1,0 +1,1 @@
+"""Variables of programs over time, for pages and clients."""

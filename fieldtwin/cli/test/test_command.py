@@ -249,7 +249,7 @@ def command(
         from fieldtwin.results.trace_about import note_report
 
         if campaign.seeds:
-            write_campaign(campaigns, Path(html))
+            write_campaign(campaigns, Path(html), results[: len(findings)])
         else:
             write_html(report, Path(html))
         for result in results:

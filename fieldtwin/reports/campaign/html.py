@@ -15,7 +15,7 @@ from fieldtwin.reports.campaign.workers import BINS, Timeline, timeline_of, work
 from fieldtwin.reports.file import put
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import fill
-from fieldtwin.results.model import Verdict
+from fieldtwin.results.model import ScenarioResult, Verdict
 
 MOST_GROUPS = 50
 MOST_SEEDS = 20
@@ -25,25 +25,31 @@ MOST_CAMPAIGNS = 20
 MOST_TEXT = 1000
 """Largest number of characters of an error and of a command."""
 MOST_LEDGERS = 100
+MOST_FINDINGS = 200
+"""Largest number of findings and waivers about the programs that are listed."""
 _ORDER = (Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED)
 
 
-def write_campaign(campaigns: Sequence[CampaignResult], path: Path) -> None:
+def write_campaign(campaigns: Sequence[CampaignResult], path: Path, findings: Sequence[ScenarioResult] = ()) -> None:
     """Write the report. Raises `FileInvalid` if that is not possible."""
-    put(path, render_campaign(campaigns))
+    put(path, render_campaign(campaigns, findings))
 
 
-def render_campaign(campaigns: Sequence[CampaignResult]) -> str:
-    """Return the whole page."""
+def render_campaign(campaigns: Sequence[CampaignResult], findings: Sequence[ScenarioResult] = ()) -> str:
+    """Return the whole page. `findings`: the results of checks of the programs, which belong to all campaigns."""
     shown = campaigns[:MOST_CAMPAIGNS]
     sections = [_section(campaign, alone=len(shown) == 1) for campaign in shown]
     verdicts = {campaign.verdict for campaign in campaigns} or {Verdict.INCONCLUSIVE}
+    verdicts |= {result.verdict for result in findings}
     return fill(
         "campaign.html.j2",
         verdict=next(verdict for verdict in _ORDER if verdict in verdicts),
         title=f"Campaign of {campaigns[0].title}" if len(campaigns) == 1 else f"{len(campaigns)} campaigns",
         sections=sections,
         more_campaigns=len(campaigns) - len(shown),
+        findings=findings,
+        MOST_FINDINGS=MOST_FINDINGS,
+        MOST_TEXT=MOST_TEXT,
     )
 
 

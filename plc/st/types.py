@@ -22,8 +22,8 @@ MAX_ELEMENTS = 1_000_000
 """The limit for an array over all its dimensions, and for all elements of a structure, a block or a program."""
 MAX_NESTED = 32
 """How deep structures, arrays and blocks may be nested."""
-GIVEN = ("VAR_INPUT", "VAR_IN_OUT")
-"""The kinds of variables that a call gives."""
+GIVEN = ("VAR_INPUT", "VAR_IN_OUT", "VAR_OUTPUT")
+"""The kinds of variables for which a call may have an argument."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ class Block:
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
     outputs: Mapping[str, tuple[str, Type]] = field(hash=False)
     order: tuple[str, ...]
-    """The names of inputs and VAR_IN_OUT as declared, in the order of the declaration, which positional arguments have."""
+    """The names of all parameters as declared, in the order of the declaration, which positional arguments have."""
     in_outs: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
     standard: type[FunctionBlock] | None = None
     elements: int = 8
@@ -197,6 +197,8 @@ class Block:
     abstract: bool = False
     created: bool = False
     """Whether it has a method FB_init, which is called when an instance is created."""
+    aliases: Mapping[str, str] = field(hash=False, default_factory=dict)
+    """Further names of inputs, in lower case, each with the name as declared."""
 
     def __str__(self) -> str:
         return self.name
@@ -405,6 +407,8 @@ def standard_blocks(blocks: Mapping[str, type[FunctionBlock]]) -> dict[str, Bloc
         return {name.lower(): (name, ELEMENTARY[kind]) for name, kind in declared.items()}
 
     return {
-        name.lower(): Block(name, members(block.inputs), members(block.outputs), tuple(block.inputs), standard=block)
+        name.lower(): Block(
+            name, members(block.inputs), members(block.outputs), (*block.inputs, *block.outputs), standard=block
+        )
         for name, block in blocks.items()
     }

@@ -1,14 +1,14 @@
 """Assigns the arguments of a call to parameters (IEC 61131-3, 6.6.1.4), for standard functions, functions and blocks.
 
-Positional arguments come first and take the parameters in their order. Named arguments follow in any order. Each parameter is
-given at most once.
+Positional arguments come first and take the parameters in the order of their declarations, also VAR_IN_OUT. A call with more of
+them than inputs and VAR_IN_OUT also gives the outputs. Named arguments follow in any order. Each parameter is given at most once.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.compiler.scope import Environment
 from fieldtwin.plc.st.syntax import tree as t
@@ -50,14 +50,21 @@ class Formals:
         return ", ".join(self.all_names(0)) + more or "none"
 
 
-def bind(env: Environment, call: t.Call, names: Sequence[str], of: str) -> dict[str, t.Argument]:
-    """Return the input arguments of `call` by parameter in lower case. `names` are the parameters in their order, `of`
-    is the name of what is called.
+def bind(
+    env: Environment, call: t.Call, names: Sequence[str], of: str, outputs: Container[str] = ()
+) -> dict[str, t.Argument]:
+    """Return the arguments of `call`, but not those with ``=>``, by parameter in lower case. `names` are the parameters in
+    their order, `of` is the name of what is called. `outputs` are those parameters, in lower case, that only a positional
+    argument may give; `given_outputs` returns them.
 
     Raises `FileInvalid` for an unknown name, a parameter that is given twice, too many arguments, and a positional
     argument after a named one.
     """
     order = [name.lower() for name in names]
+    known = [name for name in names if name.lower() not in outputs]
+    positional = sum(argument.value is not None and not argument.name for argument in call.arguments)
+    if positional <= len(known):
+        order = [name.lower() for name in known]
     found: dict[str, t.Argument] = {}
     named = False
     for argument in call.arguments:
@@ -65,8 +72,8 @@ def bind(env: Environment, call: t.Call, names: Sequence[str], of: str) -> dict[
             continue
         if argument.name:
             named, key = True, argument.name.lower()
-            if key not in order:
-                env.unknown(argument.pos, f"in {of}, a parameter", argument.name, list(names))
+            if key not in order or key in outputs:
+                env.unknown(argument.pos, f"in {of}, a parameter", argument.name, known)
         elif named:
             env.fail(
                 argument.pos, f"a positional argument of {of} after a named one", expected="NAME := value from here on"
@@ -78,9 +85,29 @@ def bind(env: Environment, call: t.Call, names: Sequence[str], of: str) -> dict[
         else:
             key = order[len(found)]
         if key in found:
-            env.fail(argument.pos, f"parameter {names[order.index(key)]} of {of} is given twice")
+            env.fail(
+                argument.pos, f"parameter {next(name for name in names if name.lower() == key)} of {of} is given twice"
+            )
         found[key] = argument
     return found
+
+
+def given_outputs(
+    env: Environment, call: t.Call, found: dict[str, t.Argument], outputs: Container[str], of: str
+) -> list[t.Argument]:
+    """Return the arguments for outputs: those with ``=>``, and the positional ones in `found`, which are removed from there."""
+    positional = {name: found.pop(name) for name in list(found) if name in outputs}
+    made = []
+    for name, argument in positional.items():
+        if not isinstance(argument.value, t.Ref):
+            env.fail(argument.pos, f"an output of {of} needs a variable")
+        made.append(replace(argument, name=name, value=None, target=argument.value))
+    for argument in call.arguments:
+        if argument.target is not None:
+            if argument.name.lower() in positional:
+                env.fail(argument.pos, f"parameter {argument.name} of {of} is given twice")
+            made.append(argument)
+    return made
 
 
 def in_order(env: Environment, call: t.Call, formals: Formals) -> list[t.Expr]:

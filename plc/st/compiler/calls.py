@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.arguments import bind, given_outputs
 from fieldtwin.plc.st.compiler.classes.members import Selected, class_of, method_of, note, selected
 from fieldtwin.plc.st.compiler.execution_control import split_control
 from fieldtwin.plc.st.compiler.expressions import Expressions
@@ -124,7 +124,9 @@ class Calls(Expressions):
 
     def _user_function(self, call: t.Call, signature: Signature, method: Selected | None = None) -> Value:
         """Compile the call of a function or method."""
-        given = bind(self.env, call, signature.order, signature.name)
+        places = {p.name.lower(): n for n, p in enumerate(signature.outputs, 1)}
+        given = bind(self.env, call, signature.order, signature.name, places)
+        outputs = given_outputs(self.env, call, given, places, signature.name)
         codes: list[str] = []
         for p in signature.inputs:
             expr, mark = _value_of(given.get(p.name.lower())), len(self.out.lines)
@@ -142,14 +144,12 @@ class Calls(Expressions):
             codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
         arguments = ", ".join(codes)
         code = f"f_{identifier(signature.name)}({arguments})" if method is None else method.called(arguments)
-        outputs = [a for a in call.arguments if a.target is not None]
         more = bool(signature.outputs)
         if not outputs and all(by_reference(p.type) for p in signature.in_outs):
             return Value(f"{code}[0]" if more else code, signature.returns)
         result = self.out.temporary()
         self.out.line(f"{result} = {code}", call.pos)
         self.take_back(cells, call.pos)
-        places = {p.name.lower(): n for n, p in enumerate(signature.outputs, 1)}
         types = {p.name.lower(): p.type for p in signature.outputs}
         for argument in outputs:
             key = argument.name.lower()

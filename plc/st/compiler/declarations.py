@@ -12,15 +12,20 @@ from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED, InitialValues
+from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED, InitialValues, element
 from fieldtwin.plc.st.compiler.pointers.memory import layout, members
-from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, identifier
+from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value, identifier
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import nodes
 
 MAX_REPEATED = 100
 """The limit, in characters, up to which generated Python code repeats an initial value. A longer one becomes a function."""
 _STANDARD = ty.standard_blocks(BLOCKS)
+_VENDOR_NAMES = {
+    "sr": {"set1": "S1", "reset": "R"}, "rs": {"set": "S", "reset1": "R1"}, "ctu": {"reset": "R"}, "ctd": {"load": "LD"},
+    "ctud": {"reset": "R", "load": "LD"},
+}  # fmt: skip
+"""The names that inputs of the standard blocks have in the library Standard of CODESYS and in Tc2_Standard of TwinCAT."""
 
 
 class Declarations:
@@ -250,7 +255,9 @@ class Declarations:
             return self._interface(pou) if pou.kind == "INTERFACE" else self._block(pou)
         self.env.refuse_missing(key, pos)
         if key in _STANDARD:
-            return _STANDARD[key]
+            found = _STANDARD[key]
+            aliases = _VENDOR_NAMES.get(key.partition("_")[0], {}) if self.env.dialect.vendor else {}
+            return replace(found, aliases=aliases)
         known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
         raise self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
 
@@ -278,9 +285,10 @@ class Declarations:
         if isinstance(declared, t.EnumDecl):
             return self._registered(declared)
         kind = self.type_of(declared.type)
-        if declared.initial is not None:
-            code = self.initial(kind, declared.initial)
-            self.env.type_initials[declared.name.lower()] = self.shared(code)
+        if declared.initial is not None or not isinstance(element(kind), ty.Block):
+            code = self.initial(kind, declared.initial, declared.type)
+            if code != default_value(kind):  # a derived type has the initial value of its base
+                self.env.type_initials[declared.name.lower()] = self.shared(code)
         return kind
 
     def _registered(self, declared: t.EnumDecl) -> ty.Enum:

@@ -181,6 +181,7 @@ class Expressions:
                 if isinstance(kind, ty.Block):
                     inner = self.env.inner.get(kind.name.lower(), {})
                     members = {**inner, **kind.inputs, **kind.outputs, **kind.publics}
+                    name = kind.aliases.get(name, name).lower()
                 kind = members[name][1] if name in members else property_type(self, kind, name)
         return self._followed(kind, ref.pos)
 

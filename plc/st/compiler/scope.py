@@ -80,7 +80,7 @@ class Signature:
     in_outs: tuple[Parameter, ...]
     outputs: tuple[Parameter, ...]
     order: tuple[str, ...]
-    """The names of inputs and VAR_IN_OUT in the order of the declaration, which positional arguments have."""
+    """The names of all parameters in the order of the declaration, which positional arguments have."""
 
     def names(self) -> set[str]:
         """Return the names of all parameters in lower case."""
@@ -179,11 +179,15 @@ def default_value(kind: ty.Type) -> str:
         code = f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{identifier(kind.name)}()"
         return f"{code}.created()" if kind.created else code
     if isinstance(kind, ty.Array):
-        code = default_value(kind.of)
-        for low, high in reversed(kind.ranges):
-            code = f"[{code} for _ in range({high - low + 1})]"
-        return code
+        return repeated(default_value(kind.of), kind)
     return "0" if isinstance(kind, ty.AnyInt | ty.AnyReal) else "None"
+
+
+def repeated(code: str, kind: ty.Array) -> str:
+    """Return the Python expression of a new array whose elements have the value `code`."""
+    for low, high in reversed(kind.ranges):
+        code = f"[{code} for _ in range({high - low + 1})]"
+    return code
 
 
 def by_reference(kind: ty.Type) -> bool:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.compiler.arguments import bind
+from fieldtwin.plc.st.compiler.arguments import bind, given_outputs
 from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.classes.members import SUPER, is_own, method_of, note
 from fieldtwin.plc.st.compiler.execution_control import split_control
@@ -221,8 +222,12 @@ class Statements(Calls):
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)
             code = place
+        if block.aliases:
+            named = (replace(a, name=block.aliases.get(a.name.lower(), a.name)) for a in call.arguments)
+            call = replace(call, arguments=tuple(named))
         cells: dict[str, str] = {}
-        given = bind(self.env, call, block.order, str(block))
+        given = bind(self.env, call, block.order, str(block), block.outputs)
+        outputs = given_outputs(self.env, call, given, block.outputs, str(block))
         for name, argument in given.items():
             assert argument.value is not None
             if name in block.inputs:
@@ -238,7 +243,7 @@ class Statements(Calls):
                 self.env.fail(call.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
         self.out.line(f"{code}.a_{action}()" if action else f"{code}.execute(_c.now_ns)", call.pos)
         self.take_back(cells, call.pos)
-        for argument in (a for a in call.arguments if a.target is not None):
+        for argument in outputs:
             name = argument.name.lower()
             if name not in block.outputs:
                 self.env.unknown(

@@ -159,6 +159,7 @@ def _member(x: Compiling, value: Value, ref: t.Ref, member: t.Member) -> Value:
         return Value(code, kind.fields[name][1], None, True, value.writable, reference, value.is_input)
     if isinstance(kind, ty.Block):
         inner = x.env.inner.get(kind.name.lower(), {})
+        name = kind.aliases.get(name, name).lower()
         for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.publics, True), (inner, False)):
             if name in members:
                 attribute = members[name][0] if kind.standard else f"v_{name}"

@@ -270,3 +270,23 @@ def test_a_semicolon_may_follow_the_result_of_a_function() -> None:
     made = program_class(compile_text(text, "p.st", DIALECTS["twincat"]))()
     scan(made)
     assert vars(made.st_body)["v_r"] == 8
+
+
+BISTABLES = """PROGRAM p VAR a, b : BOOL; s : SR; r : RS; up : CTU; down : CTD_DINT; both : CTUD; n : INT; l : DINT; END_VAR
+s(SET1 := TRUE, RESET := TRUE, Q1 => a); r(SET := TRUE, RESET1 := TRUE, Q1 => b);
+up(CU := TRUE, RESET := FALSE, PV := 1); up.RESET := up.Q; up(); down(CD := FALSE, LOAD := TRUE, PV := 7, CV => l);
+both(LOAD := TRUE, RESET := FALSE, PV := 5, CV => n); END_PROGRAM
+"""
+
+
+@pytest.mark.parametrize("dialect", ["codesys", "twincat"])
+def test_inputs_of_standard_blocks_have_the_names_of_the_library_of_the_tool(dialect: str) -> None:
+    """Sources: the libraries Standard of CODESYS and Tc2_Standard of TwinCAT."""
+    made: Any = program_class(compile_text(BISTABLES, "p.st", DIALECTS[dialect]))()
+    scan(made)
+    body = made.st_body
+    assert (body.v_a, body.v_b, body.v_up.R, body.v_up.CV, body.v_l, body.v_n) == (True, False, True, 0, 7, 5)
+    with pytest.raises(FileInvalid, match="in SR, a parameter 'SET1' is not declared"):
+        compile_text(BISTABLES, "p.st", DIALECTS["standard"])
+    with pytest.raises(FileInvalid, match="parameter S1 of SR is given twice"):
+        compile_text(BISTABLES.replace("SET1 := TRUE", "SET1 := TRUE, S1 := TRUE"), "p.st", DIALECTS[dialect])

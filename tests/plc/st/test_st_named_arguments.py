@@ -236,11 +236,38 @@ def test_functions_and_blocks_of_the_program_bind_arguments_by_the_same_rules() 
         ("t(IN := TRUE, T#1s)", "a positional argument of TON after a named one"),
         ("t(TRUE, IN := FALSE)", "parameter IN of TON is given twice"),
         ("t(IN := TRUE, IN := FALSE)", "parameter IN of TON is given twice"),
-        ("t(TRUE, T#1s, 1)", "arguments of TON; expected 2 (IN, PT); got 3"),
+        ("t(TRUE, T#1s, 1)", "an output of TON needs a variable"),
+        ("t(TRUE, T#1s, q, d, q)", "arguments of TON; expected 4 (IN, PT, Q, ET); got 5"),
+        ("t(TRUE, T#1s, q, Q => q)", "parameter Q of TON is given twice"),
+        ("t(IN := TRUE, Q := q)", "in TON, a parameter 'Q' is not declared"),
     ):
         with pytest.raises(FileInvalid) as e:
-            run("t : TON;", f"{wrong};")
+            run("t : TON; q : BOOL; d : TIME;", f"{wrong};")
         assert told in str(e.value)
+
+
+MIXED = """TYPE Made : STRUCT a, b : INT; END_STRUCT END_TYPE
+FUNCTION change : INT
+VAR_IN_OUT total : INT; END_VAR VAR_OUTPUT half : INT; END_VAR VAR_INPUT by : INT; END_VAR VAR_OUTPUT made : Made; END_VAR
+  total := total + by; half := total / 2; made.b := total; change := by;
+END_FUNCTION
+FUNCTION_BLOCK Count VAR_IN_OUT total : INT; END_VAR VAR_INPUT by : INT; END_VAR VAR_OUTPUT odd : BOOL; END_VAR
+  total := total + by; odd := total MOD 2 = 1;
+  METHOD PUBLIC change VAR_OUTPUT last : INT; END_VAR VAR_INPUT by : INT; END_VAR last := by; END_METHOD
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Wide EXTENDS Count VAR_INPUT more : INT; END_VAR total := total + by + more; END_FUNCTION_BLOCK
+"""
+
+
+def test_positional_arguments_take_all_parameters_in_the_order_of_their_declarations() -> None:
+    """Defect: inputs were taken before VAR_IN_OUT, whatever the declaration said, and outputs could be given by name only."""
+    variables = "c : Count; w : Wide; n : INT := 2; h, last, r : INT; m : Made; bits : BYTE; t : TON; d : TIME;"
+    body = """r := change(n, h, 5, m); c(n, 4, bits.%X3); c.change(last, 7); w(n, 10, bits.%X0, 100);
+    t(TRUE, T#1s, bits.%X1, d);"""
+    made = run(variables, body, MIXED)
+    assert (made["r"], made["h"], made["n"], made["m"].m_b, made["last"], made["bits"]) == (5, 3, 121, 7, 7, 0b1000)
+    with pytest.raises(FileInvalid, match="an output of change needs a variable"):
+        run(variables, "r := change(n, 1, 5);", MIXED)
 
 
 def test_every_elementary_type_converts_by_name() -> None:

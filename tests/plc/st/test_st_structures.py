@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from st_bench import program, scan
+from st_bench import program, run, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.binding import load_program
@@ -99,3 +99,26 @@ def test_an_instance_of_a_function_block_cannot_be_constant(dialect: str) -> Non
     ):
         compile_text(text, dialect=dialect_of(dialect))
     compile_text(text, dialect=dialect_of("codesys"))
+
+
+ALIASES = """TYPE Level : INT := 3; Same : Level; Twice : ARRAY[0..1] OF Same; Again : Twice; END_TYPE
+TYPE Pair : STRUCT a, b : INT; END_STRUCT; Three : Pair := (a := 3); Four : Three; Five : Four := (b := 5); END_TYPE
+TYPE Row : ARRAY[0..2] OF INT := [3, 4]; Line : Row; Light : (red, amber, green); Go : Light := green; Now : Go; END_TYPE
+TYPE Part : INT (0..10) := 7; Same_part : Part; Name : STRING[5] := 'abc'; Same_name : Name; END_TYPE
+TYPE All : STRUCT level : Same; four : Four; line : Line; END_STRUCT END_TYPE
+FUNCTION f : Same VAR_OUTPUT o : Four; END_VAR END_FUNCTION
+"""
+
+
+def test_a_type_without_an_initial_value_has_that_of_the_type_from_which_it_is_derived() -> None:
+    """IEC 61131-3:2013, 6.4.4.1. Defect: only a variable of the very type that states the initial value had it, so that
+    one of a type derived from it, and an element of an array, began with 0."""
+    variables = """same : Same; again : Again; some : ARRAY[0..1, 0..1] OF Same; rest : ARRAY[0..2] OF Level := [1];
+    four : Four; five : Five; line : Line; now : Now; part : Same_part; name : Same_name; all : All; out : Four; n : INT;"""
+    made = run(variables, "n := f(o => out);", ALIASES)
+    assert (made["same"], made["again"], made["some"], made["rest"]) == (3, [3, 3], [[3, 3], [3, 3]], [1, 3, 3])
+    assert (made["four"].m_a, made["five"].m_a, made["five"].m_b, made["line"]) == (3, 3, 5, [3, 4, 0])
+    assert (made["now"], made["part"], made["name"], made["n"], made["out"].m_a) == (2, 7, "abc", 3, 3)
+    assert (made["all"].m_level, made["all"].m_four.m_a, made["all"].m_line) == (3, 3, [3, 4, 0])
+    made["some"][0][0] = 9
+    assert made["some"] == [[9, 3], [3, 3]]

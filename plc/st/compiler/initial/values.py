@@ -13,7 +13,7 @@ from typing import Protocol
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.arguments import bind
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.scope import Environment, Symbol, default_value
+from fieldtwin.plc.st.compiler.scope import Environment, Symbol, default_value, repeated
 from fieldtwin.plc.st.syntax import tree as t
 
 FB_INIT = "FB_init"
@@ -59,8 +59,7 @@ class InitialValues:
         if isinstance(init, t.InitStruct):
             return self._structure(kind, init, spec, lists)
         if init is None:
-            named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
-            return env.type_initials.get(named) or self._new(kind, spec, lists)
+            return self._new(kind, spec, lists)
         compiler = self.expressions or self.declarations.constants()
         code = compiler.coerced(compiler.value(init, kind), kind, init.pos, "an initial value")
         if self.expressions is None and compiler.out.lines:
@@ -72,11 +71,15 @@ class InitialValues:
     def _new(self, kind: ty.Type, spec: t.TypeSpec | None, lists: Lists) -> str:
         """Return the Python expression of a new variable with the initial value of its type."""
         env, of = self.declarations.env, element(kind)
+        if isinstance(spec, t.NamedType) and (code := env.type_initials.get(spec.name.lower())):
+            return code
         if not lists:
             if spec is not None and isinstance(of, ty.Block) and (needed := self.declarations.needed(of)):
                 env.fail(
                     spec.pos, f"an instance of {of} without the arguments of {FB_INIT}", expected=", ".join(needed)
                 )
+            if isinstance(kind, ty.Array) and isinstance(spec, t.ArrayType) and not isinstance(of, ty.Block):
+                return repeated(self._value(kind.of, None, spec.of, ()), kind)
             return default_value(kind)
         if not (isinstance(of, ty.Block) and of.created):
             pos = lists[0][0].pos if lists[0] else spec.pos if spec is not None else t.Pos(1, 1)
@@ -148,7 +151,8 @@ class InitialValues:
         if count < total and lists:
             items += [self._value(kind.of, None, None, one) for one in each[count:]]
         elif count < total:
-            items.append(f"*({default_value(kind.of)} for _ in range({total - count}))")
+            rest = self._value(kind.of, None, spec.of if isinstance(spec, t.ArrayType) else None, ())
+            items.append(f"*({rest} for _ in range({total - count}))")
         return _shaped(items, kind)
 
     def _structure(self, kind: ty.Type, init: t.InitStruct, spec: t.TypeSpec | None, lists: Lists) -> str:

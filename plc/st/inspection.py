@@ -93,7 +93,7 @@ class Inspection:
             return lambda new: holder.__setitem__(last - kind.ranges[len(outer)][0], new)
         if isinstance(kind, ty.Block) and kind.standard is not None and step[1:].lower() not in kind.inputs:
             return None
-        attribute = self._member_attribute(kind, step[1:])
+        attribute = self.member_attribute(kind, step[1:])
         return (lambda new: setattr(value, attribute[0], new)) if attribute is not None else None
 
     def attribute(self, path: str) -> tuple[str, ty.Type] | None:
@@ -104,13 +104,6 @@ class Inspection:
         found = self.code(path) if "[" not in path else None
         return None if found is None or isinstance(found[1], ty.Struct | ty.Block | ty.Array) else found
 
-    def instance(self, path: str) -> tuple[str, ty.Block] | None:
-        """Return the Python attributes of a path without indices to an instance of a function block of the unit, and its type."""
-        found = self.code(path) if "[" not in path else None
-        if found is None or not isinstance(found[1], ty.Block) or found[1].standard is not None:
-            return None
-        return found[0], found[1]
-
     def code(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes and indices of a path, such as ``v_levels[2]``, and its type; None for an unknown path."""
         name, rest = self.first(path)
@@ -118,7 +111,9 @@ class Inspection:
         return self.code_within(f"v_{own_name(name).lower()}", top[1], rest) if top is not None else None
 
     def code_within(self, code: str, kind: ty.Type, rest: str) -> tuple[str, ty.Type] | None:
-        """Return the Python code and the type of a part of a variable, whose own `code` and `kind` are given, as `code` does."""
+        """Return the Python code and the type of a part of a variable, whose own `code` and `kind` are given, as `code`
+        does.
+        """
         at = 0
         while at < len(rest):
             step = _STEP.match(rest, at)
@@ -126,7 +121,7 @@ class Inspection:
                 return None
             named, at = self._with_method(kind, step, rest)
             if named:
-                member = self._member_attribute(kind, named)
+                member = self.member_attribute(kind, named)
                 if member is None:
                     return None
                 code, kind = f"{code}.{member[0]}", member[1]
@@ -138,7 +133,8 @@ class Inspection:
                 kind = kind.of
         return code, kind
 
-    def _member_attribute(self, kind: ty.Type, member: str) -> tuple[str, ty.Type] | None:
+    def member_attribute(self, kind: ty.Type, member: str) -> tuple[str, ty.Type] | None:
+        """Return the attribute of a member of a structure or block, and its type; None for others."""
         key = member.lower()
         if isinstance(kind, ty.Struct):
             return (f"m_{key}", kind.fields[key][1]) if key in kind.fields else None

@@ -35,13 +35,14 @@ from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.coverage.recording import active_recording
-from fieldtwin.plc.st.decisions import Decided, DecisionReader, Decisions, decisions_of, reader
+from fieldtwin.plc.st.decisions.reading import Decided, DecisionReader, reader
+from fieldtwin.plc.st.decisions.statements import Decisions, decisions_of
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
 from fieldtwin.plc.st.inspection import shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, state_of
-from fieldtwin.plc.st.runtime.lines import is_line, line_of
+from fieldtwin.plc.st.runtime.lines import SOURCE, Record, forget, is_line, record_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.state_diagram import StateDiagram
@@ -101,7 +102,7 @@ class StProgram(Program):
         self.st_read = reader([attribute for _, attribute in same])
         """Reads the values of `st_outputs`, all at once, because a large program has hundreds."""
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
-        self.st_places: dict[int | tuple[str, int], SourceLine] = {}
+        self.st_places: dict[tuple[str, int], SourceLine] = {}
         """The lines that assigned outputs so far; all changes by one line share its object."""
         self.st_show()
 
@@ -128,7 +129,9 @@ class StProgram(Program):
         self.st_show()
 
     def whole_state(self, now_ns: int) -> Any:
-        """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global variables."""
+        """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global
+        variables.
+        """
         resource = self.st_resource
         held = [vars(self.st_body), vars(resource.globals)]
         numbers = resource.numbers(self.st_body)
@@ -167,32 +170,43 @@ class StProgram(Program):
         if found is not None:
             convert = _from_tag(found.kind)
             self.st_assign(found, convert(value) if convert else value)
-            if self.st_line(found):
-                setattr(self.st_holder(found), line_of(str(found.attribute)), 0)
+            if self.st_record(found):
+                forget(*self.st_kept_in(found))
 
-    def st_line(self, variable: ProgramVariable | None) -> Any:
-        """Return the line that last assigned a variable: its number, or its file and number; 0 if it is not known."""
-        if variable is None or isinstance(variable.attribute, int):
-            return 0
-        return getattr(self.st_holder(variable), line_of(variable.attribute), 0)
+    def st_kept_in(self, variable: ProgramVariable) -> tuple[Any, str, tuple[int, ...]]:
+        """Return the object and the attribute that hold a variable, and the indices of an element of an array."""
+        steps = (*variable.steps, variable.attribute)
+        end = max(n for n, step in enumerate(steps) if isinstance(step, str))
+        owner = reached(self.st_resource.globals if variable.shared else self.st_body, steps[:end])
+        return owner, str(steps[end]), tuple(step for step in steps[end + 1 :] if isinstance(step, int))
+
+    def st_record(self, variable: ProgramVariable) -> Record:
+        """Return the record of the last assignment of a variable; empty if it is not known."""
+        if variable.steps:
+            return record_of(*self.st_kept_in(variable), self.source_path)
+        owner = self.st_resource.globals if variable.shared else self.st_body
+        return record_of(owner, str(variable.attribute), (), self.source_path)
 
     def place(self, name: str) -> SourceLine | None:
         """Return the line that assigned the output; for an output with its initial value, the line of its
         declaration."""
-        line = self.st_line(self.st_variables.get(name))
-        if not line:
+        found = self.st_variables.get(name)
+        record = self.st_record(found) if found is not None else ()
+        if not record:
             return None
-        place = self.st_places.get(line)
+        path, line = record[1][:SOURCE]
+        place = self.st_places.get((path, line))
         if place is None:
-            place = SourceLine(*line) if isinstance(line, tuple) else SourceLine(self.source_path, line)
-            self.st_places[line] = place
+            place = self.st_places[path, line] = SourceLine(path, line)
         return place
 
     def decided(self, name: str, place: SourceLine) -> Decided | None:
         found = self.st_variables.get(name)
         if found is None or found.shared:
             return None
-        return self.st_decisions.read(self.st_body, (place.path, place.line, name.lower()))
+        record = self.st_record(found)
+        known = record and record[1][:SOURCE] == (place.path, place.line)
+        return self.st_decisions.read(self.st_body, name, record) if known else None
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)
@@ -367,6 +381,7 @@ def program_class(
         tags = {WRITES: message_input(), **tags}
     decided = DecisionReader(
         unit,
+        found.name,
         [(v.name, v.kind) for v in found.variables if not v.steps],
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),

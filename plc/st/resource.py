@@ -34,12 +34,14 @@ Together = dict[Any, Any]
 class Context:
     """The interface through which compiled code uses the running scan."""
 
-    __slots__ = ("executed", "first_scan", "instances", "left", "lookup", "now_ns")
+    __slots__ = ("executed", "first_scan", "instances", "left", "lookup", "now_ns", "scan")
 
     def __init__(self) -> None:
         self.left = MAX_STEPS
         """The number of loop iterations and calls that the scan may still make."""
         self.now_ns = 0
+        self.scan = 0
+        """The number of the scan, for the records of assignments."""
         self.first_scan = False
         self.instances = 0
         """The number of instances that variables of an interface type can refer to."""
@@ -134,6 +136,7 @@ class Resource:
         context = self.context
         context.left = MAX_STEPS
         context.now_ns, context.first_scan, context.lookup = scan.now_ns, scan.first_scan, lookup
+        context.scan = scan.number
 
     def numbers(self, body: Any) -> dict[int, int]:
         """Return the numbers of the objects of a program by their ids, if its variables may be references."""

@@ -18,6 +18,16 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.plc.st.runtime import copying, layouts
 from fieldtwin.plc.st.runtime.arrays import OpenArray, bound
 from fieldtwin.plc.st.runtime.layouts import Stored
+from fieldtwin.plc.st.runtime.lines import (
+    NO_LINES,
+    ElementLines,
+    RowLines,
+    assigned_array,
+    assigned_whole,
+    hand_lines,
+    lent,
+    lines_in,
+)
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.moments import (
     date_of,
@@ -56,16 +66,21 @@ from fieldtwin.plc.st.runtime.references import (
 )
 
 __all__ = [  # and all names that compiled code calls
+    "NO_LINES",
     "Cell",
     "Characters",
     "Cut",
     "Element",
+    "ElementLines",
     "Instance",
     "Letters",
     "LogicError",
     "MemberReference",
     "OpenArray",
+    "RowLines",
     "Whole",
+    "assigned_array",
+    "assigned_whole",
     "attempted",
     "bound",
     "characters",
@@ -77,8 +92,11 @@ __all__ = [  # and all names that compiled code calls
     "dt_of",
     "first",
     "from_beginning",
+    "hand_lines",
     "instance",
     "layouts",
+    "lent",
+    "lines_in",
     "memory",
     "moment_text",
     "moved",
@@ -422,7 +440,8 @@ def number_of(text: str, low: int, high: int) -> int:
 
 
 def leading_number(text: str, low: int, high: int) -> int:
-    """Return the number with which a string begins, as CODESYS converts it: 12 for ``12abc``, 3 for ``3.14``, 0 without a number.
+    """Return the number with which a string begins, as CODESYS converts it: 12 for ``12abc``, 3 for ``3.14``, 0 without a
+    number.
 
     Raises `LogicError` for a number that does not fit.
     """

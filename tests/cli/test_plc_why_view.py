@@ -17,7 +17,15 @@ def test_the_statement_its_conditions_and_its_variables_are_shown(capsys: pytest
                 {"line": 14, "text": "state = FILLING", "holds": True},
                 {"line": 15, "text": "level >= 80.0", "holds": False},
             ],
-            "variables": {"timer.Q": "TRUE"},
+            "variables": {"timer.Q": "TRUE", "levels[2]": "90"},
+            "indices": {"i": "2"},
+            "notes": ["at^: at is NULL"],
+            "inside": [
+                {
+                    "instance": "levels[2]", "block": "", "place": "pump.st:9", "scan": 510, "statement": "levels[n] := raw",
+                    "conditions": [], "variables": {},
+                },
+            ],
         },
     }  # fmt: skip
     print_why("pump.state", [change])
@@ -27,6 +35,10 @@ def test_the_statement_its_conditions_and_its_variables_are_shown(capsys: pytest
         "        because state = FILLING  (line 14)",
         "        because not level >= 80.0  (line 15)",
         "        timer.Q is TRUE after the scan",
+        "        levels[2] is 90 after the scan",
+        "        i was 2 in this line",
+        "        not followed: at^: at is NULL",
+        "    levels[2]: in pump.st:9, scan 510  levels[n] := raw",
         "    level was 10.5",
     ]
 

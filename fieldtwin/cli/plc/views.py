@@ -275,20 +275,28 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
 
 def _print_decision(place: str, decided: Mapping[str, Any]) -> None:
     """Print the line that made a change; for Structured Text with its statement, the conditions around it, and the values that
-    its variables had after the scan. The statements inside function blocks follow.
+    its variables had after the scan. The statements that assigned what it used follow.
     """
     _print_statement(f"in {place}", decided)
     for one in decided.get("inside", ()):
-        _print_statement(f"{one['instance']} ({one['block']}): in {one['place']}", one)
+        block = f" ({one['block']})" if one["block"] else ""
+        scan = f", scan {one['scan']}" if one.get("scan") else ""
+        _print_statement(f"{one['instance']}{block}: in {one['place']}{scan}", one)
 
 
 def _print_statement(where: str, decided: Mapping[str, Any]) -> None:
     stdout.print(f"    {where}  {decided.get('statement', '')}".rstrip(), markup=False, soft_wrap=True)
+    if decided.get("executed_in"):
+        stdout.print(f"        executed in {decided['executed_in']}", markup=False, soft_wrap=True)
     for one in decided.get("conditions", ()):
         said = "because" if one["holds"] else "because not"
         stdout.print(f"        {said} {one['text']}  (line {one['line']})", markup=False, soft_wrap=True)
     for name, value in decided.get("variables", {}).items():
         stdout.print(f"        {name} is {value} after the scan", markup=False, soft_wrap=True)
+    for name, value in decided.get("indices", {}).items():
+        stdout.print(f"        {name} was {value} in this line", markup=False, soft_wrap=True)
+    for note in decided.get("notes", ()):
+        stdout.print(f"        not followed: {note}", markup=False, soft_wrap=True)
 
 
 def _us(us: float) -> str:

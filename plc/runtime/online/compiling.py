@@ -26,7 +26,7 @@ from fieldtwin.plc.runtime.realtime import make_way
 from fieldtwin.plc.runtime.sources import ProgramSource, digest_of
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.decisions import Decisions, decisions_of
+from fieldtwin.plc.st.decisions.statements import Decisions, decisions_of
 from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.drawing.live import Pictures
 from fieldtwin.plc.st.program import StProgram, program_class
@@ -161,7 +161,7 @@ def _unpacked(packed: _Packed) -> tuple[CompiledUnit, Decisions]:
         blocks=dict(_joined(packed.blocks)),
         globals=dict(_joined(packed.globals)),
     )
-    return unit, dict(_joined(packed.decisions))
+    return unit, Decisions(unit.source, dict(_joined(packed.decisions)))
 
 
 def _pieces(entries: list[Any]) -> list[bytes]:

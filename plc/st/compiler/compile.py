@@ -8,7 +8,7 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import CodeType
 from typing import Any
@@ -19,6 +19,7 @@ from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
 from fieldtwin.plc.st.classes.structures import with_inherited_members
+from fieldtwin.plc.st.compiler.assignments import Arrays, Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.called import with_called_programs
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
 from fieldtwin.plc.st.compiler.configurations.located import (
@@ -157,8 +158,9 @@ class _Unit:
         self.env.errors.raise_all()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
-        outputs = {**self.programs.outputs, **self.blocks.outputs}
-        lines = SourceLines(self.out, self.path, outputs, self.programs.shared_outputs)
+        assignments = {**self.programs.recorded, **self.blocks.recorded}
+        arrays = self._arrays(assignments.values())
+        lines = SourceLines(self.out, self.path, assignments, self.programs.shared_outputs, arrays)
         code = lines.code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
@@ -182,6 +184,18 @@ class _Unit:
             tuple(lines.places()),
             self.env,
         )
+
+    def _arrays(self, recorded: Collection[Recorded]) -> Arrays:
+        """Return the attributes that hold arrays of simple values."""
+        own = {name for one in recorded for name in one.arrays}
+        own |= {v.attribute for v in self.variables.kept_globals().values() if is_recorded(v.kind)}
+        members: dict[bool, set[str]] = {True: set(), False: set()}
+        for kind in self.env.types.values():
+            for name, (_, of) in kind.fields.items() if isinstance(kind, ty.Struct) else ():
+                members[is_recorded(of)].add(f"m_{name}")
+        own |= members[True] & members[False]
+        lent = frozenset(name for one in recorded for name in one.lent)
+        return Arrays(frozenset(own), lent, frozenset(members[True] - members[False]))
 
     def _names(self) -> Iterator[tuple[str, str]]:
         for pou in self.unit.pous:

@@ -15,6 +15,7 @@ from fieldtwin.plc.st.compiler.calls import Calls
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED, InitialValues, element
 from fieldtwin.plc.st.compiler.pointers.memory import layout, members
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol, default_value, identifier
+from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.walk import nodes
 
@@ -80,7 +81,9 @@ class Declarations:
             self.scope = before
 
     def _values_of(self, pou: t.Pou) -> dict[str, Symbol]:
-        """Return the values of the enumerations without a name in the declarations of a POU; they are known in this POU only."""
+        """Return the values of the enumerations without a name in the declarations of a POU; they are known in this POU
+        only.
+        """
         found: dict[str, Symbol] = {}
         for v in (v for block in pou.blocks for v in block.variables if isinstance(v.type, t.EnumType)):
             enum = self.type_of(v.type)
@@ -458,7 +461,9 @@ class Declarations:
 
     def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
         out, names = self.out, [f"m_{name}" for name in struct.fields]
-        with out.block(f"class S_{identifier(struct.name)}:", declared.pos):
+        with out.block(f"class L_S_{identifier(struct.name)}:", declared.pos):
+            out.line(f"__slots__ = {(*map(line_of, names),)}")
+        with out.block(f"class S_{identifier(struct.name)}(L_S_{identifier(struct.name)}):", declared.pos):
             out.line(f"__slots__ = {tuple(names)}")
             with out.block("def __init__(self):"):
                 for field in declared.fields:

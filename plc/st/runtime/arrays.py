@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+from fieldtwin.plc.st.runtime.lines import NO_LINES
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 
 Ranges = tuple[tuple[int, int], ...]
@@ -12,12 +13,14 @@ Ranges = tuple[tuple[int, int], ...]
 
 
 class OpenArray:
-    """An argument for a parameter of type ``ARRAY[*]``: the `items` of the caller's array, and its `ranges`."""
+    """An argument for a parameter of type ``ARRAY[*]``: the `items` of the caller's array, its `ranges`, and the records of
+    the assignments of its elements (`lines`).
+    """
 
-    __slots__ = ("items", "ranges")
+    __slots__ = ("items", "lines", "ranges")
 
-    def __init__(self, items: list[Any], ranges: Ranges) -> None:
-        self.items, self.ranges = items, ranges
+    def __init__(self, items: list[Any], ranges: Ranges, lines: Any = NO_LINES) -> None:
+        self.items, self.ranges, self.lines = items, ranges, lines
 
     def copied(self) -> OpenArray:
         """Return an array with copies of the items, for a parameter that is an input."""

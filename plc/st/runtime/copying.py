@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fieldtwin.plc.st.runtime.layouts import Layout, Rows, Stored
+from fieldtwin.plc.st.runtime.layouts import Layout, Members, Rows, Stored
+from fieldtwin.plc.st.runtime.lines import assigned_array, assigned_whole
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.references import Element, Reference, Single, Whole
 
@@ -18,7 +19,7 @@ class _Region:
     """The bytes from the variable on to which `reference` points. `layout` is that of the variable."""
 
     def __init__(self, reference: Reference, layout: Layout) -> None:
-        self._first, self._of = 0, layout
+        self._first, self._of, self._reference = 0, layout, reference
         self._items: Any
         if isinstance(reference, Element):
             self._items, self._first = reference.owner, reference.at
@@ -43,6 +44,11 @@ class _Region:
                 _assign(self._items[i], value)
             else:
                 self._items[i] = value
+        lines = self._reference.of_array if isinstance(self._reference, Element) else self._reference.lines
+        if isinstance(self._items, list):  # the lines of these assignments are not known here
+            assigned_array(self._items, lines, ())
+        elif isinstance(self._of, Members) and not isinstance(self._items[0], Stored):
+            assigned_whole(self._items[0], ())
 
     def _touched(self, count: int) -> range:
         return range(self._first, self._first - (-count // self._of.size))

@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any, Protocol
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.runtime.lines import NO_LINES, is_line
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 
 Key = tuple[Any, ...]
@@ -219,6 +220,15 @@ class Overlay(Stored):
     __slots__ = ()
     offsets: dict[str, int]
     layout: Members
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not is_line(name):  # an assignment of one member changes others, so lines are not kept
+            super().__setattr__(name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        if is_line(name):
+            return NO_LINES
+        raise AttributeError(name)
 
 
 class StructureInMemory(Overlay):

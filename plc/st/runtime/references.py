@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from fieldtwin.plc.st.runtime.layouts import Overlay, Row, Stored
-from fieldtwin.plc.st.runtime.lines import line_of
+from fieldtwin.plc.st.runtime.lines import NO_LINES, Record, WholeLines, noted
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
 
@@ -25,14 +25,20 @@ class Reference(Protocol):
     """A reference to a variable, whose value is `v`."""
 
     v: Any
+    lines: Any
+    """The records of the elements, if the variable is an array."""
 
     def key(self) -> Key: ...
+
+    def assign(self, value: Any, record: Record) -> None:
+        """Assign the variable, and record the line."""
 
 
 class Cell:
     """A function's own variable to which references exist."""
 
     __slots__ = ("v",)
+    lines: Any = NO_LINES
 
     def __init__(self, value: Any) -> None:
         self.v = value
@@ -40,11 +46,18 @@ class Cell:
     def key(self) -> Key:
         return (id(self),)
 
+    def assign(self, value: Any, record: Record) -> None:
+        self.v = value
+
 
 class Whole(Cell):
     """A reference to an array, a structure or a block, which always stays the same Python object."""
 
-    __slots__ = ()
+    __slots__ = ("lines",)
+
+    def __init__(self, value: Any, lines: Any = NO_LINES) -> None:
+        super().__init__(value)
+        self.lines = lines
 
     def key(self) -> Key:
         return self.v.key() if isinstance(self.v, Characters | Memory | Stored) else (id(self.v),)
@@ -54,6 +67,7 @@ class MemberReference:
     """A reference to an attribute: a variable of a program or block, a global variable, or a member of a structure."""
 
     __slots__ = ("name", "owner")
+    lines = NO_LINES
 
     def __init__(self, owner: Any, name: str) -> None:
         self.owner, self.name = owner, name
@@ -70,9 +84,11 @@ class MemberReference:
     @v.setter
     def v(self, value: Any) -> None:
         setattr(self.owner, self.name, value)
-        line = line_of(self.name)
-        if getattr(self.owner, line, 0):  # that of an earlier assignment; the line of this one is not known here
-            setattr(self.owner, line, 0)
+        noted(self.owner, self.name, ())  # the line of this assignment is not known here
+
+    def assign(self, value: Any, record: Record) -> None:
+        setattr(self.owner, self.name, value)
+        noted(self.owner, self.name, record)
 
 
 class Element:
@@ -81,10 +97,13 @@ class Element:
     A pointer may be moved to any place `at`. It raises `LogicError` when it is used outside the array.
     """
 
-    __slots__ = ("at", "owner")
+    __slots__ = ("at", "of_array", "owner")
+    lines = NO_LINES
 
-    def __init__(self, owner: Any, at: int) -> None:
+    def __init__(self, owner: Any, at: int, lines: Any = NO_LINES) -> None:
         self.owner, self.at = owner, at
+        self.of_array = lines
+        """The records of the elements of its array."""
 
     def key(self) -> Key:
         if isinstance(self.owner, Row):
@@ -104,6 +123,11 @@ class Element:
         if not 0 <= self.at < len(self.owner):
             self._fail()
         self.owner[self.at] = value
+        self.of_array.assigned(self.at, ())
+
+    def assign(self, value: Any, record: Record) -> None:
+        self.v = value
+        self.of_array.assigned(self.at, record)
 
     def _fail(self) -> None:
         expected = f"element 1 to {len(self.owner)}"
@@ -114,6 +138,7 @@ class Cut:
     """A reference to a string with another length than the variable: its value is cut to `length` characters."""
 
     __slots__ = ("_length", "_of")
+    lines = NO_LINES
 
     def __init__(self, of: Any, length: int) -> None:
         self._of, self._length = of, length
@@ -129,6 +154,9 @@ class Cut:
     @v.setter
     def v(self, value: str) -> None:
         self._of.v = value[: self._length]
+
+    def assign(self, value: str, record: Record) -> None:
+        self._of.assign(value[: self._length], record)
 
 
 class Instance:
@@ -180,8 +208,8 @@ class Single(_Parts):
 class Characters(_Parts):
     """A string as an array of its bytes. The byte after its last character, and those after that one, are 0.
 
-    An assigned 0 ends the string. A character can be assigned up to the end of the string; one that would be after the end raises
-    `LogicError`, because a string has no bytes there.
+    An assigned 0 ends the string. A character can be assigned up to the end of the string; one that would be after the end
+    raises `LogicError`, because a string has no bytes there.
     """
 
     __slots__ = ("_length",)
@@ -255,7 +283,7 @@ def same(a: Reference | None, b: Reference | None) -> bool:
 
 def first(reference: Reference | None) -> Reference | None:
     """Return a pointer to the first element of the array to which `reference` refers."""
-    return None if reference is None else Element(reference.v, 0)
+    return None if reference is None else Element(reference.v, 0, reference.lines)
 
 
 def cut(reference: Reference | None, length: int) -> Reference | None:
@@ -276,12 +304,12 @@ def memory(reference: Reference | None, held: str, shown: str, *, array: bool) -
     if reference is None:
         return None
     if array:
-        owner, at = reference.v, 0
+        owner, at, lines = reference.v, 0, reference.lines
     elif isinstance(reference, Element):
-        owner, at = reference.owner, reference.at
+        owner, at, lines = reference.owner, reference.at, reference.of_array
     else:
-        owner, at = Single(reference), 0
-    return Element(Memory(owner, held, shown), place_in_memory(at, held, shown))
+        owner, at, lines = Single(reference), 0, NO_LINES
+    return Element(Memory(owner, held, shown), place_in_memory(at, held, shown), WholeLines(lines))
 
 
 def from_beginning(reference: Reference | None) -> Reference | None:
@@ -291,7 +319,7 @@ def from_beginning(reference: Reference | None) -> Reference | None:
     assert isinstance(reference, Element)
     if reference.at:
         raise LogicError("a pointer to an array that begins in the middle of another one", expected="the first element")
-    return Whole(reference.owner)
+    return Whole(reference.owner, reference.of_array)
 
 
 def moved(reference: Reference | None, amount: int, size: int) -> Reference:
@@ -306,7 +334,7 @@ def moved(reference: Reference | None, amount: int, size: int) -> Reference:
         )
     held = pointed(reference)
     if isinstance(held, Element):
-        return Element(held.owner, held.at + at)
+        return Element(held.owner, held.at + at, held.of_array)
     return Element(Single(held), at)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from st_bench import program, scan
 
-from fieldtwin.plc.program import Described
-from fieldtwin.plc.st.decisions import decisions_of
+from fieldtwin.plc.st.decisions.reading import Decided
+from fieldtwin.plc.st.decisions.statements import decisions_of
 from fieldtwin.plc.st.program import StProgram
 
 PUMP = """TYPE States : (IDLE, FILLING, FULL, FAULT); END_TYPE
@@ -34,7 +34,7 @@ END_PROGRAM
 """
 
 
-def decision_of(made: StProgram, name: str) -> Described | None:
+def decision_of(made: StProgram, name: str) -> Decided | None:
     place = made.place(name)
     return made.decided(name, place) if place is not None else None
 
@@ -276,7 +276,7 @@ END_PROGRAM
 """
 
 
-def test_an_output_that_a_pointer_assigned_has_no_line_instead_of_an_old_one() -> None:
+def test_an_output_that_a_pointer_assigned_has_the_line_of_the_statement_with_the_pointer() -> None:
     made = program(POINTERS, dialect="codesys")
     scan(made, 1)
     place, found = made.place("q"), decision_of(made, "r")
@@ -286,10 +286,10 @@ def test_an_output_that_a_pointer_assigned_has_no_line_instead_of_an_old_one() -
     assert len(found.inside) == 1
     scan(made, 2)
     found = decision_of(made, "r")
-    assert made.place("q") is None
-    assert decision_of(made, "q") is None
     assert found is not None
-    assert found.inside == ()
+    assert [(one["place"], one["statement"]) for one in found.describe()["inside"]] == [("test.st:6", "p^ := 5")]
+    place, found = made.place("q"), decision_of(made, "q")
+    assert (place and place.line, found and found.decision.text) == (18, "at^ := 5")
 
 
 def test_an_output_that_an_inherited_body_assigned_has_the_line_of_the_base() -> None:

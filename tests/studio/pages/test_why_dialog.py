@@ -18,12 +18,13 @@ PROGRAM = """
 PROGRAM Fill
 VAR_INPUT level : REAL; END_VAR
 VAR_OUTPUT run : BOOL; END_VAR
-VAR settled : TON; END_VAR
+VAR settled : TON; states : ARRAY[1..2] OF BOOL; n : INT := 2; END_VAR
   settled(IN := TRUE, PT := T#1s);
   IF level > 100000.0 THEN
     run := FALSE;
   ELSIF settled.Q THEN
-    run := TRUE;
+    states[n] := TRUE;
+    run := states[n];
   END_IF
 END_PROGRAM
 """
@@ -36,8 +37,10 @@ def test_the_statement_and_what_decided_are_shown(tmp_path: Path) -> None:
         page.go(f"{running.url}?token={OPERATE}#/tank/plc")
         page.sees("main", "true")  # the timer has run out
         page.click("tr button", "Why?")
-        page.sees("dialog .decision", "run := TRUE")
+        page.sees("dialog .decision", "run := states[n]")
         page.sees("dialog .conditions", "level > 100000.0 was false")
         page.sees("dialog .conditions", "settled.Q was true")
         page.sees("dialog", "settled.Q")
+        page.sees("dialog", "In this line n was 2")
+        page.sees("dialog", "In states[2], line")
         assert page.complaints() == []

@@ -28,6 +28,7 @@ function FromGateway({ store, tag }) {
 function Decision({ decided }) {
   const variables = Object.entries(decided.variables);
   return html`<pre class="decision">${decided.statement}</pre>
+    ${decided.executed_in && html`<p>Executed in <strong>${decided.executed_in}</strong>.</p>`}
     ${decided.conditions.length > 0 &&
     html`<ul class="conditions">
       ${decided.conditions.map((c) => html`<li key=${c.line + c.text}>line ${c.line}: <code>${c.text}</code> ${c.holds ? "was true" : "was false"}</li>`)}
@@ -37,7 +38,10 @@ function Decision({ decided }) {
       <thead><tr><th>Variable after the scan</th><th class="number">Value</th></tr></thead>
       <tbody>${variables.map(([name, v]) => html`<tr key=${name}><td>${name}</td><td class="number">${v}</td></tr>`)}</tbody>
     </table>`}
-    ${(decided.inside ?? []).map((one) => html`<p key=${one.instance + one.place}>In <strong>${one.instance}</strong> (${one.block}), line <code>${one.place}</code>:</p>
+    ${Object.keys(decided.indices ?? {}).length > 0 &&
+    html`<p>In this line ${Object.entries(decided.indices).map(([name, v], n) => html`${n ? ", " : ""}${name} was <strong>${v}</strong>`)}.</p>`}
+    ${(decided.notes ?? []).map((note) => html`<p key=${note} class="soft">Not followed: ${note}.</p>`)}
+    ${(decided.inside ?? []).map((one) => html`<p key=${one.instance + one.place}>In <strong>${one.instance}</strong>${one.block ? ` (${one.block})` : ""}, line <code>${one.place}</code>${one.scan ? `, scan ${one.scan}` : ""}:</p>
       <${Decision} decided=${one} />`)}`;
 }
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.assignments import Recorded, is_recorded
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
 from fieldtwin.plc.st.compiler.scope import Symbol, by_reference, identifier
 from fieldtwin.plc.st.compiler.statements import Statements
-from fieldtwin.plc.st.runtime.lines import line_of
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import area_of
 
@@ -95,8 +95,8 @@ class Blocks(Bodies):
         super().__init__(variables, functions)
         self.kept: dict[str, tuple[tuple[str, ty.Type], ...]] = {}
         """By function block: its variables that keep their values."""
-        self.outputs: dict[str, frozenset[str]] = {}
-        """By class of a function block: the attributes that hold its outputs, and its variables at %Q*."""
+        self.recorded: dict[str, Recorded] = {}
+        """By class of a function block: the attributes of its outputs, of its variables at %Q*, and of its arrays."""
 
     def write(self, pou: t.Pou) -> None:
         """Write the Python class of a FUNCTION_BLOCK or CLASS."""
@@ -112,7 +112,7 @@ class Blocks(Bodies):
             for s, attribute in zip(held, kept, strict=True)
             if attribute not in in_outs and not s.is_constant
         )
-        with self.out.block(f"class {self._class_of(pou, kept)}:", pou.pos):
+        with self.out.block(f"class {self._class_of(pou, symbols, kept, in_outs)}:", pou.pos):
             self.out.line(f"__slots__ = {(*kept, *number)}")
             self.out.line(f"in_outs = {(*in_outs, *number)}")
             self.out.line(f"name = {pou.name!r}")
@@ -175,19 +175,24 @@ class Blocks(Bodies):
             )
             self.out.line("return self", method.pos)
 
-    def _class_of(self, pou: t.Pou, kept: list[str]) -> str:
-        """Return the head of the class of a POU. The lines of the last assignments of its outputs and of its variables at %Q* are
-        in a base class, because they do not belong to the state.
+    def _class_of(self, pou: t.Pou, symbols: dict[str, Symbol], kept: list[str], in_outs: list[str]) -> str:
+        """Return the head of the class of a POU. The lines of the last assignments of its outputs, of its variables at %Q* and
+        of elements of its arrays are in a base class, because they do not belong to the state.
         """
         name = f"B_{identifier(pou.name)}"
         variables = [(v, block) for block in pou.blocks for v in block.variables]
         wanted = {f"v_{v.name.lower()}" for v, b in variables if b.kind == "VAR_OUTPUT" or area_of(v.location) == "Q"}
-        outputs = [attribute for attribute in kept if attribute in wanted]
-        if not outputs:
+        arrays = {f"v_{key}" for key, symbol in symbols.items() if is_recorded(symbol.type)}
+        recorded = Recorded(
+            frozenset(wanted.intersection(kept) - arrays),
+            frozenset(arrays.intersection(kept).difference(in_outs)),
+            frozenset(arrays.intersection(in_outs)),
+        )
+        if recorded == Recorded():
             return name
-        self.outputs[name] = frozenset(outputs)
+        self.recorded[name] = recorded
         with self.out.block(f"class L_{identifier(pou.name)}:", pou.pos):
-            self.out.line(f"__slots__ = {(*map(line_of, outputs),)}")
+            self.out.line(f"__slots__ = {recorded.slots()}")
         return f"{name}(L_{identifier(pou.name)})"
 
     def _marked(self, pou: t.Pou, symbols: dict[str, Symbol], *words: str) -> tuple[str, ...]:

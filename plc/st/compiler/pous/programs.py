@@ -8,6 +8,7 @@ from itertools import islice
 
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.compiler.assignments import Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.configured import ConfiguredParts
 from fieldtwin.plc.st.compiler.configurations.located import Offered, offered
 from fieldtwin.plc.st.compiler.configurations.parts import MAX_PARTS, Parts
@@ -35,10 +36,10 @@ _AREAS = {"input": "%I*", "output": "%Q*"}
 class ProgramVariable:
     """A variable of a PROGRAM, or a part of one, that can be bound to a tag.
 
-    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts. Its value
-    is the `attribute` of the program's object, or of the object with the global variables if it is `shared`. The value of a part,
-    such as ``pump.fault``, is the `attribute`, or the element, of the object that is reached from there through `steps`.
-    `location` is its address, if any. An `optional` input need not be bound to a tag.
+    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts. Its
+    value is the `attribute` of the program's object, or of the object with the global variables if it is `shared`. The value of
+    a part, such as ``pump.fault``, is the `attribute`, or the element, of the object that is reached from there through
+    `steps`. `location` is its address, if any. An `optional` input need not be bound to a tag.
     """
 
     name: str
@@ -71,8 +72,8 @@ class Programs(Bodies):
         self._unit = unit
         self._parts = Parts(unit, self.declarations)
         self.configured = ConfiguredParts(self.env, self.declarations, unit)
-        self.outputs: dict[str, frozenset[str]] = {}
-        """By class of a PROGRAM: the attributes that hold its outputs and local variables."""
+        self.recorded: dict[str, Recorded] = {}
+        """By class of a PROGRAM: the attributes whose assignments are recorded, among them its outputs and local variables."""
         self.shared_outputs: set[str] = set()
         """The attributes of global variables that are outputs."""
 
@@ -110,7 +111,10 @@ class Programs(Bodies):
         variables += self._offered(pou, {v.name.lower() for v in variables})
         shared = (v for v in variables if v.shared and v.role != "input" and not v.steps)
         self.shared_outputs.update(str(v.attribute) for v in shared)
-        self.outputs[f"P_{identifier(pou.name)}"] = assigned
+        arrays = frozenset(
+            f"v_{s.name.lower()}" for s in symbols.values() if s.code.startswith("self.") and is_recorded(s.type)
+        )
+        self.recorded[f"P_{identifier(pou.name)}"] = Recorded(assigned - arrays, arrays)
         with self.out.block(f"class P_{identifier(pou.name)}:", pou.pos):
             with self.out.block("def __init__(self):"):
                 self.variables.initialise(pou, symbols, tuple(_BLOCKS))

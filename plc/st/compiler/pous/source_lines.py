@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from types import CodeType
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.st.compiler.assignments import Assignments
+from fieldtwin.plc.st.compiler.assignments import Arrays, Assignments, MemberLines, Recorded
 from fieldtwin.plc.st.compiler.pous.inlining import Inlining
 from fieldtwin.plc.st.compiler.scope import CodeWriter
 from fieldtwin.plc.st.syntax import tree as t
@@ -17,10 +17,18 @@ class SourceLines:
     """The lines of the source from which the code in `out` was written. `path` is that of code without a file."""
 
     def __init__(
-        self, out: CodeWriter, path: str, outputs: Mapping[str, frozenset[str]], shared: Collection[str]
+        self,
+        out: CodeWriter,
+        path: str,
+        recorded: Mapping[str, Recorded],
+        shared: Collection[str],
+        arrays: Arrays,
     ) -> None:
-        """`outputs` has the attributes that hold outputs by class of a program or block; `shared` are those of globals."""
-        self.out, self.path, self.outputs, self.shared = out, path, outputs, frozenset(shared)
+        """`recorded` has the attributes whose assignments are recorded by class of a program or block; `shared` are those of
+        global variables. `arrays` has the arrays of the unit.
+        """
+        self.out, self.path, self.recorded = out, path, recorded
+        self.shared, self.arrays = frozenset(shared), arrays
 
     def code(self, text: str) -> tuple[CodeType, ...]:
         """Return the code of each file, in the order of the Python code `text`. Raises `FileInvalid` beyond Python's limits."""
@@ -54,9 +62,10 @@ class SourceLines:
                 node.lineno = node.end_lineno = places[min(node.lineno, len(places)) - 1].line
                 node.col_offset = node.end_col_offset = 0
         if isinstance(statement, ast.ClassDef | ast.FunctionDef):
-            own = self.outputs.get(statement.name, frozenset())
-            if own or self.shared:
-                of_block = not statement.name.startswith("P_")
-                Assignments(own, self.shared, path, with_path=of_block).visit(statement)
+            if statement.name.startswith("S_"):
+                MemberLines(self.arrays.members).visit(statement)
+            else:
+                own, of_block = self.recorded.get(statement.name, Recorded()), not statement.name.startswith("P_")
+                Assignments(own, self.arrays, self.shared, path, with_path=of_block).visit(statement)
             Inlining().visit(statement)
         return ast.fix_missing_locations(statement)

@@ -262,6 +262,10 @@ class Declarations:
             aliases = _VENDOR_NAMES.get(key.partition("_")[0], {}) if self.env.dialect.vendor else {}
             return replace(found, aliases=aliases)
         known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
+        library = name.rpartition(".")[0]
+        if library:
+            known = [one for one in known if "." in one]
+            raise self.env.unknown(pos, "a type", name, known, self.env.of_library(library))
         raise self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
 
     def _declared(self, declared: t.TypeDecl) -> ty.Type:

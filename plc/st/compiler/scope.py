@@ -294,7 +294,7 @@ class Environment:
         self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known) or hint)
 
     def of_library(self, name: str) -> str:
-        """Return the advice for an unknown name before a dot, which may be that of a library; "" if there are no such names."""
+        """Return the advice for an unknown name before a dot, which may be the name of a library; "" in other dialects."""
         if not self.dialect.vendor:
             return ""
         return f"if {name} is a library, name its folder under libraries: in the system file, or with --library DIR"

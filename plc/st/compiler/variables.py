@@ -143,7 +143,7 @@ def _enum_value(x: Compiling, ref: t.Ref) -> Value:
 
 
 def unknown_variable(x: Compiling, ref: t.Ref) -> NoReturn:
-    """Raise the error of a name that is no variable."""
+    """Raise the error of a name that is not declared as a variable."""
     known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
     qualifies = bool(ref.selectors) and isinstance(ref.selectors[0], t.Member)
     x.env.unknown(ref.pos, "a variable", ref.name, known, x.env.of_library(ref.name) if qualifies else "")

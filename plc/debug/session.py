@@ -83,9 +83,9 @@ class Session:
                 answer["body"] = body
         except FieldtwinError as e:
             lines = [str(e), *(str(other) for other in getattr(e, "others", ()))]
-            answer |= {"success": False, "message": "\n".join(lines)}
+            answer |= _failure("\n".join(lines))
         except (KeyError, TypeError, ValueError) as e:
-            answer |= {"success": False, "message": f"the arguments of {command}: {type(e).__name__}: {e}"}
+            answer |= _failure(f"the arguments of {command}: {type(e).__name__}: {e}")
         self.send("response", **answer)
         if command in ("launch", "attach") and answer["success"]:
             self.send("event", event="initialized")
@@ -283,6 +283,11 @@ class Session:
 
     def do_pause(self, given: dict[str, Any]) -> None:
         self.tracer.pause()
+
+
+def _failure(text: str) -> dict[str, Any]:
+    """Return the part of a response that says why a request failed. The body is for editors that do not show the message."""
+    return {"success": False, "message": text, "body": {"error": {"id": 1, "format": text}}}
 
 
 def _time_text(space: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,25 @@ if TYPE_CHECKING:
 
 DEFAULT_S = 60.0
 """The virtual time of a system that is debugged, in seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Options:
+    """The options of a program, which a launch request can override."""
+
+    dialect: str | None
+    libraries: tuple[Path, ...]
+    duration_s: float
+    seed: int | None
+
+    def overridden(self, given: dict[str, Any]) -> _Options:
+        """Return the options with the arguments of a launch request. Raises `UsageError`."""
+        try:
+            duration_s = Duration().convert(given.get("for", self.duration_s), None, None)
+        except click.BadParameter as e:
+            raise UsageError(f"`for` in the launch request: {e.message}") from e
+        libraries = tuple(Path(one) for one in given.get("libraries", self.libraries))
+        return _Options(given.get("dialect", self.dialect), libraries, duration_s, given.get("seed", self.seed))
 
 
 @click.command("debug", cls=GroupedCommand)
@@ -60,16 +80,18 @@ def debug(
     """Debug unit tests (a file *.test.st) or the programs of a system (in virtual time) from an editor.
 
     The editor speaks the Debug Adapter Protocol: breakpoints, steps over lines, variables, watches. Without SOURCE, the launch
-    request of the editor names it as `program`.
+    request of the editor names it as `program`. Its arguments `for`, `seed`, `dialect` and `libraries` override the options.
     """
     from fieldtwin.run.debug.adapter import Adapter
     from fieldtwin.run.debug.messages import Messages
+
+    options = _Options(dialect, libraries, duration_s, seed)
 
     def launch(given: dict[str, Any]) -> Debuggee:
         named = source or str(given.get("program", ""))
         if not named:
             raise UsageError("which program is to be debugged", expected="SOURCE, or `program` in the launch request")
-        return _debuggee(named, dialect, libraries, duration_s, seed, sources)
+        return _debuggee(named, options.overridden(given), sources)
 
     if port is None:
         Adapter(Messages(sys.stdin.buffer, sys.stdout.buffer), launch).serve()
@@ -82,21 +104,14 @@ def debug(
     return 0
 
 
-def _debuggee(
-    named: str,
-    dialect: str | None,
-    libraries: tuple[Path, ...],
-    duration_s: float,
-    seed: int | None,
-    sources: TemplateSearchOptions,
-) -> Debuggee:
+def _debuggee(named: str, options: _Options, sources: TemplateSearchOptions) -> Debuggee:
     from fieldtwin.plc.st.project import compile_source
     from fieldtwin.run.debug.programs import unit_tests, virtual_run
     from fieldtwin.run.template import system_file
     from fieldtwin.run.virtual.run import VirtualOptions
     from fieldtwin.twin.site.system import load_system
 
-    found = source_file(named, dialect, libraries)
+    found = source_file(named, options.dialect, options.libraries)
     if found is not None:
         path, chosen, used = found
         return unit_tests(path, chosen, used)
@@ -105,4 +120,4 @@ def _debuggee(
     if not programs:
         raise UsageError(f"no program in Structured Text in {named}", expected="a system whose `plc.programs` have one")
     units = [compile_source(*one) for one in dict.fromkeys(programs.values())]
-    return virtual_run(VirtualOptions(file, duration_s, seed, sources.profiles), units)
+    return virtual_run(VirtualOptions(file, options.duration_s, options.seed, sources.profiles), units)

@@ -13,6 +13,7 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.plc.debug.session import Session
 from fieldtwin.plc.debug.tracer import Resume, Tracer
+from fieldtwin.run.debug.arguments import ATTACH, LAUNCH, checked
 from fieldtwin.run.debug.messages import Messages
 from fieldtwin.run.debug.programs import Debuggee
 from fieldtwin.run.debug.relay import Relay, attach
@@ -20,7 +21,7 @@ from fieldtwin.run.debug.relay import Relay, attach
 ENDING_S = 5.0
 """How long the end of a session waits for its program, in seconds."""
 Launch = Callable[[dict[str, Any]], Debuggee]
-"""Reads and compiles the program for the arguments of a launch request. Raises `FieldtwinError`."""
+"""Reads and compiles the program for the checked arguments of a launch request. Raises `FieldtwinError`."""
 
 
 class Adapter(Session):
@@ -58,7 +59,7 @@ class Adapter(Session):
     def do_launch(self, given: dict[str, Any]) -> None:
         if self._thread is not None:
             raise UsageError("the program has been launched before")
-        self._debuggee = self._launch(given)
+        self._debuggee = self._launch(checked("launch", given, LAUNCH))
         self.show(self._debuggee.units, self._debuggee.names)
         if given.get("stopOnEntry") is True:
             self.tracer.step_first()
@@ -68,7 +69,7 @@ class Adapter(Session):
     def do_attach(self, given: dict[str, Any]) -> None:
         if self._thread is not None:
             raise UsageError("a program has been launched before")
-        self._relay = attach(str(given.get("instance", "")), self.send)
+        self._relay = attach(checked("attach", given, ATTACH).get("instance", ""), self.send)
 
     def do_configurationDone(self, given: dict[str, Any]) -> None:
         self._thread = threading.Thread(target=self._run, name="debugged program", daemon=True)

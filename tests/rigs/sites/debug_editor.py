@@ -12,16 +12,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from debug_protocol_schema import validate
+
 from fieldtwin.run.debug.adapter import Adapter, Launch
 from fieldtwin.run.debug.messages import Messages
 
 
 class Editor:
-    """A client of the protocol on a pair of byte streams."""
+    """A client of the protocol on a pair of byte streams. It validates the messages of both directions."""
 
     def __init__(self, reading: BinaryIO, writing: BinaryIO) -> None:
         self.reading, self.writing = reading, writing
-        self.sequence = 0
+        self.sequence = self.read_sequence = 0
         self.events: list[dict[str, Any]] = []
 
     def read(self) -> dict[str, Any]:
@@ -32,6 +34,9 @@ class Editor:
                 length = int(value)
         assert length, self.complaint()
         found: dict[str, Any] = json.loads(self.reading.read(length))
+        validate(found)
+        self.read_sequence += 1
+        assert found["seq"] == self.read_sequence
         return found
 
     def complaint(self) -> str:
@@ -44,6 +49,11 @@ class Editor:
 
     def request(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Return the response. Events that come before it are kept."""
+        validate({"seq": 1, "type": "request", "command": command, "arguments": arguments})
+        return self.bad_request(command, **arguments)
+
+    def bad_request(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Return the response to a request that may violate the protocol."""
         self.sequence += 1
         self.send(
             json.dumps({"seq": self.sequence, "type": "request", "command": command, "arguments": arguments}).encode()

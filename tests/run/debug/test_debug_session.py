@@ -120,7 +120,7 @@ def test_a_step_over_a_call_executes_the_whole_line(editor: ProcessEditor, proje
 def test_a_breakpoint_moves_to_the_next_statement_and_stops_once_in_each_call(
     editor: ProcessEditor, project: Path
 ) -> None:
-    editor.ask("initialize")
+    editor.ask("initialize", adapterID="fieldtwin")
     editor.ask("launch")
     source = {"path": str(project / "counter.st")}
     answer = editor.ask("setBreakpoints", source=source, breakpoints=[{"line": 9}, {"line": 400}])
@@ -176,7 +176,7 @@ def test_an_error_in_a_scan_stops_at_its_line(project: Path, opened: Open) -> No
 def test_a_source_with_an_error_is_a_failed_launch(project: Path, opened: Open) -> None:
     (project / "bad.test.st").write_text("TEST 'bad'\n  nothing := 1;\nEND_TEST\n")
     editor = opened()
-    editor.ask("initialize")
+    editor.ask("initialize", adapterID="fieldtwin")
     answer = editor.request("launch", program=str(project / "bad.test.st"))
     assert not answer["success"]
     assert "bad.test.st:2:3: a variable 'nothing' is not declared" in answer["message"]
@@ -196,9 +196,9 @@ def test_an_endless_program_is_paused_and_ended(project: Path, opened: Open) -> 
 
 
 def test_requests_at_the_wrong_time_and_bad_messages_are_answered(editor: ProcessEditor) -> None:
-    assert "not supported: fly" in editor.request("fly")["message"]
-    assert "the program is not stopped" in editor.request("continue")["message"]
-    assert "the arguments of setBreakpoints" in editor.request("setBreakpoints")["message"]
+    assert "not supported: fly" in editor.bad_request("fly")["message"]
+    assert "the program is not stopped" in editor.request("continue", threadId=1)["message"]
+    assert "the arguments of setBreakpoints" in editor.bad_request("setBreakpoints")["message"]
     assert "these variables no longer exist" in editor.request("variables", variablesReference=3)["message"]
     editor.send(b"[]")
     assert editor.process.wait(20) == 2

@@ -44,6 +44,13 @@ _MEANINGS = {
         "LINT at most; CODESYS may compute in a narrower one.",
         "Convert one operand to the type of the other.",
     ),
+    "ST009": (
+        "A function block declares FB_exit or FB_reinit. A controller of CODESYS calls FB_exit before an instance is deleted or "
+        "copied, and FB_reinit after an online change has copied it. Here no instance is deleted while its program runs, an "
+        "online change creates new instances with FB_init, and they get the values of the old ones. Only calls in the program "
+        "execute the two methods.",
+        "Move what has to happen at a start into FB_init. For a reaction to an online change, compare values in the body.",
+    ),
     "ST100": (
         "A comment `fieldtwin: allow ID: REASON` accepts a warning in its line or the next one. This one names no warning, "
         "has no reason, or there is no such warning any more.",

@@ -25,6 +25,7 @@ WARNINGS = {
     "ST006": "enumeration used as a number, or number used as an enumeration",
     "ST007": "skipped pragma",
     "ST008": "operands of signed and unsigned types",
+    "ST009": "FB_exit or FB_reinit, which is not called by itself",
 }
 """The id and title of each warning about a construct of a dialect."""
 FINDINGS = {

@@ -52,6 +52,8 @@ def _integers() -> dict[str, Elementary]:
 
 
 BOOL = Elementary("BOOL", "bool", 1, 0, 1)
+BIT = Elementary("BIT", "bool", 1, 0, 1)
+"""A BOOL of CODESYS that is a member of a structure, and has one bit of its memory."""
 REAL = Elementary("REAL", "real", 32)
 LREAL = Elementary("LREAL", "real", 64)
 TIME = Elementary("TIME", "duration", 64, -(2**63), 2**63 - 1)

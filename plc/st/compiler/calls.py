@@ -21,7 +21,7 @@ from fieldtwin.plc.st.compiler.scope import (
     identifier,
     wrapped,
 )
-from fieldtwin.plc.st.compiler.variables import bit, part_of, place, variable
+from fieldtwin.plc.st.compiler.variables import bit, lookup, part_of, place, unknown_variable, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 _OF_ADDRESSES = frozenset({"BITADR", "INDEXOF", "__NEW", "__DELETE"})
@@ -81,6 +81,12 @@ class Calls(Expressions):
             if of is not None and last.name.lower() not in of.actions:
                 known = [one.signature.name for one in of.methods.values() if one.kind == "METHOD"]
                 self.env.unknown(last.pos, f"in {of.name}, a method", last.name, known)
+        if (
+            ref.of is None
+            and lookup(self, ref)[0] is None
+            and ref.name.lower() not in (*self.env.lists, *self.env.types)
+        ):
+            unknown_variable(self, ref)
         return self.env.error(call.pos, "a function block is called in a separate statement", got=ref.name)
 
     def _controlled_call(self, call: t.Call, en: t.Expr | None, eno: t.Argument | None) -> Value:

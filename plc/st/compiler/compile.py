@@ -131,6 +131,7 @@ class _Unit:
         self.blocks = Blocks(self.variables, self.functions)
         self.programs = Programs(self.variables, self.functions, self.unit)
         hierarchy = Hierarchy(self.env, self.declarations, self.functions)
+        self._warn_of_uncalled()
         for pou in self.unit.pous:
             if pou.kind == "FUNCTION":
                 with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
@@ -196,6 +197,14 @@ class _Unit:
         own |= members[True] & members[False]
         lent = frozenset(name for one in recorded for name in one.lent)
         return Arrays(frozenset(own), lent, frozenset(members[True] - members[False]))
+
+    def _warn_of_uncalled(self) -> None:
+        """Warn of methods that CODESYS calls by itself, and this PLC does not (decision 78)."""
+        for pou in self.source.pous:
+            for method in pou.methods:
+                if pou.kind == "FUNCTION_BLOCK" and method.name.lower() in ("fb_exit", "fb_reinit"):
+                    message = f"only calls in the program execute {method.name} of {pou.name}"
+                    self.env.accepts("ST009", method.pos, message)
 
     def _names(self) -> Iterator[tuple[str, str]]:
         for pou in self.unit.pous:

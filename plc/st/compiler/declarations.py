@@ -257,11 +257,19 @@ class Declarations:
             pou = self._blocks[key]
             return self._interface(pou) if pou.kind == "INTERFACE" else self._block(pou)
         self.env.refuse_missing(key, pos)
+        if key == "bit" and self.env.dialect.vendor:
+            self.env.fail(
+                pos, "BIT outside of a structure", expected="BOOL, or BIT as the type of a member of a STRUCT"
+            )
         if key in _STANDARD:
             found = _STANDARD[key]
             aliases = _VENDOR_NAMES.get(key.partition("_")[0], {}) if self.env.dialect.vendor else {}
             return replace(found, aliases=aliases)
         known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
+        library = name.rpartition(".")[0]
+        if library:
+            known = [one for one in known if "." in one]
+            raise self.env.unknown(pos, "a type", name, known, self.env.of_library(library))
         raise self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
 
     def _declared(self, declared: t.TypeDecl) -> ty.Type:
@@ -270,7 +278,7 @@ class Declarations:
             for field in declared.fields:
                 if field.name.lower() in fields:
                     self.env.fail(field.pos, f"{field.name} is declared twice")
-                kind = self.type_of(field.type)
+                kind = ty.BIT if self._is_bit(field.type) and not declared.union else self.type_of(field.type)
                 if field.location and (declared.union or ty.holds_union(kind)):
                     what = "is a member of a union" if declared.union else "is or contains a union"
                     self.env.fail(field.pos, f"{field.name} {what} and has an address", expected="no AT")
@@ -293,6 +301,11 @@ class Declarations:
             if code != default_value(kind):  # a derived type has the initial value of its base
                 self.env.type_initials[declared.name.lower()] = self.shared(code)
         return kind
+
+    def _is_bit(self, spec: t.TypeSpec) -> bool:
+        """Return whether a type is BIT, which the dialects of CODESYS have for members of structures."""
+        named = isinstance(spec, t.NamedType) and spec.name.upper() == ty.BIT.name
+        return named and self.env.dialect.vendor and "bit" not in self._types
 
     def _registered(self, declared: t.EnumDecl) -> ty.Enum:
         enum = self._enum(declared)

@@ -235,7 +235,9 @@ class Expressions:
         type_name, _, name = literal.text.partition("#")
         enum = self.env.types.get(type_name.lower())
         if not isinstance(enum, ty.Enum):
-            self.env.unknown(literal.pos, "an enumeration", type_name, list(self.env.types))
+            library = type_name.rpartition(".")[0]
+            hint = self.env.of_library(library) if library else ""
+            self.env.unknown(literal.pos, "an enumeration", type_name, [] if hint else list(self.env.types), hint)
         number = {k.lower(): v for k, v in enum.values.items()}.get(name.lower())
         if number is None:
             self.env.unknown(literal.pos, f"in {enum}, a value", name, list(enum.values))

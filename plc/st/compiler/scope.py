@@ -286,11 +286,18 @@ class Environment:
         if key in self.missing:
             self.fail(pos, str(self.missing[key]))
 
-    def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
+    def unknown(self, pos: Pos, what: str, name: str, known: list[str], hint: str = "") -> NoReturn:
+        """Raise the error of a name that is not declared. `hint` is the advice if none of the `known` names is similar."""
         if name.lower() in self.faulty | self.faulty_here:
             raise FollowingError(f"{name} is declared with an error", path=pos.path, line=pos.line, column=pos.column)
         self.faulty_here.add(name.lower())
-        self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known))
+        self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known) or hint)
+
+    def of_library(self, name: str) -> str:
+        """Return the advice for an unknown name before a dot, which may be the name of a library; "" in other dialects."""
+        if not self.dialect.vendor:
+            return ""
+        return f"if {name} is a library, name its folder under libraries: in the system file, or with --library DIR"
 
 
 class Compiling(Protocol):

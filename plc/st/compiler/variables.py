@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.classes.members import is_own, own_property, own_variable, property_value
 from fieldtwin.plc.st.compiler.implicit import as_number
@@ -132,13 +134,19 @@ def _enum_value(x: Compiling, ref: t.Ref) -> Value:
     if isinstance(wanted, ty.Enum) and _is_value_of(wanted, ref):
         found = [(wanted, n) for name, n in wanted.values.items() if name.lower() == ref.name.lower()]
     if not found or ref.selectors:
-        known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
-        x.env.unknown(ref.pos, "a variable", ref.name, known)
+        unknown_variable(x, ref)
     if len(found) > 1:
         names = ", ".join(f"{enum}#{ref.name}" for enum, _ in found)
         x.env.fail(ref.pos, f"{ref.name} is a value of several types", expected=names)
     enum, number = found[0]
     return Value(repr(number), enum, number)
+
+
+def unknown_variable(x: Compiling, ref: t.Ref) -> NoReturn:
+    """Raise the error of a name that is not declared as a variable."""
+    known = [s.name for s in (*x.symbols.values(), *x.env.globals.values())]
+    qualifies = bool(ref.selectors) and isinstance(ref.selectors[0], t.Member)
+    x.env.unknown(ref.pos, "a variable", ref.name, known, x.env.of_library(ref.name) if qualifies else "")
 
 
 def _qualified_value(x: Compiling, enum: ty.Enum, member: t.Member) -> Value:

@@ -56,6 +56,21 @@ class Truth:
         memory[at] = value
 
 
+class Bit:
+    """The layout of a BIT, which is the bit `number` of a byte. The other bits of this byte belong to other members."""
+
+    size = 1
+
+    def __init__(self, number: int) -> None:
+        self._mask = 1 << number
+
+    def read(self, memory: bytearray, at: int) -> bool:
+        return bool(memory[at] & self._mask)
+
+    def write(self, memory: bytearray, at: int, value: bool) -> None:
+        memory[at] = memory[at] | self._mask if value else memory[at] & ~self._mask
+
+
 class Time:
     """The layout of a TIME or a date: a number of 4 bytes without a sign that counts units of `unit_ns`."""
 
@@ -146,6 +161,7 @@ def _code(letter: str, size: int) -> bytes:
 
 
 TRUTH = Truth()
+bit = cache(Bit)
 number = cache(Number)
 time = cache(Time)
 letter = cache(Letter)

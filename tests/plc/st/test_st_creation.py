@@ -8,6 +8,8 @@ import pytest
 from st_bench import program, run, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.compiler.compile import compile_text
+from fieldtwin.plc.st.dialects import DIALECTS
 
 FIXED = "bInitRetains : BOOL; bInCopyCode : BOOL;"
 PUMP = f"""FUNCTION_BLOCK Pump
@@ -170,3 +172,11 @@ def test_an_error_during_the_creation_names_the_line() -> None:
     with pytest.raises(FileInvalid, match=r"FB_init: .*zero") as error:
         run("a : Pump(4);", "", block, dialect="codesys")
     assert error.value.line == 7
+
+
+def test_methods_that_only_calls_execute_give_a_warning() -> None:
+    block = "FUNCTION_BLOCK b\nMETHOD FB_exit : BOOL END_METHOD\nMETHOD fb_reinit : BOOL END_METHOD END_FUNCTION_BLOCK"
+    unit = compile_text(f"{block} PROGRAM p VAR x : b; END_VAR END_PROGRAM", "", DIALECTS["twincat"])
+    found = [(each.id, each.line, each.message) for each in unit.warnings]
+    message = "only calls in the program execute {} of b"
+    assert found == [("ST009", 2, message.format("FB_exit")), ("ST009", 3, message.format("fb_reinit"))]

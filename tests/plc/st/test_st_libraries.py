@@ -13,6 +13,8 @@ from fieldtwin.cli.plc.check_command import check
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.binding import BoundProgram, load_program
 from fieldtwin.plc.runtime.sources import sources
+from fieldtwin.plc.st.dialects import dialect_of
+from fieldtwin.plc.st.project import compile_source
 
 GOOD = """FUNCTION scaled : INT VAR_INPUT x : INT; END_VAR scaled := limited(x * FACTOR); END_FUNCTION
 FUNCTION limited : INT VAR_INPUT x : INT; END_VAR limited := MIN(x, 100); END_FUNCTION
@@ -117,3 +119,30 @@ def test_bases_interfaces_and_what_methods_use_are_taken(tmp_path: Path) -> None
     made = loaded(tmp_path)
     scan(made)
     assert made.n == 22
+
+
+@pytest.mark.parametrize(
+    ("declared", "body", "message"),
+    [
+        (
+            "x : INT;",
+            "x := Util.Scaled(3);",
+            r"2:6: a variable 'Util' is not declared \(if Util is a library, name its folder",
+        ),
+        ("", "Util.Log(3);", r"2:1: a variable 'Util' .*libraries: in the system file, or with --library DIR\)"),
+        ("x : INT;", "x := Util.limit;", r"2:6: a variable 'Util' .*if Util is a library"),
+        ("x : Util.BLINK;", ";", r"1:22: a type 'Util.BLINK' is not declared \(if Util is a library"),
+        ("x : INT;", "x := Util.Mode#run;", r"2:6: an enumeration 'Util.Mode' is not declared \(if Util is a library"),
+        ("drive : TON;", "drvie.IN := TRUE;", r"2:1: a variable 'drvie' is not declared \(did you mean 'drive'\?\)"),
+    ],
+)
+def test_the_name_of_an_unknown_library_is_an_error_that_says_how_to_declare_it(
+    declared: str, body: str, message: str, tmp_path: Path
+) -> None:
+    source = tmp_path / "main.st"
+    source.write_text(f"PROGRAM Main VAR {declared} END_VAR\n{body}\nEND_PROGRAM", encoding="utf-8")
+    with pytest.raises(FileInvalid, match=message):
+        compile_source(source, dialect_of("codesys"))
+    with pytest.raises(FileInvalid) as e:
+        compile_source(source)
+    assert "library" not in str(e.value)

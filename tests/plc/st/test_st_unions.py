@@ -127,6 +127,39 @@ def test_initial_values_of_members_and_of_variables() -> None:
     assert bytes(found["d"].m_bytes) == bytes(16)
 
 
+BITS = """TYPE Bits : STRUCT b0, b1, b2, b3, b4, b5, b6, b7, b8 : BIT; n : BYTE; last : BIT; END_STRUCT END_TYPE
+TYPE Flags : UNION bits : Bits; word : WORD; raw : DWORD; END_UNION END_TYPE
+"""
+
+
+def test_members_of_the_type_bit_share_bytes() -> None:
+    found = run(
+        "f : Flags; b : Bits; yes, no : BOOL; size : INT; w : WORD; raw : DWORD; other : Bits; n : UDINT;",
+        """f.word := 16#0182; yes := f.bits.b1 AND f.bits.b7 AND f.bits.b8; no := f.bits.b0 OR f.bits.b6;
+        f.bits.b1 := FALSE; f.bits.b0 := yes; b := f.bits; w := f.word; b.last := b.b0; b.n := 7; f.bits := b; raw := f.raw;
+        size := SIZEOF(Bits); n := MEMCPY(ADR(other), ADR(b), 3);""",
+        BITS,
+    )
+    assert (found["yes"], found["no"], found["w"], found["size"], found["raw"]) == (True, False, 0x0181, 4, 0x01070181)
+    assert (found["b"].m_b7, found["b"].m_b8, found["other"].m_b0, found["other"].m_n) == (True, True, True, 7)
+
+
+@pytest.mark.parametrize(
+    ("variables", "body", "message"),
+    [
+        ("b : BIT;", "", "BIT outside of a structure; expected BOOL"),
+        ("b : Bits; p : POINTER TO BOOL;", "p := ADR(b.b1);", "ADR of a BIT, which has no address"),
+        ("b : Bits; m : Raise;", "m(x := b.b1);", "VAR_IN_OUT x of Raise; expected BOOL; got BIT"),
+        ("b : Other;", "", "BIT outside of a structure"),
+    ],
+)
+def test_a_bit_has_no_address(variables: str, body: str, message: str) -> None:
+    before = f"{BITS} FUNCTION_BLOCK Raise VAR_IN_OUT x : BOOL; END_VAR END_FUNCTION_BLOCK"
+    other = "TYPE Other : UNION b : BIT; w : WORD; END_UNION END_TYPE" if "Other" in variables else ""
+    with pytest.raises(FileInvalid, match=message):
+        run(variables, body, f"{before} {other}")
+
+
 def test_a_time_that_does_not_fit_its_four_bytes_stops_the_task() -> None:
     for value in ("T#50d", "-T#1ms"):
         with pytest.raises(LogicError, match="a time that does not fit its memory"):

@@ -48,7 +48,12 @@ def members(env: Environment, kind: ty.Struct, pos: Pos, what: str) -> str:
     """Return the size of a structure or union and the places of its members, as the arguments of a Python call."""
     layouts = {name: layout(env, of, pos, f"{what}.{field}") for name, (field, of) in kind.fields.items()}
     size, _, places = places_of(env, kind, pos)
-    return ", ".join([str(size), *(f"({f'm_{name}'!r}, {places[name]}, {code})" for name, code in layouts.items())])
+    found = [str(size)]
+    for name, (_, of) in kind.fields.items():
+        at, bit = places[name]
+        code = f"_v.layouts.bit({bit})" if of == ty.BIT else layouts[name]
+        found.append(f"({f'm_{name}'!r}, {at}, {code})")
+    return ", ".join(found)
 
 
 def _elementary(kind: ty.Elementary) -> str:

@@ -32,6 +32,8 @@ def _reference(x: Compiling, expr: t.Expr, what: str) -> Value:
     target = variable(x, expr)
     if not target.place or target.constant is not None:
         x.env.fail(expr.pos, f"{what} needs a variable", got="a bit or a constant")
+    if target.type == ty.BIT:
+        x.env.fail(expr.pos, f"{what} of a BIT, which has no address", expected="a BOOL, or the structure of the BIT")
     element = target.reference.startswith(("_v.Element(", "_v.pointed(", "_v.moved("))
     if by_reference(target.type) and not element:
         return Value(f"_v.Whole({target.code})", target.type, writable=target.writable)

@@ -42,14 +42,26 @@ def _layout(env: Environment, kind: ty.Type, pos: Pos) -> tuple[int, int]:
     raise env.error(pos, f"the size of a {kind} depends on the controller and is not supported")
 
 
-def places_of(env: Environment, kind: ty.Struct, pos: Pos) -> tuple[int, int, dict[str, int]]:
-    """Return the size of a structure or union, the multiple of bytes at which it begins, and the first byte of each member."""
-    end, used, widest = 0, 0, 1
-    places = {}
+Place = tuple[int, int]
+"""The first byte of a member, and the number of its bit in this byte if its type is BIT, else 0."""
+
+
+def places_of(env: Environment, kind: ty.Struct, pos: Pos) -> tuple[int, int, dict[str, Place]]:
+    """Return the size of a structure or union, the multiple of bytes at which it begins, and the places of its members.
+
+    Successive members of the type BIT share bytes.
+    """
+    end, used, widest, bits = 0, 0, 1, 0
+    places: dict[str, Place] = {}
     for name, (_, of) in kind.fields.items():
+        if of == ty.BIT and bits % 8:
+            places[name] = end - 1, bits % 8
+            bits += 1
+            continue
+        bits = 1 if of == ty.BIT else 0
         size, step = _layout(env, of, pos)
         step = min(step, kind.packed)
-        places[name] = 0 if kind.union else -(-end // step) * step
-        end = places[name] + size
+        places[name] = 0 if kind.union else -(-end // step) * step, 0
+        end = places[name][0] + size
         used, widest = max(used, end), max(widest, step)
     return -(-used // widest) * widest, widest, places

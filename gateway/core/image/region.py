@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from fieldtwin.gateway.core.errors import Bug, FileInvalid
 from fieldtwin.gateway.core.image.layout import CHECK, RECORD_HEAD, SLOTS, RegionShape, RingShape, TagKind
-from fieldtwin.gateway.core.image.snapshot import Message, RegionFlag, Snapshot
+from fieldtwin.gateway.core.image.snapshot import Message, RegionFlag, Snapshot, with_renewed
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
@@ -52,15 +52,21 @@ class Heartbeat:
     here, and the memory stays as it was: packing, check sum and unpacking took 20 % of a cycle in virtual time.
     """
 
-    __slots__ = ("counter", "in_memory", "stamps", "t_ns")
+    __slots__ = ("counter", "in_memory", "packed", "renewed", "t_ns")
 
     def __init__(self) -> None:
         self.counter = 0
         self.in_memory = 0
         """The counter of the publication in the memory."""
         self.t_ns = 0
-        self.stamps = b""
-        """The packed times of the tags of the latest publication."""
+        self.packed = b""
+        self.renewed: Sequence[int] = ()
+        """The indexes of the tags whose time is `t_ns`; `packed` holds the times of the others, see `Snapshot`."""
+
+    @property
+    def stamps(self) -> bytes:
+        """Return the packed times of the tags of the latest publication."""
+        return with_renewed(self.packed, self.renewed, self.t_ns)
 
 
 class _Region:
@@ -105,6 +111,7 @@ class RegionWriter(_Region):
         super().__init__(memory, shape, heartbeat)
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
+        self._all = range(shape.count)
         self._packed = False
         """True if `_body` holds the values, qualities and reasons of the last publication."""
         self._flags = 0
@@ -164,7 +171,7 @@ class RegionWriter(_Region):
         """
         stamps = self._stamps(times_ns)
         if same and not messages and self._packed:
-            return self._repeat(stamps, now_ns, _UNFLAGGED)
+            return self._repeat(stamps, now_ns)
         return self._publish(values, qualities, reasons, stamps, now_ns, messages, _UNFLAGGED)
 
     def publish_columns(
@@ -187,7 +194,10 @@ class RegionWriter(_Region):
         since the last publication; they are then not examined.
         """
         if same and not messages and self._packed:
-            return self._repeat(self._same_stamps(now_ns), now_ns, flags)
+            if self.repeats and not flags:
+                self.skip(1, now_ns)
+                return self.counter
+            return self._commit(self._same_stamps(now_ns), now_ns, flags)
         count = len(values)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
         if but:
@@ -249,13 +259,13 @@ class RegionWriter(_Region):
             self._last = last
         return self._commit(stamps, now_ns, flags)
 
-    def _repeat(self, stamps: bytes, now_ns: int, flags: int) -> int:
+    def _repeat(self, stamps: bytes, now_ns: int) -> int:
         """Publish the columns packed in `_body` again, which differ from the last publication only in their times."""
         beat = self._heartbeat
-        if beat is None or flags or self._flags:
-            return self._commit(stamps, now_ns, flags)
+        if beat is None or self._flags:
+            return self._commit(stamps, now_ns, _UNFLAGGED)
         self.counter = beat.counter = self.counter + 1
-        beat.t_ns, beat.stamps = now_ns, stamps
+        beat.t_ns, beat.packed, beat.renewed = now_ns, stamps, ()
         return self.counter
 
     @property
@@ -267,21 +277,20 @@ class RegionWriter(_Region):
         """Count `count` publications that repeat the values of the last one. The last of them was made at `last_ns`, which is
         also the time of the tags with the indexes `renewed`; None: of all tags. `repeats` must be true.
         """
-        self.counter += count - 1
-        stamps = self._same_stamps(last_ns)
-        if renewed is not None:
-            mixed = bytearray(self._heartbeat.stamps if self._heartbeat is not None else b"")
-            for index in renewed:
-                mixed[8 * index : 8 * index + 8] = stamps[:8]
-            stamps = bytes(mixed)
-        self._repeat(stamps, last_ns, _UNFLAGGED)
+        beat = self._heartbeat
+        assert beat is not None
+        wanted = self._all if renewed is None else renewed
+        if beat.renewed is not wanted:
+            beat.packed, beat.renewed = beat.stamps, wanted
+        self.counter = beat.counter = self.counter + count
+        beat.t_ns = last_ns
 
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
         """Publish the columns packed in `_body`. `stamps` holds the packed time of each tag, `now_ns` is the heartbeat."""
         self._store(self.counter + 1, stamps, now_ns, flags)
         if self._heartbeat is not None:
             self._heartbeat.counter = self._heartbeat.in_memory = self.counter
-            self._heartbeat.stamps = stamps
+            self._heartbeat.packed, self._heartbeat.renewed = stamps, ()
         return self.counter
 
     def _store(self, counter: int, stamps: bytes, now_ns: int, flags: int) -> None:
@@ -436,7 +445,16 @@ class RegionReader(_Region):
             s = self._from_memory()
             messages = s.messages
         self.latest = Snapshot(
-            s.shape, beat.counter, beat.t_ns, s.flags, s.values, s.qualities, s.reasons, beat.stamps, messages
+            s.shape,
+            beat.counter,
+            beat.t_ns,
+            s.flags,
+            s.values,
+            s.qualities,
+            s.reasons,
+            beat.packed,
+            messages,
+            beat.renewed,
         )
         return self.latest
 

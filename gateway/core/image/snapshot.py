@@ -5,7 +5,7 @@ This module only holds values. It must not depend on the memory or on the proces
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 
 import msgspec
@@ -42,9 +42,11 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
 
     `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them for
     one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, the messages that are
-    new since the reader's last snapshot, in order; a tag without new messages has no entry. Times stay packed in
-    `stamps` until the caller requests one, which is rare. As long as no value, quality or reason changes, snapshots share
-    those columns.
+    new since the reader's last snapshot, in order; a tag without new messages has no entry. As long as no value, quality
+    or reason changes, snapshots share those columns.
+
+    Times are computed when the caller requests them, which is rare: that of a tag in `renewed` is `t_ns`, and `packed`
+    holds those of the other tags.
     """
 
     shape: RegionShape
@@ -54,8 +56,9 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
     values: tuple[Scalar | None, ...]
     qualities: bytes
     reasons: bytes
-    stamps: bytes
+    packed: bytes
     messages: Mapping[str, tuple[Message, ...]]
+    renewed: Sequence[int] = ()
 
     def value(self, tag: str | int) -> TagValue:
         """Return the value of a tag by name or index; its `raw` is empty. Raises KeyError or IndexError."""
@@ -64,7 +67,14 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
 
     def time_ns(self, index: int) -> int:
         """Return the time that the source gave for the tag at `index` (monotonic, ns)."""
-        return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
+        if index in self.renewed:
+            return self.t_ns
+        return int.from_bytes(self.packed[8 * index : 8 * index + 8], "little", signed=True)
+
+    @property
+    def stamps(self) -> bytes:
+        """Return the packed times of all tags, in the order of the region's tags."""
+        return with_renewed(self.packed, self.renewed, self.t_ns)
 
     def all(self) -> dict[str, TagValue]:
         """Return the value of every tag, by name."""
@@ -77,3 +87,13 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
     def age_ns(self, now_ns: int) -> float:
         """Return the time since the writer published this (its heartbeat); infinite if it never published."""
         return now_ns - self.t_ns if self.counter else float("inf")
+
+
+def with_renewed(packed: bytes, renewed: Sequence[int], t_ns: int) -> bytes:
+    """Return the packed times with `t_ns` as the time of the tags with the indexes `renewed`."""
+    if not renewed:
+        return packed
+    mixed, stamp = bytearray(packed), t_ns.to_bytes(8, "little", signed=True)
+    for index in renewed:
+        mixed[8 * index : 8 * index + 8] = stamp
+    return bytes(mixed)

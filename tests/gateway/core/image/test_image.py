@@ -264,9 +264,15 @@ def test_skipped_publications_count_and_renew_only_the_named_times(renewed: list
     assert (after.counter, after.t_ns) == (before.counter + repeated + 3, 400)
     assert (after.values, after.qualities, after.reasons) == (before.values, before.qualities, before.reasons)
     old = [11, 21] if repeated else [10, 20]
-    assert [after.time_ns(at) for at in (0, 1)] == [
-        400 if renewed is None or at in renewed else old[at] for at in (0, 1)
-    ]
+    times = [400 if renewed is None or at in renewed else old[at] for at in (0, 1)]
+    assert [after.time_ns(at) for at in (0, 1)] == times
+    assert after.shape.times.unpack(after.stamps) == tuple(times)
+    writer.skip(1, 500, [0])  # the times that the earlier skipped publications renewed are kept
+    latest = reader.snapshot()
+    assert (latest.counter, latest.time_ns(0), latest.time_ns(1)) == (after.counter + 1, 500, times[1])
+    assert [after.time_ns(at) for at in (0, 1)] == times
+    writer.release()  # the next writer and reader find the latest publication in the memory
+    assert image.reader("r").snapshot().stamps == latest.stamps
 
 
 def test_flags_and_columns() -> None:

@@ -12,12 +12,9 @@ import asyncio
 from collections.abc import Callable
 from contextvars import copy_context
 from heapq import heappop, heappush
-from typing import Any, Protocol
+from typing import Protocol
 
 from fieldtwin.gateway.core.concurrency.cycle import Cycle
-
-Timers = list[tuple[int, int, Any]]
-"""A heap of (when in ns, sequence, what is due)."""
 
 
 class CycleLoop(Protocol):
@@ -25,7 +22,7 @@ class CycleLoop(Protocol):
 
     now_ns: int
 
-    def set_timer(self, when_ns: int, due: CycleCall, /) -> None: ...
+    def set_cycle_timer(self, when_ns: int, call: CycleCall, /) -> None: ...
 
 
 class CycleCall:
@@ -35,7 +32,7 @@ class CycleCall:
     time than a task that sleeps until each run.
     """
 
-    __slots__ = ("args", "callback", "context", "cycle", "ended", "loop", "period_ns")
+    __slots__ = ("args", "callback", "context", "cycle", "ended", "loop", "must_run", "period_ns")
 
     def __init__(self, loop: CycleLoop, cycle: Cycle, ended: asyncio.Future[None]) -> None:
         self.loop = loop
@@ -45,6 +42,8 @@ class CycleCall:
         self.callback: Callable[..., object] = self.run
         self.args: tuple[()] = ()
         self.context = copy_context()
+        self.must_run = False
+        """Whether `skip_runs` found that the next run may change something, so that the cycle need not be asked again."""
 
     @property
     def is_cancelled(self) -> bool:
@@ -54,15 +53,16 @@ class CycleCall:
         """Run the cycle now, and set the timer of the next run. An error ends the cycle."""
         cycle, now_ns = self.cycle, self.loop.now_ns
         try:
-            if cycle.repeats_until(now_ns + 1):
+            if not self.must_run and cycle.repeats_until(now_ns + 1):
                 cycle.skip(1, now_ns)
             else:
+                self.must_run = False
                 while cycle.running:
                     cycle.run_once()
                     if cycle.deadline_ns > now_ns:
                         break
             if cycle.running:
-                self.loop.set_timer(cycle.deadline_ns, self)
+                self.loop.set_cycle_timer(cycle.deadline_ns, self)
             else:
                 self.ended.set_result(None)
         except BaseException as e:
@@ -71,36 +71,40 @@ class CycleCall:
                 raise
 
 
-def skip_runs(timers: Timers, sequence: int) -> int:
-    """Skip the runs of the cycles whose timers come first in `timers`, as far as they would change nothing.
+CycleTimers = list[tuple[int, int, CycleCall]]
+"""A heap of (when in ns, sequence, call)."""
 
-    If all of them only repeat their last run, their runs until the next timer of anything else are skipped, otherwise the runs
-    before the first one that has to take place. The timers of the next runs get the sequence numbers after `sequence`, in the
-    order in which the runs would have set them. Return the last number.
+
+def skip_runs(timers: CycleTimers, until_ns: int, sequence: int) -> int:
+    """Skip the runs of the cycles in `timers` before `until_ns`, as far as they would change nothing. Nothing else is due before.
+
+    If all of these cycles only repeat their last run, all of their runs are skipped, otherwise the runs before the first one
+    that has to take place. The timers of the next runs get the sequence numbers after `sequence`, in the order in which the
+    runs would have set them. Return the last number.
     """
-    left: Timers = []
-    while timers and type(timers[0][2]) is CycleCall and (not left or _runs_in_turn(left[0], timers[0])):
-        timer = heappop(timers)
-        if not timer[2].ended.done():
-            left.append(timer)
-    if left and timers and left[0][0] < timers[0][0]:
-        until_ns = timers[0][0]
-        repeated: Timers = []
-        for timer in left:
-            if not timer[2].cycle.repeats_until(until_ns):
-                break
-            repeated.append(timer)
-        all_repeat = len(repeated) == len(left)
-        left = left[len(repeated) :]
-        for when_ns, order, call, count in _last_runs(repeated, until_ns) if all_repeat else _next_runs(repeated):
-            if when_ns < until_ns:
-                call.cycle.skip(count, when_ns)
-                sequence += 1
-                heappush(timers, (call.cycle.deadline_ns, sequence, call))
-            else:
-                heappush(timers, (when_ns, order, call))
+    left: CycleTimers = []
+    while timers and timers[0][0] < until_ns:
+        if left and not _runs_in_turn(left[0], timers[0]):
+            until_ns = timers[0][0]
+        else:
+            timer = heappop(timers)
+            if not timer[2].ended.done():
+                left.append(timer)
+    while left and left[-1][0] >= until_ns:
+        heappush(timers, left.pop())
+    repeated = 0
     for timer in left:
+        if not timer[2].cycle.repeats_until(until_ns):
+            timer[2].must_run = True
+            break
+        repeated += 1
+    for timer in left[repeated:]:
         heappush(timers, timer)
+    runs = _last_runs(left, until_ns) if repeated == len(left) else [(*timer, 1) for timer in left[:repeated]]
+    for when_ns, _, call, count in runs:
+        call.cycle.skip(count, when_ns)
+        sequence += 1
+        heappush(timers, (call.cycle.deadline_ns, sequence, call))
     return sequence
 
 
@@ -113,12 +117,7 @@ def _runs_in_turn(one: tuple[int, int, CycleCall], other: tuple[int, int, CycleC
     return period_ns == other[2].period_ns and other[0] - one[0] < period_ns
 
 
-def _next_runs(timers: Timers) -> list[tuple[int, int, CycleCall, int]]:
-    """Return the next run of each cycle: its timer, and 1."""
-    return [(*timer, 1) for timer in timers]
-
-
-def _last_runs(timers: Timers, until_ns: int) -> list[tuple[int, int, CycleCall, int]]:
+def _last_runs(timers: CycleTimers, until_ns: int) -> list[tuple[int, int, CycleCall, int]]:
     """Skip the runs before the last ones before `until_ns`. Return the last ones in order: their timers, and the number of runs
     of the cycle that are still to be skipped.
 
@@ -127,7 +126,7 @@ def _last_runs(timers: Timers, until_ns: int) -> list[tuple[int, int, CycleCall,
     """
     last = []
     for when_ns, order, call in timers:
-        earlier = max(0, (until_ns - when_ns - 1) // call.period_ns)
+        earlier = (until_ns - when_ns - 1) // call.period_ns
         last.append((when_ns + earlier * call.period_ns, order, call, earlier + 1))
     last.sort()
     for place, (when_ns, order, call, count) in enumerate(last):

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
-from fieldtwin.emulators.virtual.cycles import CycleCall, skip_runs
+from fieldtwin.emulators.virtual.cycles import CycleCall, CycleTimers, skip_runs
 from fieldtwin.emulators.virtual.interrupts import Interrupts
 from fieldtwin.emulators.virtual.scheduled_call import ScheduledCall
 from fieldtwin.emulators.virtual.waiting import waits_at
@@ -30,7 +30,7 @@ from fieldtwin.gateway.core.errors import Bug
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
-Due = ScheduledCall | CycleCall | asyncio.Future[None]
+Due = ScheduledCall | asyncio.Future[None]
 
 START_NS = 1_000 * NS_PER_S
 """The start of monotonic time. It is not 0, because 0 means "never" in many places."""
@@ -72,6 +72,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         """The number of callbacks that have run."""
         self._ready: deque[ScheduledCall | CycleCall] = deque()
         self._timers: list[tuple[int, int, Due]] = []
+        self._cycles: CycleTimers = []
+        """The timers of cycles. Their sequence numbers are of one series with those of `_timers`."""
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
         self._tasks = 0
@@ -126,7 +128,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         ended: asyncio.Future[None] = asyncio.Future(loop=self)
         call = CycleCall(self, cycle, ended)
         if cycle.deadline_ns > self.now_ns:
-            self.set_timer(cycle.deadline_ns, call)
+            self.set_cycle_timer(cycle.deadline_ns, call)
         else:
             call.run()
         await ended
@@ -144,6 +146,11 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         heappush(self._timers, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, due))
         if self._sequence >= self._compact_at:
             self._compact()
+
+    def set_cycle_timer(self, when_ns: int, call: CycleCall) -> None:
+        """Set the timer of the next run of a cycle."""
+        self._sequence += 1
+        heappush(self._cycles, (when_ns if when_ns > self.now_ns else self.now_ns, self._sequence, call))
 
     def _compact(self) -> None:
         """Remove the timers that are no longer needed.
@@ -236,12 +243,16 @@ class VirtualLoop(asyncio.AbstractEventLoop):
             self._advance()
 
     def _advance(self) -> None:
-        timers, ready = self._timers, self._ready
-        if timers and type(timers[0][2]) is CycleCall:
-            self._sequence = skip_runs(timers, self._sequence)
+        timers, cycles, ready = self._timers, self._cycles, self._ready
+        if cycles and timers and cycles[0][0] < timers[0][0]:
+            self._sequence = skip_runs(cycles, timers[0][0], self._sequence)
         now_ns = None
-        while timers and (now_ns is None or timers[0][0] == now_ns):
-            when_ns, _, due = heappop(timers)
+        while timers or cycles:
+            first: list[Any] = cycles if cycles and (not timers or cycles[0] < timers[0]) else timers
+            when_ns = first[0][0]
+            if now_ns is not None and when_ns != now_ns:
+                break
+            due = heappop(first)[2]
             if isinstance(due, asyncio.Future):
                 if due.done():
                     continue
@@ -281,6 +292,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._closed = True
         self._ready.clear()
         self._timers.clear()
+        self._cycles.clear()
 
     def _end_tasks(self) -> None:
         """End the remaining tasks, as `asyncio.run` does. Their errors, and a task that does not end, are ignored."""

@@ -129,7 +129,7 @@ class Scan:
         """The indexes in INPUTS on which the logic depends."""
         self._steady = False
         """Whether the inputs of the last scan were those of the scan before."""
-        self._columns: Sequence[Scalar | None] = ()
+        self._columns: Sequence[Scalar | None] = []
         """The values of INPUTS that the last scan read. They are the same object as long as nothing but a time changed."""
         self._given = ""
         """The inputs of the programs with qualities and reasons, and the counters of taken messages, of the last scan."""
@@ -202,15 +202,19 @@ class Scan:
         settling, forces = self._settling, self.output_image.forces
         snapshot = self._reader.snapshot()
         forced = bool(forces.inputs or forces.outputs)
-        if settling.settled and snapshot.values is self._columns and not forced and self._is_alive(snapshot, now_ns):
+        given = self._given
+        if settling.possible and snapshot.values is not self._columns:
+            given = repr([(snapshot.values[at], snapshot.qualities[at], snapshot.reasons[at]) for at in self._deciding])
+        same = given == self._given and not forced and not snapshot.messages
+        if settling.settled and same and self._is_alive(snapshot, now_ns):
+            self._columns = snapshot.values
             self._keep(snapshot)
             self.gateway_alive = True
             return True
         self._take(snapshot, now_ns)
         if not settling.possible:
             return False
-        given = repr([(snapshot.values[at], snapshot.qualities[at], snapshot.reasons[at]) for at in self._deciding])
-        self._steady = self.gateway_alive and given == self._given and not forced and not snapshot.messages
+        self._steady = self.gateway_alive and same
         self._columns, self._given = snapshot.values, given
         if not self._steady:
             settling.disturbed()

@@ -130,6 +130,9 @@ class Behaviour(NodeService):
         self._encoders: dict[Key, Callable[[Number], bytes] | None] = {}
         """Encoders by object, for objects that the model has mentioned; None for an object that the node does not have."""
         self._seen: tuple[int, ...] = ()
+        self._states: Mapping[Key, Number] = {}
+        self._encoded_states: dict[Key, bytes] = {}
+        """The last states of the model as numbers and as bytes, which change rarely."""
 
     def connect(self, core: Core, emergency: Emergency, changed: Callable[[Iterable[Key], int], None]) -> None:
         """Connect the parts of the node that the model's output changes. Call it once, before anything else."""
@@ -185,12 +188,14 @@ class Behaviour(NodeService):
         for code in outcome.clears:
             self._emergency.clear_error(code, now_ns)
         self._seen = self._emergency.active
-        encoded_states = self._encoded(outcome.states)
+        if outcome.states != self._states:
+            self._states, self._encoded_states = outcome.states, self._encoded(outcome.states)
+        encoded_states = self._encoded_states
         values = {**played, **self._encoded(outcome.readings), **encoded_states}
         if self._distort is not None:
             values = self._distort(values, now_ns)
             encoded_states = {key: values[key] for key in encoded_states}
-        events = [key for key, raw in encoded_states.items() if self._data.put(*key, raw)]
+        events = self._data.put_all(encoded_states)
         for key in events:
             self._core.note(now_ns, "set", *key, encoded_states[key])
         if events:

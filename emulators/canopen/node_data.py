@@ -116,6 +116,11 @@ class NodeData:
             self.version += 1
         return True
 
+    def put_all(self, values: Mapping[Key, bytes]) -> list[Key]:
+        """Set several values like `put`. Return the keys of the values that changed."""
+        live = self._live
+        return [key for key, raw in values.items() if live.get(key) != raw and self.put(*key, raw)]
+
     def put_number(self, index: int, subindex: int, value: int) -> None:
         """Call `put` with an unsigned value; does nothing if the node has no such entry."""
         entry = self.dictionary.entry(index, subindex)

@@ -166,9 +166,8 @@ class Core:
         dictionary.
         """
         if self._source is not None:
-            values, put = self._source(now_ns), self.data.put
-            for (index, subindex), raw in values.items():
-                put(index, subindex, raw)
+            values = self._source(now_ns)
+            self.data.put_all(values)
             if self.held is not None:
                 self.held(values, now_ns)
 

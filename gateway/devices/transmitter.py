@@ -57,16 +57,13 @@ class TransmitterDriver(RegisterDriver):
         self.to_acknowledge = 0
         """The sequence of the message that was emitted and is not acknowledged yet; 0 if there is none."""
         self.outbox_free = False
+        self.outbox_tag = f"{self.config.name}.outbox"
+        """The full name of the tag through which the control logic sends messages with this transmitter."""
         self.received = self.sent = self.taken = self.mailbox_waits = 0
 
     @property
     def message_tag(self) -> str:
         return f"{self.config.name}.inbox"
-
-    @property
-    def outbox_tag(self) -> str:
-        """Return the full name of the tag through which the control logic sends messages with this transmitter."""
-        return f"{self.config.name}.outbox"
 
     async def synchronise(self) -> None:
         """Read from the device which messages each side has taken, so that no message is handled twice. Call it after each

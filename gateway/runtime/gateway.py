@@ -7,6 +7,7 @@ simulation (digital twin prototype). Its status is plain data for the control ch
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 from fieldtwin.gateway.connections.sockets.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -39,6 +40,7 @@ from fieldtwin.gateway.store.exchange_log import ExchangeLog
 PLC_GRACE_NS = 10 * NS_PER_S
 """The time after the gateway's start within which the PLC has to appear. Otherwise the outputs get their safe values."""
 _NUMBERS = (int, float)
+_IS_IDLE = attrgetter("is_idle")
 
 
 @dataclass(frozen=True)
@@ -292,12 +294,7 @@ class Gateway:
 
     def _is_idle(self) -> bool:
         """Return whether no message is passed on, and none was delivered since the last `tick`."""
-        before = self.exchange.undelivered
-        for pump in self.pumps:
-            if not pump.is_idle or pump.undelivered != before.get(pump.driver.outbox_tag):
-                return False
-        tags = self.config.log_tags
-        return not tags or all(self.log.pending(tag) == before.get(tag) for tag in tags)
+        return all(map(_IS_IDLE, self.pumps)) and self._undelivered() == self.exchange.undelivered
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count ticks that do not take place, see `Cycle`."""

@@ -98,7 +98,8 @@ class ImageExchange:
         times. See `fieldtwin.gateway.core.concurrency.cycle.Cycle`.
         """
         return (
-            self._columns.repeats_until(until_ns)
+            not self._tags.news
+            and until_ns <= self._columns.earliest_ns
             and self._reader.repeats
             and self._writer.repeats
             and not self.plc_stopped
@@ -185,22 +186,25 @@ class _Columns:
         self.times_ns = [0] * len(specs)
         self.changed = True
         """Whether values, qualities or reasons may differ from those published last; the publisher resets it."""
-        self._earliest_ns = -1
+        self.earliest_ns = -1
         """No tag becomes stale before this time; it may be earlier than the first one that does."""
 
     def refresh(self, now_ns: int) -> None:
         """Copy the tag table's new values, and mark those that became stale by `now_ns`."""
         news = self._tags.take_changes()
-        if now_ns > self._earliest_ns:
-            self._earliest_ns = FOREVER_NS
+        if now_ns > self.earliest_ns:
+            self.earliest_ns = FOREVER_NS
             for name, at in self._index.items():
-                self._set(at, self._tags.current(name, now_ns), self._tags.fresh_until_ns(name))
+                held = self._tags.entry(name)
+                if held is None:
+                    self._set(at, NEVER, FOREVER_NS)
+                else:
+                    self._set(at, held.as_of(now_ns), held.fresh_until_ns)
             return
         for held in news:
             place = self._index.get(held.name)
             if place is not None:
-                until_ns = held.fresh_until_ns
-                self._set(place, held.value if now_ns <= until_ns else self._tags.current(held.name, now_ns), until_ns)
+                self._set(place, held.as_of(now_ns), held.fresh_until_ns)
 
     def _set(self, at: int, value: TagValue, until_ns: int) -> None:
         self.times_ns[at] = value.t_ns
@@ -208,12 +212,8 @@ class _Columns:
         self.qualities[at] = value.quality
         self.reasons[at] = value.reason
         self.changed = True
-        if until_ns < self._earliest_ns and value.quality is not _BAD:
-            self._earliest_ns = until_ns
-
-    def repeats_until(self, until_ns: int) -> bool:
-        """Return whether `refresh` finds nothing new before `until_ns`."""
-        return not self._tags.news and until_ns <= self._earliest_ns
+        if until_ns < self.earliest_ns and value.quality is not _BAD:
+            self.earliest_ns = until_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
         """Set the number at position `at`, which the exchange itself provides. Its quality is good."""

@@ -50,6 +50,13 @@ class Held:
         """Return the time after which the value is stale, see `TagTable.fresh_until_ns`."""
         return FOREVER_NS if self.limit_ns is None else self.refreshed_ns + self.limit_ns
 
+    def as_of(self, now_ns: int) -> TagValue:
+        """Return the value as of `now_ns`, see `TagTable.current`."""
+        value, limit = self.value, self.limit_ns
+        if limit is None or value.quality is _BAD or now_ns - self.refreshed_ns <= limit:
+            return value
+        return replace(value, quality=_BAD, reason=Reason.STALE)
+
 
 class TagTable:
     """The values by full tag name. Drivers write them (`TagSink`); the process image, the status and the data store read them."""
@@ -160,17 +167,18 @@ class TagTable:
         A tag that is not read (one that can only be written) has the reason NEVER_READ.
         """
         held = self._held.get(name)
-        if held is None:
-            return NEVER
-        value, limit = held.value, held.limit_ns
-        if limit is None or value.quality is _BAD or now_ns - held.refreshed_ns <= limit:
-            return value
-        return replace(value, quality=_BAD, reason=Reason.STALE)
+        return NEVER if held is None else held.as_of(now_ns)
 
     def held(self, name: str) -> TagValue:
         """Return the value that was stored last, without a check of its age."""
         held = self._held.get(name)
         return NEVER if held is None else held.value
+
+    def entry(self, name: str) -> Held | None:
+        """Return the table's own entry of a tag, which always holds its newest value; None for a tag that the table does not
+        have.
+        """
+        return self._held.get(name)
 
     def fresh_until_ns(self, name: str) -> int:
         """Return the time after which the tag is stale unless it is refreshed; `FOREVER_NS` if it never becomes stale."""

@@ -24,10 +24,6 @@ class _Held:
     times_ns: list[int] = field(default_factory=list)
     raws: list[bytes] = field(default_factory=list)
 
-    def note(self, t_ns: int, raw: bytes) -> None:
-        self.times_ns.append(t_ns)
-        self.raws.append(raw)
-
     def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
         """Return whether the device held `raw` at any time in the interval, both ends included.
 
@@ -56,7 +52,11 @@ class AgeOracle:
 
     def held(self, tag: str, raw: bytes, t_ns: int) -> None:
         """Record that the device holds `raw` for DEVICE.TAG from `t_ns` on."""
-        self._held.setdefault(tag, _Held()).note(t_ns, raw)
+        held = self._held.get(tag)
+        if held is None:
+            held = self._held[tag] = _Held()
+        held.times_ns.append(t_ns)
+        held.raws.append(raw)
 
     def published(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
         """Record that DEVICE.TAG was published as good at `now_ns`; its value may not be older than `source_ns`."""

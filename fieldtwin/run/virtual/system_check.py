@@ -174,24 +174,25 @@ class SystemCheck:
         The device must have held such a value within the value's maximum age, plus the time of one exchange. The
         function does so at most every `STALE_CHECK_NS`.
         """
-        tags, loop = bench.run.gateway.tags, bench.loop
-        limits_ns = {
-            tag: limit_ms * NS_PER_MS + self._exchange_ns(driver.config.bus)
+        tags, loop, still_good = bench.run.gateway.tags, bench.loop, self.oracle.still_good
+        aging = [
+            (tag, held, limit_ms * NS_PER_MS + self._exchange_ns(driver.config.bus))
             for driver in bench.run.gateway.drivers.values()
             for tag, limit_ms in stale_limits(driver).items()
-            if limit_ms is not None
-        }
+            if limit_ms is not None and (held := tags.entry(tag)) is not None
+        ]
         next_ns = 0
 
         def check() -> None:
             nonlocal next_ns
-            if loop.now_ns < next_ns:
+            now_ns = loop.now_ns
+            if now_ns < next_ns:
                 return
-            next_ns = loop.now_ns + STALE_CHECK_NS
-            for tag, limit_ns in limits_ns.items():
-                value = tags.current(tag, loop.now_ns)
+            next_ns = now_ns + STALE_CHECK_NS
+            for tag, held, limit_ns in aging:
+                value = held.as_of(now_ns)
                 if value.quality is _GOOD:
-                    self.oracle.still_good(tag, value.raw, value.value, loop.now_ns - limit_ns, loop.now_ns)
+                    still_good(tag, value.raw, value.value, now_ns - limit_ns, now_ns)
 
         return check
 

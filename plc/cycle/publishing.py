@@ -303,12 +303,11 @@ class OutputImage:
 
     @property
     def repeats(self) -> bool:
-        """Return whether the next publication repeats the last one, unless values are collected, forced or consumed before."""
-        return self._same and not self._forced and not self.forces.outputs and self.writer.repeats
+        """Return whether the next publication repeats the last one, unless values are collected, forced or consumed before.
 
-    def skip(self, count: int, last_ns: int) -> None:
-        """Count publications that would have repeated the last one, and publish the last of them, which was at `last_ns`."""
-        self.writer.skip(count, last_ns)
+        `writer.skip` may then count publications.
+        """
+        return self._same and not self._forced and not self.forces.outputs and self.writer.repeats
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
         """Return (program, ``FILE:LINE``) that set `tag` to `value` (None: to NaN), from the recorded changes.

@@ -248,8 +248,10 @@ class Scan:
         """Count scans that do not take place, see `Cycle`."""
         self.number += count
         self.skipped += count
-        self._keep(self._reader.snapshot())
-        self.output_image.skip(count, last_ns)
+        self._snapshot = self._reader.snapshot()
+        if self._held:
+            self._keep(self._snapshot)
+        self.output_image.writer.skip(count, last_ns)
 
     def _keep(self, snapshot: Snapshot) -> None:
         """Keep a snapshot that changes no input of the logic."""

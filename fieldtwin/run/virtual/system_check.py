@@ -142,12 +142,16 @@ class SystemCheck:
             for name, device in self.system.devices.items()
             if not self.system.buses[device.bus].endpoint.is_can
         }
-        check_ages = self._age_check(bench)
+        check_ages, published, next_check_ns = self._age_check(bench), self.oracle.published, 0
         asked_of: dict[str, deque[int] | None] = {}
         """The times of requests on the bus of each tag; None for a message that a node sends by itself."""
 
         def put(name: str, value: TagValue) -> None:
-            check_ages()
+            nonlocal next_check_ns
+            now_ns = loop.now_ns
+            if now_ns >= next_check_ns:
+                next_check_ns = now_ns + STALE_CHECK_NS
+                check_ages()
             if value.quality is _GOOD:
                 # A value is timed at the moment when its reply was complete; the device answered after the request. A
                 # node's unrequested message was on the bus for some time, longer if it had to be sent again.
@@ -163,7 +167,7 @@ class SystemCheck:
                         if asked_ns <= since_ns:
                             since_ns = asked_ns
                             break
-                self.oracle.published(name, value.raw, value.value, since_ns, loop.now_ns)
+                published(name, value.raw, value.value, since_ns, now_ns)
 
         return put
 
@@ -172,7 +176,7 @@ class SystemCheck:
         were not published again.
 
         The device must have held such a value within the value's maximum age, plus the time of one exchange. The
-        function does so at most every `STALE_CHECK_NS`.
+        caller calls the function at most every `STALE_CHECK_NS`.
         """
         tags, loop, still_good = bench.run.gateway.tags, bench.loop, self.oracle.still_good
         aging = [
@@ -181,14 +185,9 @@ class SystemCheck:
             for tag, limit_ms in stale_limits(driver).items()
             if limit_ms is not None and (held := tags.entry(tag)) is not None
         ]
-        next_ns = 0
 
         def check() -> None:
-            nonlocal next_ns
             now_ns = loop.now_ns
-            if now_ns < next_ns:
-                return
-            next_ns = now_ns + STALE_CHECK_NS
             for tag, held, limit_ns in aging:
                 value = held.as_of(now_ns)
                 if value.quality is _GOOD:

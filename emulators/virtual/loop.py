@@ -71,7 +71,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.callbacks = 0
         """The number of callbacks that have run."""
         self._ready: deque[ScheduledCall | CycleCall] = deque()
-        self._timers: list[tuple[int, int, Due]] = []
+        self._timers: list[tuple[int, int, Any]] = []
+        """The timers as (when in ns, sequence, call or future)."""
         self._cycles: CycleTimers = []
         """The timers of cycles. Their sequence numbers are of one series with those of `_timers`."""
         self._sequence = 0

@@ -44,8 +44,11 @@ class Histogram:
 
     def record(self, duration_ns: int) -> None:
         """Count one duration."""
-        if duration_ns <= 0:
-            self.record_zeros(1)  # in virtual time every scan takes 0 ns
+        if duration_ns <= 0:  # in virtual time every scan takes 0 ns
+            self.min_ns = 0
+            self.count += 1
+            self.counts[0] += 1
+            self._recent.append(0)
             return
         if not self.count or duration_ns < self.min_ns:
             self.min_ns = duration_ns

@@ -294,7 +294,11 @@ class Gateway:
 
     def _is_idle(self) -> bool:
         """Return whether no message is passed on, and none was delivered since the last `tick`."""
-        return all(map(_IS_IDLE, self.pumps)) and self._undelivered() == self.exchange.undelivered
+        return (
+            all(map(_IS_IDLE, self.pumps))
+            and not any(map(self.log.pending, self.config.log_tags))
+            and not any(self.exchange.undelivered.values())
+        )
 
     def skip(self, count: int, last_ns: int) -> None:
         """Count ticks that do not take place, see `Cycle`."""

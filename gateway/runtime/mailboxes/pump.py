@@ -155,7 +155,11 @@ class MailboxPump:
         """Return whether there is no message to pass on, to acknowledge or to refuse, so that `tick` does nothing."""
         driver = self.driver
         return not (
-            driver.to_acknowledge or driver.consumer.queue or self.inbox.queue or self._taken.of(driver.config.name)
+            self._sending
+            or driver.to_acknowledge
+            or driver.consumer.queue
+            or self.inbox.queue
+            or self._taken.of(driver.config.name)
         )
 
     def _keep(self, all_consumed: bool) -> None:

@@ -38,7 +38,7 @@ class NotRead(Exception):
 
 
 def lit_result(text: str, dialect: Dialect) -> str:
-    """Return the difference of a file from the output that it expects; "" if there is none.
+    """Return the first difference of a file's output from the expected one, or "" if both agree.
 
     Raises `NotRead` if the file is not executed by its own test, or has a comment that is not known.
     """

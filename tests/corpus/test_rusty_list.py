@@ -1,4 +1,4 @@
-"""The list of rusty's tests (`rusty.yaml`), and the readers of scripts/corpus_rusty, with texts of our own."""
+"""The list of rusty's tests (`rusty.yaml`), and the readers of scripts/corpus_rusty."""
 
 from __future__ import annotations
 

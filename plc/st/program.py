@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MethodType
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
@@ -32,7 +34,7 @@ from fieldtwin.plc.st import values
 from fieldtwin.plc.st.classes.instance_variables import is_instance_variable
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
-from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable, connection
+from fieldtwin.plc.st.compiler.pous.programs import METHODS, CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.coverage.recording import active_recording
 from fieldtwin.plc.st.decisions.reading import Decided, DecisionReader, reader
@@ -434,9 +436,24 @@ def _class_of(
         "source_files": tuple(sorted(unit.files, key=lambda file: (file != found.path, file))),
         "source_warnings": tuple(map(str, unit.warnings)),
         "__module__": __name__,
-        **tags,
+        **{name: _Method(getattr(StProgram, name)) if name in METHODS else tag for name, tag in tags.items()},
     }
-    return type(found.name, (StProgram,), body)
+    made: type[StProgram] = type(found.name, (StProgram,), body)
+    made.variables = {**StProgram.variables, **{name: replace(tag, name=name) for name, tag in tags.items()}}
+    return made
+
+
+class _Method:
+    """A method whose name is also that of a variable. As it can be set, it has precedence over the value in the instance."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __get__(self, program: StProgram | None, _: type[StProgram]) -> Callable[..., Any]:
+        return self.function if program is None else MethodType(self.function, program)
+
+    def __set__(self, program: StProgram, value: object) -> None:
+        raise AttributeError(f"{self.function.__name__} is a method")
 
 
 def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from inspect import isfunction
 from itertools import islice
 
 from fieldtwin.plc.program import Program
@@ -21,7 +22,9 @@ from fieldtwin.plc.st.runtime.parts import Key
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.addresses import address_of, area_of, short_name
 
-_API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
+METHODS = frozenset(name for name, of in vars(Program).items() if isfunction(of) and not name.startswith("__"))
+"""The methods of programs. A variable may have the name of one, because its value is found in the dictionary of the instance."""
+_API = frozenset(name for name in vars(Program) if not name.startswith("__")) - METHODS
 
 
 COMPOUND = (ty.String, ty.Array, ty.Struct)

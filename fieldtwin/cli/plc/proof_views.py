@@ -42,6 +42,8 @@ def print_report(report: Report) -> None:
     stdout.print(f"{report.program}: a scan follows the scan before after {shortest} to {longest}", markup=False)
     for name, text in report.assumptions:
         stdout.print(f"  assumed: {_named(name, text)}", markup=False, soft_wrap=True)
+    for limit in report.limits:
+        stdout.print(f"  assumed: {limit}", markup=False, soft_wrap=True)
     for what, pos in report.unknowns:
         where = f"{pos.path}:{pos.line}"
         stdout.print(f"  not exact: {what} may have any result ({where})", markup=False, soft_wrap=True)
@@ -144,6 +146,7 @@ def report_as_data(report: Report) -> dict[str, Any]:
         "proved": report.proved,
         "scan_interval_ms": [ns / NS_PER_MS for ns in report.interval_ns],
         "assumptions": [{"name": name, "expression": text} for name, text in report.assumptions],
+        "limits": list(report.limits),
         "inexact": [{"operation": what, "path": pos.path, "line": pos.line} for what, pos in report.unknowns],
         "invariants": [
             {

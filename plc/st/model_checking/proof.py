@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import z3
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.image.image import TagKind
+from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.model_checking.execution.mailboxes import MOST_MESSAGES
 from fieldtwin.plc.st.model_checking.properties import Asked, Expression, State, asked
 from fieldtwin.plc.st.model_checking.replay import Check, ModelDisagrees, Replay, held, instances
 from fieldtwin.plc.st.model_checking.solving import FAILS, Answer, Limits, Scan, solve
@@ -86,6 +90,8 @@ class Report:
     assumptions: tuple[tuple[str, str], ...]
     interval_ns: tuple[int, int]
     unknowns: tuple[tuple[str, t.Pos], ...]
+    limits: tuple[str, ...]
+    """The assumptions of the model itself, as sentences."""
     make: type[StProgram]
 
     replay: Replay
@@ -190,6 +196,7 @@ class _Proof:
             assumptions=self._question.assumptions,
             interval_ns=self._question.interval_ns,
             unknowns=tuple(dict.fromkeys(transition.unknowns)),
+            limits=tuple(_limits_of(program)),
             make=self._kind,
             replay=self._replay,
         )
@@ -225,9 +232,22 @@ class _Proof:
             values = {
                 v.name: program.__dict__[v.name]
                 for v in program.variables.values()
-                if v.name not in dict((answer.way or ())[0].values) and not v.name.startswith(HIDDEN)
+                if v.name not in dict((answer.way or ())[0].values)
+                and not v.name.startswith(HIDDEN)
+                and v.kind is not TagKind.MESSAGE
             }
         return Result(name, text, check, answer, failure, values)
+
+
+def _limits_of(program: StProgram) -> Iterator[str]:
+    """Yield the assumptions that the model makes about mailboxes and the clock."""
+    for v in program.st_declared.variables:
+        if isinstance(v.kind, ty.MessagesIn):
+            yield f"{v.name} brings at most {MOST_MESSAGES} messages in a scan, with any content"
+        elif isinstance(v.kind, ty.MessagesOut):
+            yield f"{v.name} has room for any number of messages up to {v.kind.depth}, at any time"
+    if program.st_resource.absolute:
+        yield "the first scan is at any time of the clock, and SCAN_TIME() stays below 146 years"
 
 
 def _is_true(condition: Any) -> bool:

@@ -13,8 +13,10 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError
+from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.model_checking.solving import Scan
 from fieldtwin.plc.st.model_checking.state import objects
 from fieldtwin.plc.st.model_checking.transition import action_of
@@ -82,6 +84,11 @@ class Replay:
         good = dict(scan.good)
         known = {}
         for name, value in scan.values:
+            if isinstance(program.st_variables[name].kind, ty.MessagesIn):
+                messages = tuple(Message(number, now_ns, b"") for number in range(1, value + 1))
+                program.__dict__[name] = messages
+                program.st_assign(program.st_variables[name], messages)
+                continue
             tag = tag_value(program, name, value)
             program.__dict__[name] = tag
             quality, reason = (Quality.GOOD, Reason.NONE) if good.get(name, True) else (Quality.BAD, Reason.TIMEOUT)

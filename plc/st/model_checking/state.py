@@ -9,6 +9,7 @@ from typing import Any
 import z3
 
 from fieldtwin.plc.st.model_checking.execution import floats
+from fieldtwin.plc.st.model_checking.execution.mailboxes import Model
 from fieldtwin.plc.st.model_checking.execution.merging import options_of
 from fieldtwin.plc.st.model_checking.execution.operations import is_none
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
@@ -85,7 +86,9 @@ def _parts(owner: Any) -> list[tuple[Any, Any]]:
 
 def _is_object(value: Any) -> bool:
     """Return whether a value is an object with variables. References do not count."""
-    plain = bool | int | float | str | Text | Int | Choice | floats.Float | z3.AstRef | Instance | Stored
+    plain = (
+        bool | int | float | str | tuple | Text | Int | Choice | floats.Float | z3.AstRef | Instance | Stored | Model
+    )
     return value is not None and not isinstance(value, plain) and not isinstance(value, REFERENCES)
 
 

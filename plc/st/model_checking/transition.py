@@ -20,9 +20,18 @@ from fieldtwin.plc.st.compiler.pous.programs import connection
 from fieldtwin.plc.st.model_checking.execution import floats
 from fieldtwin.plc.st.model_checking.execution.evaluation import Failure
 from fieldtwin.plc.st.model_checking.execution.interpreter import Interpreter
+from fieldtwin.plc.st.model_checking.execution.mailboxes import (
+    LATEST_NS,
+    MOST_MESSAGES,
+    Evaluation,
+    Mailbox,
+    Model,
+    Outgoing,
+    modelled,
+)
 from fieldtwin.plc.st.model_checking.execution.memory import Memory
 from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
-from fieldtwin.plc.st.model_checking.execution.operations import extreme, truth
+from fieldtwin.plc.st.model_checking.execution.operations import binary, extreme, truth
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
 from fieldtwin.plc.st.model_checking.execution.sources import Sources
 from fieldtwin.plc.st.model_checking.execution.symbolic import (
@@ -63,10 +72,16 @@ def action_of(key: str) -> str:
 
 @dataclass
 class Context:
-    """The running scan, as compiled code uses it. The scan's own time is 0, and earlier times are negative."""
+    """The running scan, as compiled code uses it. The scan's own time is 0, and earlier times are negative.
+
+    `scan_ns` is the time of the clock, for SCAN_TIME().
+    """
 
     first_scan: Any = True
     now_ns: int = 0
+    scan_ns: Any = 0
+    reads_times: bool = False
+    """Whether the program reads times of messages."""
     qualities: dict[str, Any] = field(default_factory=dict)
     """By input whose quality the program asks for: whether it is good."""
 
@@ -77,9 +92,12 @@ class Context:
         """Return the number of a new instance, which nothing depends on: interface types have no model."""
         return 0
 
+    @modelled
+    def message(self, x: Evaluation, box: Mailbox, number: Any) -> Any:
+        return box.message(x, number, timed=self.reads_times)
+
     def __getattr__(self, name: str) -> Any:
-        what = "SCAN_TIME()" if name == "scan_ns" else name
-        raise NotModelled(what, "use a timer, because only differences of times are modelled")
+        raise NotModelled(name)
 
 
 @dataclass(frozen=True)
@@ -132,22 +150,31 @@ class Builder:
     def __init__(self, program: StProgram, interval_ns: tuple[int, int]) -> None:
         self._program, self._interval_ns = program, interval_ns
         self._resource = program.st_resource
-        self._context = Context()
+        self._context = Context(reads_times=").t_ns" in program.st_unit.python)
         self._resource.space["_c"] = self._context
         self._resource.space["_G"] = self._resource.globals
         self._sources = Sources(program.st_unit, self._resource.space)
         self._inputs = self._input_symbols()
+        for v in program.st_declared.variables:
+            if isinstance(v.kind, ty.MessagesOut):
+                program.st_assign(v, Outgoing(v.kind.max_bytes, v.kind.depth))
         self._input_places = [
             (v.name, program.st_holder(v), v.attribute) for v in program.st_declared.variables if v.role == "input"
         ]
+        self._mailboxes = {v.name for v in program.st_declared.variables if isinstance(v.kind, ty.MessagesIn)}
         inputs = {(id(holder), attribute) for _, holder, attribute in self._input_places}
         roots = ((program.st_body, ""), (self._resource.globals, "global"))
         self._leaves = [Leaf(self._context, "first_scan", "first scan")]
+        self._clock = Leaf(self._context, "scan_ns", "time of the clock") if self._resource.absolute else None
+        if self._clock is not None:
+            self._leaves.append(self._clock)
         for root, name in roots:
             self._leaves += [
                 leaf
                 for leaf in leaves(root, name)
-                if (id(leaf.owner), leaf.key) not in inputs and not str(leaf.key).startswith(f"v_{HIDDEN}")
+                if (id(leaf.owner), leaf.key) not in inputs
+                and not str(leaf.key).startswith(f"v_{HIDDEN}")
+                and not isinstance(leaf.get(), Model)
             ]
         self._timers = [each for root, _ in roots for each in objects(root) if isinstance(each, _Timer)]
         self._initial = [leaf.get() for leaf in self._leaves]
@@ -159,6 +186,8 @@ class Builder:
     def build(self, assumptions: Sequence[Call], properties: Sequence[Call]) -> Transition:
         """Return the transition. Raises `FileInvalid` for a construct without a model."""
         domains = [self._joined(leaf, Domain(), value) for leaf, value in zip(self._leaves, self._initial, strict=True)]
+        if self._clock is not None:
+            domains[self._leaves.index(self._clock)] = Domain(low=0, high=LATEST_NS)
         growths = [0] * len(domains)
         for _ in range(_ROUNDS):
             scan = self._scan(domains, assumptions, ())
@@ -213,14 +242,13 @@ class Builder:
 
     def _input_symbols(self) -> list[InputSymbol]:
         low, high = self._interval_ns
+        if self._resource.absolute:  # the time before the first scan is that of the clock
+            low, high = 0, LATEST_NS
         found = [InputSymbol("", *integer("time since the scan before", low, high))]
         for v in self._program.st_declared.variables:
-            if isinstance(v.kind, ty.MessagesIn | ty.MessagesOut):
-                raise FileInvalid(
-                    f"plc prove has no model of MESSAGES, which the variable {v.name} has",
-                    path=self._program.source_path,
-                )
-            if v.role == "input":
+            if isinstance(v.kind, ty.MessagesIn):
+                found.append(InputSymbol(v.name, *integer(v.name, 0, MOST_MESSAGES)))
+            elif v.role == "input":
                 found.append(InputSymbol(v.name, *_input(v.name, v.kind)))
         return found
 
@@ -230,6 +258,7 @@ class Builder:
         """Execute a scan from a state in which each leaf has any value of its domain."""
         symbols = [domain.symbol(leaf.name) for leaf, domain in zip(self._leaves, domains, strict=True)]
         self._context.qualities.clear()
+        self._limit_time(symbols[0].value)
         limited = [*(s.limited for s in symbols), *(i.limited for i in self._inputs)]
         scan = _Scan(tuple(self._leaves), tuple(domains), tuple(symbols), tuple(self._inputs), both(*limited))
         interpreter = Interpreter(self._sources, Memory(), scan.possible)
@@ -237,10 +266,11 @@ class Builder:
         passed = self._inputs[0].value
         for leaf, symbol in zip(self._leaves, symbols, strict=True):
             leaf.put(_earlier(symbol.value, passed) if leaf.is_time else symbol.value)
-        for each, (_, holder, attribute) in zip(self._inputs[1:], self._input_places, strict=True):
-            assign(holder, attribute, each.value)
+        for each, (name, holder, attribute) in zip(self._inputs[1:], self._input_places, strict=True):
+            assign(holder, attribute, Mailbox(each.value) if name in self._mailboxes else each.value)
+        in_time = self._advance_clock(passed)
         try:
-            scan.assumed = both(*(self._asked(interpreter, call) for call in assumptions))
+            scan.assumed = both(in_time, *(self._asked(interpreter, call) for call in assumptions))
             interpreter.failures.clear()
             self._execute(interpreter)
             for timer in self._timers:
@@ -256,6 +286,24 @@ class Builder:
         scan.qualities = dict(self._context.qualities)
         scan.unknowns = tuple((made, what, self._sources.place(line)) for made, what, line in interpreter.unknowns)
         return scan
+
+    def _limit_time(self, first: Any) -> None:
+        """Limit the time since the scan before, for a program that uses SCAN_TIME: before the first scan it is any time."""
+        passed = self._inputs[0]
+        if self._clock is not None:
+            low, high = self._interval_ns
+            inside = both(compare("<=", low, passed.value), compare("<=", passed.value, high))
+            any_time = both(compare("<=", 0, passed.value), compare("<=", passed.value, LATEST_NS))
+            self._inputs[0] = InputSymbol(passed.name, passed.value, merged(first, any_time, inside))
+
+    def _advance_clock(self, passed: Any) -> Condition:
+        """Set the time of the clock, and return the condition that it can be represented."""
+        if self._clock is None:
+            return True
+        now = binary("+", self._clock.get(), passed)
+        in_time = compare("<=", now, LATEST_NS)
+        self._clock.put(extreme("<", [now, LATEST_NS]))
+        return in_time
 
     def _execute(self, interpreter: Interpreter) -> None:
         """Execute the program, and copy the variables that a configuration connects, as `StProgram.execute` does."""

@@ -13,6 +13,7 @@ import z3
 
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.model_checking.execution import floats, operations
+from fieldtwin.plc.st.model_checking.execution.mailboxes import Outgoing
 from fieldtwin.plc.st.model_checking.execution.memory import Memory
 from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
 from fieldtwin.plc.st.model_checking.execution.natives import BUILTINS, OF_VALUES
@@ -34,7 +35,7 @@ from fieldtwin.plc.st.model_checking.execution.symbolic import (
     width,
 )
 from fieldtwin.plc.st.runtime import copying, layouts, moments
-from fieldtwin.plc.st.runtime.references import MemberReference
+from fieldtwin.plc.st.runtime.references import Element, MemberReference
 
 _OPERATORS: dict[type, str] = {
     ast.Add: "+", ast.Sub: "-", ast.Pow: "**", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.BitAnd: "&",
@@ -60,6 +61,13 @@ class Closure:
 
     body: ast.expr
     frame: Frame
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """The method that returns the bytes of a text that is not known."""
+
+    text: Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +130,14 @@ class Evaluation:
         if isinstance(owner, Undefined) or owner is None:
             return UNDEFINED
         if isinstance(owner, Text):
+            if name == "encode":
+                return Encoding(owner)
             raise NotModelled(operations.STRINGS)
+        if isinstance(owner, Outgoing) and name == "room":
+            return owner.room_left(self)
+        if isinstance(owner, Element) and name == "v" and isinstance(owner.owner, list):
+            self._check_element(owner)
+            return operations.item(owner.owner, owner.at)
         found = getattr(type(owner), name, None)
         return self.run(found.fget, (owner,)) if isinstance(found, property) and found.fget else getattr(owner, name)
 
@@ -138,12 +153,31 @@ class Evaluation:
         if isinstance(owner, MemberReference) and name == "v":  # without the line, on which no scan depends
             self.put_attribute(owner.owner, owner.name, value)
             return
+        if isinstance(owner, Element) and name == "v" and isinstance(owner.owner, list):
+            self._check_element(owner)
+            self.put_item(owner.owner, owner.at, value)
+            return
         found = getattr(type(owner), name, None)
         if isinstance(found, property):
             assert found.fset is not None
             self.run(found.fset, (owner, value))
         else:
             self.memory.put(owner, name, value)
+
+    def _check_element(self, reference: Element) -> None:
+        """Note that a reference fails outside of its array."""
+        at, count = reference.at, len(reference.owner)
+        outside = either(operations.compare("<", at, 0), operations.compare(">=", at, count))
+        self.fail_if(outside, "a pointer outside the variable to which it pointed")
+
+    def put_item(self, items: list[Any], index: Any, value: Any) -> None:
+        """Assign an element of a list, whose index may be symbolic. An index outside of the list is excluded before."""
+        if isinstance(index, int):
+            if 0 <= index < len(items):
+                self.memory.put(items, index, value)
+        elif isinstance(index, Int):
+            for n in range(max(0, index.low), min(len(items) - 1, index.high) + 1):
+                self.memory.put(items, n, merged(operations.compare("==", index, n), value, items[n]))
 
     # -- expressions ------------------------------------------------------------------------------------------------------
 
@@ -298,6 +332,12 @@ class Evaluation:
             return self.value(function.body, function.frame)
         if isinstance(function, Undefined):
             return UNDEFINED
+        if isinstance(function, Encoding):
+            return function.text
+        if getattr(function, "modelled", False):
+            if isinstance(function, MethodType):
+                return function(self, *given)
+            return function(given[0], self, *given[1:])
         if isinstance(function, MethodType):
             return self.called(function.__func__, (function.__self__, *given), named)
         name, module = getattr(function, "__name__", ""), getattr(function, "__module__", None)

@@ -6,10 +6,8 @@ import ast
 from collections.abc import Callable
 from typing import Any
 
-from fieldtwin.plc.st.model_checking.execution import operations
 from fieldtwin.plc.st.model_checking.execution.evaluation import Evaluation, Frame
 from fieldtwin.plc.st.model_checking.execution.memory import Memory
-from fieldtwin.plc.st.model_checking.execution.merging import merged
 from fieldtwin.plc.st.model_checking.execution.natives import SymbolicRange
 from fieldtwin.plc.st.model_checking.execution.operations import binary, compare, truth
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
@@ -253,9 +251,7 @@ class Interpreter(Evaluation):
             elif isinstance(index, int):
                 self.memory.put(option, index, value)
             elif not isinstance(index, Undefined) and not isinstance(option, Undefined):
-                for n in range(max(0, index.low), min(len(option) - 1, index.high) + 1):
-                    chosen = operations.compare("==", index, n)
-                    self.memory.put(option, n, merged(chosen, value, option[n]))
+                self.put_item(option, index, value)
             self.memory.close()
 
 

@@ -14,6 +14,7 @@ import z3
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.model_checking.execution import floats, operations
+from fieldtwin.plc.st.model_checking.execution.mailboxes import Mailbox
 from fieldtwin.plc.st.model_checking.execution.merging import merged, options_of
 from fieldtwin.plc.st.model_checking.execution.operations import binary, compare, extreme, is_known, truth
 from fieldtwin.plc.st.model_checking.execution.refusal import NotModelled
@@ -174,7 +175,13 @@ def _length(x: Evaluation, given: tuple[Any, ...]) -> Any:
     result: Any = UNDEFINED
     for condition, option in options_of(given[0]):
         known = isinstance(option, list | tuple | str)
-        found = len(option) if known else x.unknown_integer("the length of a STRING", 0, ty.MAX_STRING)
+        found = (
+            option.count
+            if isinstance(option, Mailbox)
+            else len(option)
+            if known
+            else x.unknown_integer("the length of a STRING", 0, ty.MAX_STRING)
+        )
         result = merged(condition, found, result)
     return result
 

@@ -214,7 +214,44 @@ VAR one : Meter(first); first : INT := Doubled(20); full : BOOL; a, b, c : INT; 
   c := Part.count;
 END_PROGRAM
 """
+CLOCK = """
+PROGRAM Clock
+VAR_INPUT start : BOOL; END_VAR
+VAR began, passed : LTIME; running, late : BOOL; ms : LINT; END_VAR
+  IF start AND NOT running THEN began := SCAN_TIME(); running := TRUE; END_IF
+  IF running THEN
+    passed := SCAN_TIME() - began;
+    ms := LTIME_TO_LINT(SCAN_TIME()) / 1_000_000 MOD 1000;
+    IF passed >= LT#10s THEN late := TRUE; running := start; END_IF
+  END_IF
+END_PROGRAM
+"""
+MAIL = """
+PROGRAM Mail
+VAR_INPUT heard : MESSAGES; at : INT; END_VAR
+VAR_OUTPUT said : MESSAGES[16, 4]; END_VAR
+VAR count, most : DINT; many : BOOL; seen : ARRAY[0..3] OF INT; text : STRING; END_VAR
+VAR_TEMP i : DINT; END_VAR
+  FOR i := 1 TO MSG_COUNT(heard) DO
+    text := MSG_AT(heard, i);
+    count := (count + 1) MOD 1000;
+    seen[i MOD 4] := seen[i MOD 4] + 1;
+  END_FOR
+  most := MAX(most, MSG_COUNT(heard));
+  many := MSG_COUNT(heard) > 3;
+  IF at = 5 THEN text := MSG_AT(heard, 2); END_IF
+END_PROGRAM
+"""
+LENT = """
+FUNCTION_BLOCK Counter VAR_INPUT by : INT; END_VAR VAR_IN_OUT n : INT; END_VAR n := n + by; END_FUNCTION_BLOCK
+PROGRAM Lent
+VAR_INPUT at, by : INT; END_VAR
+VAR a : ARRAY[0..3] OF INT; grid : ARRAY[1..2, 1..2] OF INT; one : Counter; other : INT; END_VAR
+  one(by := by, n := a[at]);
+  IF by > 0 THEN one(by := 1, n := grid[2, at]); ELSE one(by := 2, n := other); END_IF
+END_PROGRAM
+"""
 EXAMPLES = {
     "integers": INTEGERS, "failing": FAILING, "parts": PARTS, "times": TIMES, "reals": REALS, "alarms": ALARMS, "chart": CHART,
-    "classes": CLASSES, "texts": TEXTS,
+    "classes": CLASSES, "texts": TEXTS, "clock": CLOCK, "mail": MAIL, "lent": LENT,
 }  # fmt: skip

@@ -8,6 +8,8 @@ from typing import Any
 
 import z3
 
+from fieldtwin.plc.program import Outbox
+from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.dialects import dialect_of
 from fieldtwin.plc.st.model_checking.solving import Scan, float_of
@@ -81,8 +83,12 @@ def program_states(kind: type[StProgram], way: Sequence[Scan]) -> Iterator[dict[
 
 def kept(program: StProgram) -> list[Leaf]:
     """Return the variables of a program that keep their values, without times of the clock."""
+    mailboxes = {v.attribute for v in program.st_declared.variables if isinstance(v.kind, ty.MessagesIn)}
     roots = ((program.st_body, ""), (program.st_resource.globals, "global"))
-    return [leaf for root, name in roots for leaf in leaves(root, name) if not leaf.is_time]
+    every = [leaf for root, name in roots for leaf in leaves(root, name)]
+    return [
+        leaf for leaf in every if not leaf.is_time and not isinstance(leaf.owner, Outbox) and leaf.name not in mailboxes
+    ]
 
 
 def same(a: Any, b: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from model_bench import INTERVAL_NS, kept, model_of, model_states, program_state
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.dialects import dialect_of
+from fieldtwin.plc.st.model_checking.execution.mailboxes import LATEST_NS, MOST_MESSAGES
 from fieldtwin.plc.st.model_checking.solving import Scan
 from fieldtwin.plc.st.model_checking.transition import Builder, Transition
 from fieldtwin.plc.st.program import StProgram, program_class
@@ -45,6 +47,8 @@ def values(kind: ty.Type) -> st.SearchStrategy[Any]:
         return st.sampled_from(sorted(kind.values.values()))
     if isinstance(kind, ty.Subrange):
         return whole_numbers(kind.low, kind.high)
+    if isinstance(kind, ty.MessagesIn):
+        return whole_numbers(0, MOST_MESSAGES)
     assert isinstance(kind, ty.Elementary)
     if kind.kind == "bool":
         return st.booleans()
@@ -64,7 +68,16 @@ def ways(kind: type[StProgram]) -> st.SearchStrategy[list[Scan]]:
     )
     pairs = st.tuples(*(values(v.kind).map(lambda value, name=v.name: (name, value)) for v in inputs))
     good = st.tuples(*(st.booleans().map(lambda on, name=v.name: (name, on)) for v in inputs))
-    return st.lists(st.builds(Scan, after, pairs, good), min_size=1, max_size=6)
+    scans = st.lists(st.builds(Scan, after, pairs, good), min_size=1, max_size=6)
+    if not kind().st_resource.absolute:
+        return scans
+    start = st.one_of(st.integers(0, 1000), st.integers(0, LATEST_NS - 6 * INTERVAL_NS[1]))
+    return st.builds(_beginning, scans, start)
+
+
+def _beginning(way: list[Scan], at_ns: int) -> list[Scan]:
+    """Return scans of which the first one is at a time of the clock."""
+    return [replace(way[0], after_ns=at_ns), *way[1:]]
 
 
 def check(transition: Transition, kind: type[StProgram], way: list[Scan]) -> None:

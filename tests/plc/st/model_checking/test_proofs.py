@@ -290,8 +290,6 @@ def test_errors_in_expressions_name_the_expression() -> None:
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("PROGRAM P VAR_INPUT m : MESSAGES; END_VAR END_PROGRAM", "MESSAGES, which the variable m has"),
-        ("PROGRAM P VAR a : LTIME; END_VAR a := SCAN_TIME(); END_PROGRAM", r":1:\d+: .*SCAN_TIME"),
         ("PROGRAM P VAR_INPUT n : INT; END_VAR VAR s : STRING; END_VAR s := MAX(INT_TO_STRING(n), 'x'); END_PROGRAM",
          "this operation on a STRING"),
         ("PROGRAM P VAR_INPUT n : DINT; END_VAR VAR i : DINT; END_VAR WHILE i < n DO i := i + 1; END_WHILE END_PROGRAM",
@@ -306,6 +304,76 @@ def test_errors_in_expressions_name_the_expression() -> None:
 def test_a_construct_without_a_model_is_refused_by_name(text: str, what: str) -> None:
     with pytest.raises(FileInvalid, match=what):
         proved(text)
+
+
+def test_scan_time_is_any_time_that_grows_from_scan_to_scan() -> None:
+    text = """
+    PROGRAM Clock
+    VAR began, passed : LTIME; n : INT; END_VAR
+      IF n = 0 THEN began := SCAN_TIME(); END_IF
+      passed := SCAN_TIME() - began;
+      IF n < 2 THEN n := n + 1; ELSE began := SCAN_TIME(); n := 1; END_IF
+    END_PROGRAM
+    """
+    report = proved(
+        text, "passed >= LT#0s", "passed <= LT#10s", "passed < LT#9s", "began < LT#1h", interval_ms=(10, 5_000)
+    )
+    assert [r.verdict for r in report.invariants] == ["proved", "proved", "violated", "violated", "proved"]
+    way = report.invariants[2].answer.way
+    assert way is not None
+    assert sum(scan.after_ns for scan in way[1:]) >= 9_000_000_000
+    assert report.limits == ("the first scan is at any time of the clock, and SCAN_TIME() stays below 146 years",)
+
+
+def test_messages_come_in_any_number_up_to_a_limit_that_the_report_names() -> None:
+    text = """
+    PROGRAM Mail
+    VAR_INPUT heard : MESSAGES; second : BOOL; END_VAR
+    VAR_OUTPUT said : MESSAGES[16, 4]; END_VAR
+    VAR most : DINT; text : STRING; END_VAR
+      most := MAX(most, MSG_COUNT(heard));
+      IF second THEN text := MSG_AT(heard, 2); END_IF
+    END_PROGRAM
+    """
+    report = proved(text, "most <= 16", "most <= 15", scans=3)
+    assert [r.verdict for r in report.invariants] == ["proved", "violated", "violated"]
+    assert dict((report.invariants[1].answer.way or ())[-1].values)["heard"] == 16
+    assert "an index outside its array" in report.invariants[-1].failure
+    assert report.limits == (
+        "heard brings at most 16 messages in a scan, with any content",
+        "said has room for any number of messages up to 4, at any time",
+    )
+
+
+def test_the_content_of_a_message_and_the_room_for_one_may_be_anything() -> None:
+    text = """
+    PROGRAM Answer
+    VAR_INPUT heard : MESSAGES; END_VAR
+    VAR_OUTPUT said : MESSAGES[16, 4]; END_VAR
+    VAR sent, stop, full : BOOL; at : LTIME; END_VAR
+      IF MSG_COUNT(heard) > 0 THEN
+        stop := MSG_AT(heard, 1) = 'stop';
+        at := MSG_TIME(heard, 1);
+        sent := MSG_SEND(said, 'ok');
+      END_IF
+      full := MSG_ROOM(said) = 0;
+    END_PROGRAM
+    """
+    report = proved(text, "stop OR TRUE", "NOT stop", "NOT sent", "at = LT#0s", "NOT full", scans=3)
+    assert [r.verdict for r in report.invariants] == ["proved", "bounded", "violated", "violated", "bounded", "proved"]
+    assert {what for what, _ in report.unknowns} == {"the comparison of a STRING", "MSG_TIME", "MSG_SEND", "MSG_ROOM"}
+
+
+def test_an_element_with_a_variable_index_can_be_lent_to_a_var_in_out() -> None:
+    text = """
+    FUNCTION_BLOCK Up VAR_IN_OUT n : INT; END_VAR IF n < 3 THEN n := n + 1; END_IF END_FUNCTION_BLOCK
+    PROGRAM P VAR_INPUT at : INT; END_VAR VAR a : ARRAY[0..2] OF INT; up : Up; END_VAR
+      up(n := a[LIMIT(0, at, 2)]);
+    END_PROGRAM
+    """
+    report = proved(text, "a[0] <= 3 AND a[2] <= 3", "a[1] < 3", scans=5)
+    assert [r.verdict for r in report.invariants] == ["proved", "violated", "proved"]
+    assert len(report.invariants[1].answer.way or ()) == 3
 
 
 UNION = "TYPE U : UNION w : WORD; b : BYTE; END_UNION END_TYPE"

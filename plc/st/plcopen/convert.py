@@ -76,6 +76,9 @@ class _Converter:
         for data_type in self.project.every("dataType"):
             with self._whole(data_type, "type", data_type.attributes.get("name", "")):
                 self._data_type(data_type)
+        for union in self.project.every("union"):
+            with self._whole(union, "type", union.attributes.get("name", "")):
+                self._union(union)
         for pou in self.project.every("pou"):
             with self._whole(pou, _kind(pou).lower().replace("_", " "), pou.attributes.get("name", "")):
                 self._pou(pou)
@@ -140,12 +143,19 @@ class _Converter:
             self._put(inner.line, f"{name} : STRUCT")
             for v in inner.children:
                 if v.tag == "variable":
-                    at = f" AT {v.attributes['address']}" if v.attributes.get("address") else ""
-                    self._put(v.line, f"{self._name(v)}{at} : {self._type(v)}{self._initial(v)};")
+                    self._variable(v)
             self._put(inner.end_line, "END_STRUCT;")
         else:
             self._put(inner.line, f"{name} : {self._type_of(inner)}{self._initial(element)};")
         self._put(element.end_line, "END_TYPE")
+
+    def _union(self, element: Element) -> None:
+        """Write a union, which CODESYS adds to the data types."""
+        self.last = element.line
+        self._put(element.line, f"TYPE {self._name(element)} : UNION")
+        for v in element.every("variable"):
+            self._variable(v)
+        self._put(element.end_line, "END_UNION END_TYPE")
 
     def _pou(self, pou: Element) -> None:
         self.last = pou.line
@@ -243,9 +253,12 @@ class _Converter:
         self._put(block.line, " ".join(words))
         for v in block.children:
             if v.tag == "variable":
-                at = f" AT {v.attributes['address']}" if v.attributes.get("address") else ""
-                self._put(v.line, f"{self._name(v)}{at} : {self._type(v)}{self._initial(v)};")
+                self._variable(v)
         self._put(block.end_line, "END_VAR")
+
+    def _variable(self, v: Element) -> None:
+        at = f" AT {v.attributes['address']}" if v.attributes.get("address") else ""
+        self._put(v.line, f"{self._name(v)}{at} : {self._type(v)}{self._initial(v)};")
 
     def _type(self, variable: Element) -> str:
         kind = variable.find("type")

@@ -19,18 +19,45 @@ def read_parts(
     """Read each declaration of an export alone, as `parse_parts` does."""
     export = convert(text, path)
     for unit, names, error in parse_parts(export.text, path, dialect):
-        yield _complete(unit, export), names, error
+        yield _complete(unit, export, dialect), names, error
 
 
 def read_plcopen(text: str, path: str = "", dialect: Dialect = STANDARD) -> t.SourceUnit:
     """Return the declarations of an export. Raises `FileInvalid` for an error in a part of it that is supported."""
     export = convert(text, path)
-    return _complete(parse_all(export.text, path, dialect), export)
+    return _complete(parse_all(export.text, path, dialect), export, dialect)
 
 
-def _complete(unit: t.SourceUnit, export: Export) -> t.SourceUnit:
-    pous = tuple(_with_drawings(pou, export.drawings) for pou in unit.pous)
-    return replace(unit, pous=pous, missing=export.missing)
+def _complete(unit: t.SourceUnit, export: Export, dialect: Dialect) -> t.SourceUnit:
+    """Return a unit with the bodies that are drawn. Without unions and POUs with properties in dialects that do not have them."""
+    missing = [] if dialect.vendor else list(_of_other_dialects(unit))
+    left_out = {one.name for one in missing}
+    pous = tuple(_with_drawings(pou, export.drawings) for pou in unit.pous if pou.name not in left_out)
+    types = tuple(one for one in unit.types if one.name not in left_out)
+    return replace(unit, types=types, pous=pous, missing=(*export.missing, *missing))
+
+
+def _of_other_dialects(unit: t.SourceUnit) -> Iterator[t.Missing]:
+    """Yield the declarations that only the dialects codesys and twincat have."""
+    which = "which the dialects codesys and twincat have"
+    for one in unit.types:
+        if isinstance(one, t.StructDecl) and one.union:
+            yield t.Missing(one.pos, "type", one.name, f"{one.name} is a UNION, {which}")
+    reasons = {pou.name.lower(): f"{pou.name} has a property, {which}" for pou in unit.pous if _has_property(pou)}
+    derived = [pou for pou in unit.pous if pou.extends]
+    for _ in derived:
+        for pou in derived:
+            of = reasons.get(pou.extends[0].name.lower())
+            if of is not None:
+                reasons.setdefault(pou.name.lower(), f"{pou.name} extends {pou.extends[0].name}; {of}")
+    for pou in unit.pous:
+        if pou.name.lower() in reasons:
+            kind = pou.kind.lower().replace("_", " ")
+            yield t.Missing(pou.pos, kind, pou.name, reasons[pou.name.lower()])
+
+
+def _has_property(pou: t.Pou) -> bool:
+    return any(method.kind in ("GET", "SET") for method in pou.methods)
 
 
 def _with_drawings(pou: t.Pou, drawings: Mapping[tuple[str, str], Drawn]) -> t.Pou:

@@ -115,3 +115,40 @@ def test_a_property_with_an_accessor_in_another_language_is_not_imported(tmp_pat
     text = EXPORT.replace(st("speed := own;"), "<body><FBD/></body>")
     with pytest.raises(FileInvalid, match=r"GET of the property Base\.speed has no interface and body in ST"):
         loaded(tmp_path, text)
+
+
+UNION = f"""<data name="{DATA}/union" handleUnknown="implementation">
+<union name="Halves">
+{variable("whole", "DWORD", "16#10002")}
+<variable name="half"><type><array><dimension lower="0" upper="1"/><baseType><WORD/></baseType></array></type></variable>
+</union></data>"""
+
+
+WITHOUT_DRIVE = EXPORT.replace('<derived name="Drive"/>', "<INT/>").replace(
+    st("drive.speed := 500; drive(); seen := drive.speed + start; double := drive.doubled;"), st("seen := start;")
+)
+
+
+def test_a_union_of_an_export_is_imported_in_the_dialects_that_have_unions(tmp_path: Path) -> None:
+    data = f'<addData><data name="{DATA}/globalvars">'
+    text = WITHOUT_DRIVE.replace(data, data.replace("<addData>", f"<addData>{UNION}"))
+    assert loaded(tmp_path, text).seen == 0
+    (tmp_path / "used.st").write_text(
+        "PROGRAM Used VAR h : Halves; n : WORD; END_VAR n := h.half[1] + h.half[0]; END_PROGRAM"
+    )
+    made: Any = load_source(tmp_path, "Used", dialect_of("codesys"))()
+    made.execute(ScanInfo(0, 1, True))
+    assert made.n == 3
+    with pytest.raises(FileInvalid, match="Halves is a UNION, which the dialects codesys and twincat have"):
+        load_source(tmp_path, "Used")
+
+
+def test_a_block_with_a_property_is_an_error_in_the_standard_only_where_it_is_used(tmp_path: Path) -> None:
+    path = tmp_path / "plant.xml"
+    path.write_text(EXPORT, encoding="utf-8")
+    with pytest.raises(FileInvalid, match="Drive extends Base; Base has a property, which the dialects codesys"):
+        load_source(path, "Main")
+    path.write_text(WITHOUT_DRIVE, encoding="utf-8")
+    made: Any = load_source(path, "Main")()
+    made.execute(ScanInfo(0, 1, True))
+    assert made.seen == 1000

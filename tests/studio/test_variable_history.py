@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -31,13 +33,17 @@ END_PROGRAM
 VARIABLES = "/instances/tank/plc/variables"
 
 
-@pytest.fixture(scope="module")
-def tank(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
-    folder = tmp_path_factory.mktemp("variables") / "tank"
+def tank_folder(folder: Path) -> None:
     shutil.copytree(TANK, folder)
     (folder / "fill.st").write_text(PROGRAM)
     system = folder / "tank.yaml"
     system.write_text(system.read_text().replace("source: fill.st", "source: fill.st\n      dialect: codesys"))
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    folder = tmp_path_factory.mktemp("variables") / "tank"
+    tank_folder(folder)
     with studio("tank.yaml", folder=folder) as running:
         yield running
 
@@ -84,6 +90,31 @@ def test_the_type_of_a_time_is_described(tank: Studio) -> None:
     with tank.client(VIEW) as client:
         programs = until(lambda: client.get("/instances/tank/plc/programs").json(), "the programs are described")
     assert programs["fill"]["variables"]["due"]["type"] == "TIME"
+
+
+def test_variables_that_a_run_in_virtual_time_has_recorded_are_in_its_trace(tmp_path: Path) -> None:
+    folder = tmp_path / "tank"
+    tank_folder(folder)
+    command = [sys.executable, "-m", "fieldtwin", "simulate", "tank.yaml", "--for", "2s", "--trace", "run.jsonl"]
+    unknown = [*command, "--variable", "fill.tymer"]
+    wrong = subprocess.run(unknown, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert wrong.returncode == 2
+    assert "no variable 'fill.tymer' that can be traced" in wrong.stderr
+    names = ["fill.timer.ET", "fill.pump.Next.count", "fill.modes[2]", "fill.n"]
+    chosen = [text for name in names for text in ("--variable", name)]
+    subprocess.run([*command, *chosen], cwd=folder, check=True, capture_output=True, timeout=120)
+    with studio("run.jsonl", folder=folder) as running, running.client(VIEW) as client:
+        trace = "/traces/run.jsonl"
+        until(lambda: client.get(trace).json()["behind_bytes"] == 0, "the trace is read")
+        assert set(names) <= set(client.get(f"{trace}/plc/variables").json())
+        found = client.get(f"{trace}/tags/fill.pump.Next.count/history").json()["points"]
+        counts = [value for _, value, _, _ in found]
+        assert counts == list(range(1, len(counts) + 1))
+        assert len(counts) > 150  # a scan every 10 ms
+        modes = client.get(f"{trace}/tags/fill.modes[2]/history").json()["points"]
+        assert [point[1] for point in modes[:3]] == ["IDLE", "FILLING", "IDLE"]
+        about = client.get(f"{trace}/plc/programs").json()["fill"]["variables"]["timer.ET"]
+        assert (about["unit"], about["type"], about["role"]) == ("ns", "TIME", "internal")
 
 
 def test_a_ring_keeps_the_last_scans_and_counts_the_others() -> None:

@@ -60,6 +60,14 @@ OF_A_GROUP = (
         help="Write every event to this file (JSON lines).",
     ),
     click.option(
+        "--variable",
+        "variables",
+        multiple=True,
+        metavar="NAME",
+        help="Write this variable of a program into the trace after each scan that changes it, such as main.timer.ET; "
+        "named as in fieldtwin plc trace. Can be repeated.",
+    ),
+    click.option(
         "--compare",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         help="Compare the run with an older trace, as fieldtwin trace --against; exit code 1 if it differs.",
@@ -78,6 +86,7 @@ def command(
     choice: FaultChoice,
     sources: TemplateSearchOptions,
     trace: Path | None,
+    variables: tuple[str, ...],
     compare: Path | None,
     reports: CampaignReports,
     as_json: bool,
@@ -96,6 +105,8 @@ def command(
     """
     if duration_s <= 0:
         raise UsageError("simulate needs an end time", expected="--for 24h")
+    if variables and trace is None:
+        raise UsageError("--variable without a file for its values", expected="--trace FILE")
     random_faults = choice.of(faults)
     systems = systems_of(system, sources, {**replay.given(), "--compare": compare}, OF_A_GROUP, virtual=True)
     if systems is None:
@@ -116,6 +127,7 @@ def command(
         fault_file=Path(faults) if faults and random_faults is None else None,
         random_faults=random_faults,
         trace=trace,
+        variables=variables,
     )
     if runs.seeds:
         if trace or compare or seed is not None:

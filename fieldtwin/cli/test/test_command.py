@@ -100,6 +100,14 @@ class _WithCommand(GroupedCommand):
         help="Write every event of each scenario to a file in this folder, which fieldtwin studio shows.",
     ),
     click.option(
+        "--variable",
+        "variables",
+        multiple=True,
+        metavar="NAME",
+        help="Write this variable of a program into the traces after each scan that changes it, such as main.timer.ET. "
+        "Can be repeated.",
+    ),
+    click.option(
         "--progress",
         type=click.Path(dir_okay=False),
         help="Write the steps, verdicts and checked values of a single scenario to this file while it runs (JSON lines).",
@@ -121,6 +129,7 @@ def command(
     html: str | None,
     trace: str | None,
     traces: Path | None,
+    variables: tuple[str, ...],
     progress: str | None,
     as_json: bool,
 ) -> int:
@@ -156,6 +165,10 @@ def command(
         if given and len(paths) != 1:
             raise UsageError(f"{option} needs a single scenario", got=f"{len(paths)} of them")
     _check(target, at)
+    if variables and (target != "virtual" or campaign.seeds or not (trace or traces)):
+        raise UsageError(
+            "--variable needs a trace of a run in virtual time", expected="--trace FILE or --traces FOLDER"
+        )
     if retries and target == "real" and Impact(at.allow).rank > Impact.READ.rank:
         raise UsageError(
             "--retry-inconclusive would repeat a scenario's writes to a plant",
@@ -185,6 +198,7 @@ def command(
         Impact(at.allow),
         at.can,
         controller,
+        variables,
     )
     recording = logic.recording(target, campaign=bool(campaign.seeds), html=html is not None)
     shown = Progress(Path(progress)) if progress else None

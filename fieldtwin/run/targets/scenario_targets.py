@@ -51,7 +51,8 @@ class ScenarioTarget:
     `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the topside modem of a plant.
     `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local` the
     interface of emulated CAN buses (`socketcan/vcan0`); empty: the interface in the prototype file. `controller`: on `local`
-    the user's program and its arguments, which replaces fieldtwin's gateway and PLC.
+    the user's program and its arguments, which replaces fieldtwin's gateway and PLC. `variables` of programs are in the trace of
+    `virtual`.
     """
 
     name: str = "virtual"
@@ -64,6 +65,7 @@ class ScenarioTarget:
     allow: Impact = Impact.READ
     can: str = ""
     controller: tuple[str, ...] = ()
+    variables: tuple[str, ...] = ()
 
 
 def run_scenario(
@@ -95,7 +97,7 @@ def _attempt(
     A scenario that the target does not allow or cannot run is SKIPPED; a lost system is an ERROR with its reason.
     """
     if target.name == "virtual":
-        return run_virtual(scenario, target.seed, trace_file, progress=progress)
+        return run_virtual(scenario, target.seed, trace_file, progress=progress, variables=target.variables)
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     refused = _of_a_plant(scenario, target) if target.name == "real" else ""

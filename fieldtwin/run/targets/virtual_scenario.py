@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from fieldtwin.run.targets.progress import Progress
 from fieldtwin.run.targets.run_checks import RunChecker
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.run.virtual.guided_faults import GuidedFaults
+from fieldtwin.run.virtual.recorded_variables import RecordedVariables
 from fieldtwin.run.virtual.trace_description import begin_description, described_checks
 from fieldtwin.scenarios.judging.runner import ByChance, ScenarioRunner, gone
 from fieldtwin.scenarios.language.about import result_of
@@ -42,10 +43,11 @@ def run_virtual(
     most_trace_bytes: int | None = None,
     watch: Callable[[Trace], None] | None = None,
     guide: GuidedFaults | None = None,
+    variables: Sequence[str] = (),
 ) -> ScenarioResult:
     """Run the scenario. `seed` takes precedence over the scenario's own seed and the prototype file's. `by_chance`: random
     faults of a campaign; `guide` chooses further ones during the run. `most_trace_bytes` limits the trace file (see
-    `open_sink`). `watch` gets the trace before its first event, to listen to it.
+    `open_sink`). `watch` gets the trace before its first event, to listen to it. `variables` are in the trace as well.
     """
     group = group_of(scenario)
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
@@ -75,6 +77,7 @@ def run_virtual(
             kind = virtual_kind(group)
             nonlocal about
             async with kind.virtual(group, loop, Path(folder), trace, chosen, None, scenario.probes) as running:
+                recorded = RecordedVariables(running, variables) if variables else None
                 if trace_file is not None:
                     about = begin_description(
                         trace_file,
@@ -83,6 +86,7 @@ def run_virtual(
                         seed=chosen,
                         profiles=scenario.profiles,
                         title=scenario.form.scenario,
+                        recorded=recorded.variables if recorded is not None else (),
                     )
                 async with Nursery() as nursery:
                     if guide is not None:

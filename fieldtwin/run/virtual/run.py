@@ -28,6 +28,7 @@ from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.run.virtual.guided_faults import guide_of
+from fieldtwin.run.virtual.recorded_variables import RecordedVariables
 from fieldtwin.run.virtual.system_check import SystemCheck
 from fieldtwin.run.virtual.trace_description import begin_description
 from fieldtwin.scenarios.bench import Bench
@@ -46,7 +47,8 @@ class VirtualOptions:
     """The options of a run. `system` names the file of one system or of several; the duration is in virtual seconds.
 
     `faults`, and those of the file `fault_file`, are injected in addition to those of `random_faults`, which the seed
-    chooses; `trace` is a file for every event, and `most_trace_bytes` limits it (see `open_sink`). `commands`: the sample
+    chooses; `trace` is a file for every event, and `most_trace_bytes` limits it (see `open_sink`). `variables` of programs are
+    events of the trace as well (`RecordedVariables`). `commands`: the sample
     periods in seconds that are commanded; None: the usual commands. `prototype_file`, `recordings` and `speed` are for one
     system.
     """
@@ -64,6 +66,7 @@ class VirtualOptions:
     random_faults: RandomFaults | None = None
     trace: Path | None = None
     most_trace_bytes: int | None = field(default=None, repr=False)  # no part of a campaign's fingerprint
+    variables: tuple[str, ...] = field(default=(), repr=False)
 
 
 def load_one(options: VirtualOptions) -> SystemGroup:
@@ -182,10 +185,16 @@ class VirtualRun:
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
         kind, group, commands = self._kind, self.group, self.scripted
         async with kind.virtual(group, loop, folder, self.trace, self.seed, commands) as running:
+            recorded = RecordedVariables(running, self.options.variables) if self.options.variables else None
             self.attach(running)
             if self.options.trace is not None:
                 self._about = begin_description(
-                    self.options.trace, group, running, seed=self.seed, profiles=self.options.profiles
+                    self.options.trace,
+                    group,
+                    running,
+                    seed=self.seed,
+                    profiles=self.options.profiles,
+                    recorded=recorded.variables if recorded is not None else (),
                 )
             for fault in self.faults:  # each has its own start time
                 await running.bench.inject(fault)

@@ -10,8 +10,9 @@ import msgspec
 
 from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.plc.runtime.about import describe_programs
+from fieldtwin.plc.runtime.variable_trace import TracedVariable
 from fieldtwin.results.model import CheckResult
-from fieldtwin.results.trace_about import VERSION, CheckAbout, ProgramAbout, TraceAbout, write_about
+from fieldtwin.results.trace_about import VERSION, CheckAbout, ProgramAbout, TraceAbout, VariableAbout, write_about
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.twin.prototype.group import SystemGroup
@@ -26,8 +27,10 @@ def begin_description(
     seed: int,
     profiles: Iterable[Path] = (),
     title: str = "",
+    recorded: Iterable[TracedVariable] = (),
 ) -> TraceAbout:
     """Write the description of a run that begins, and return it. Several systems are described as one, under the group's names.
+    `recorded` are variables that are in the trace and are not tags.
 
     Raises `FileInvalid`.
     """
@@ -49,6 +52,10 @@ def begin_description(
             for tag, limit in stale_limits(driver).items()
         },
     )
+    for one in recorded:
+        program, _, path = one.name.partition(".")
+        variable = VariableAbout(tag=one.name, role="internal", kind=one.type, unit=one.unit, type=one.type)
+        about.programs[program].variables[path] = variable
     write_about(trace, about)
     return about
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,9 @@ END_PROGRAM
 """
 
 
+VARIABLES = ("fill.settled.ET", "fill.modes[2]", "fill.settled.Q", "fill.due")
+
+
 def add(page: Window, name: str) -> None:
     page.type(".add-variable input", name)
     page.click(".add-variable button")
@@ -45,7 +50,7 @@ def test_variables_are_added_to_the_trends_of_tags_with_units_names_and_scans(tm
         page.sees("tr[data-variable='fill.settled.PT']", "T#2s")
         page.click("tr[data-variable='fill.settled.ET'] a", "Trend")
         page.sees(".trend .scans", "fill.settled.ET: all")
-        for name in ("fill.modes[2]", "fill.settled.Q", "fill.due"):
+        for name in VARIABLES[1:]:
             add(page, name)
             page.sees(".trend .scans", f"{name}: all")
         page.choose("Add", "sensor.level")
@@ -75,12 +80,45 @@ def test_variables_are_added_to_the_trends_of_tags_with_units_names_and_scans(tm
         assert answers == []
 
 
+SCENARIO = """scenario: the mode is reached
+system: ./tank.yaml
+steps:
+  - pause: 3s
+"""
+
+
+def test_a_trace_shows_the_variables_that_its_scenario_has_recorded(tmp_path: Path) -> None:
+    folder = tmp_path / "tank"
+    shutil.copytree(TANK, folder)
+    (folder / "fill.st").write_text(PROGRAM)
+    (folder / "mode.scenario.yaml").write_text(SCENARIO)
+    chosen = [text for name in VARIABLES for text in ("--variable", name)]
+    command = [sys.executable, "-m", "fieldtwin", "test", "mode.scenario.yaml", *chosen]
+    refused = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert (refused.returncode, "--trace FILE" in refused.stderr) == (2, True)
+    subprocess.run([*command, "--trace", "run.jsonl"], cwd=folder, check=True, capture_output=True, timeout=120)
+    query = "&".join(f"variable={name}" for name in VARIABLES)
+    with studio("run.jsonl", folder=folder) as running, browser() as page:
+        page.go(f"{running.url}?token={OPERATE}#/trace%3Arun.jsonl/trends?t=2.5&{query}")
+        page.click("button", "Cursors")
+        rows = until(lambda: values_at_b(page), "cursor B has a value of each series")
+        assert rows["fill.modes[2]"] == ("FILLING", "")
+        assert rows["fill.settled.Q"] == ("FALSE", "")
+        assert rows["fill.due"] == ("1.5", "s")
+        assert 1.6 < float(rows["fill.settled.ET"][0]) < 1.7  # at two thirds of 2.5 s
+        assert rows["fill.settled.ET"][1] == "s"
+        page.click(".nav a", "PLC")
+        page.sees("tr[data-tag='fill.settled.ET']", "T#2s")
+        if not NO_AXE:
+            assert violations(page) == []
+        assert page.complaints() == []
+
+
 def values_at_b(page: Window) -> dict[str, tuple[str, str]]:
     """Return the value and the unit of each series at cursor B; nothing while one is missing."""
     lines = page.text(".cursors tbody tr").split("\n")
     rows = {
         cells[0]: (cells[2], cells[4] if len(cells) > 4 else "") for line in lines if len(cells := line.split("\t")) > 3
     }
-    wanted = {"fill.modes[2]", "fill.settled.Q", "fill.due", "fill.settled.ET"}
-    ready = wanted <= set(rows) and not any(re.match("no value|not", rows[name][0]) for name in wanted)
+    ready = set(VARIABLES) <= set(rows) and not any(re.match("no value|not", rows[name][0]) for name in VARIABLES)
     return rows if ready else {}

@@ -5,7 +5,9 @@ const OTHERS = "other values";
 const NS_PER_S = 1e9;
 
 /** A series of a fetched history. `words`: names of numbers. `known`: the levels of this series so far, so that a level keeps its place. */
-export function seriesOf(found, { unit = "", words = {} }, known = []) {
+export function seriesOf(answer, { unit = "", words = {} }, known = []) {
+  // In a trace, variables of programs have no quality.
+  const found = { ...answer, points: answer.points.map(([t, value, quality, why]) => [t, value, quality || "good", why]) };
   const values = found.points.map(([, value]) => value).filter((value) => value !== null && value !== undefined);
   const have = (test) => values.length > 0 && values.every(test);
   if (have((v) => typeof v === "boolean")) return stepped(found, ["FALSE", "TRUE"], (v) => (v ? "TRUE" : "FALSE"));

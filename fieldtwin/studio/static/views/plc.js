@@ -69,7 +69,7 @@ function Program({ store, name, plc, changes }) {
 }
 
 const COUNTER = /\.(taken|consumed)$/; // counts the messages of a mailbox
-const ORDER = ["output", "local", "input", "messages", "watched", "counter"];
+const ORDER = ["output", "local", "input", "messages", "watched", "internal", "counter"];
 
 /** The tags in the PLC: [kind, name, present value, its description], those that programs use first. */
 function tagsOf(store, plc) {
@@ -93,7 +93,7 @@ function tagsOf(store, plc) {
 }
 
 function Tags({ store, plc, onOpen }) {
-  return html`<div class="scroll">
+  return html`<div class="scroll" role="group" tabindex="0" aria-label="Tags of the PLC">
     <table class="list one-line">
       <thead><tr><th>Tag</th><th>Kind</th><th class="number">Value</th><th>Quality</th><th><span class="visually-hidden">Actions</span></th></tr></thead>
       <tbody>

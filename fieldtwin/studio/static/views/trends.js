@@ -62,7 +62,7 @@ export function Trends({ store, query }) {
       current = false;
       clearInterval(timer);
     };
-  }, [chosen.join(), span, held, store.settled, view.zoom?.join()]);
+  }, [chosen.join(), span, held, store.settled, view.zoom?.join(), Object.keys(store.programs).join()]);
   const started = store.about.started_ns;
   const seconds = (ns) => (ns - started) / 1e9;
   const drawn = (name, answer) => {

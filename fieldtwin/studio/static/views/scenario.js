@@ -4,6 +4,7 @@ import { html, useEffect, useMemo, useRef, useState } from "../vendor/preact.js"
 import { address } from "../lib/address.js";
 import { get, post, remove, url } from "../lib/api.js";
 import { Charts, Cursors, Marks } from "../lib/chart.js";
+import { seriesOf } from "../lib/series.js";
 import { Failure, useAction, useFetched } from "../lib/parts.js";
 import { useStore } from "../lib/store.js";
 import { PREFIX } from "../lib/trace_store.js";
@@ -218,14 +219,17 @@ function Values({ store, run, values }) {
     }
     const steps = run.progress.steps.filter(({ begun_s, text }) => begun_s !== null && /^(fault|clear|set|send):/.test(text));
     const acts = steps.map(({ begun_s, text }) => ({ t_ns: begun_s * 1e9, kind: text.startsWith("clear") ? "cleared" : "fault", text }));
-    return { data: found, tags: Object.keys(found).slice(0, MOST_CHARTED), marks: [...acts, ...states].sort((a, b) => a.t_ns - b.t_ns) };
+    const series = Object.entries(found).map(([name, one]) => {
+      const tag = store.tagOf(name);
+      return [name, seriesOf(one, { unit: tag?.unit, words: tag?.values })];
+    });
+    return { data: Object.fromEntries(series), tags: Object.keys(found).slice(0, MOST_CHARTED), marks: [...acts, ...states].sort((a, b) => a.t_ns - b.t_ns) };
   }, [values, run.progress.t_s]);
-  const unitOf = (tag) => store.tagOf(tag)?.unit ?? "";
   if (!tags.length) return null;
   return html`<section aria-label="Values of the run">
     ${view.zoom && html`<div class="bar"><button class="primary" onClick=${() => setView({ ...view, zoom: null })}>Reset zoom</button></div>`}
-    <${Charts} started=${0} tags=${tags} unitOf=${unitOf} data=${data} marks=${marks} view=${view} setView=${setView} />
-    <${Cursors} started=${0} tags=${tags} data=${data} unitOf=${unitOf} view=${view} setView=${setView} from=${0} to=${run.progress.t_s} />
+    <${Charts} started=${0} tags=${tags} data=${data} range=${[0, run.progress.t_s]} marks=${marks} view=${view} setView=${setView} />
+    <${Cursors} started=${0} tags=${tags} data=${data} view=${view} setView=${setView} from=${0} to=${run.progress.t_s} />
     <${Marks} started=${0} marks=${marks} view=${view} setView=${setView} />
   </section>`;
 }

@@ -101,6 +101,27 @@ def test_an_invariant_about_an_unknown_text_is_open(tmp_path: Path) -> None:
     assert "  OPEN, neither proved nor violated (the model has no exact result of the length of a STRING" in shown
 
 
+def test_the_output_names_what_the_model_of_messages_and_of_the_clock_assumes(tmp_path: Path) -> None:
+    text = """PROGRAM P
+VAR_INPUT heard : MESSAGES; END_VAR
+VAR_OUTPUT n : DINT; END_VAR
+VAR at : LTIME; END_VAR
+n := MSG_COUNT(heard);
+at := SCAN_TIME();
+END_PROGRAM"""
+    (tmp_path / "mail.st").write_text(text)
+    code, shown = prove(tmp_path / "mail.st", "--invariant", "n < 2")
+    assert code == 1
+    limits = [
+        "heard brings at most 16 messages in a scan, with any content",
+        "the first scan is at any time of the clock, and SCAN_TIME() stays below 146 years",
+    ]
+    assert shown.splitlines()[1:3] == [f"  assumed: {limit}" for limit in limits]
+    assert "  VIOLATED after 1 scan: n < 2" in shown.splitlines()
+    found = json.loads(prove(tmp_path / "mail.st", "--invariant", "n < 17", "--json")[1])
+    assert (found["proved"], found["limits"]) == (True, limits)
+
+
 def test_invariants_and_assumptions_of_a_system_are_proved(tmp_path: Path) -> None:
     extra = (
         "      invariants: {not above 2 m: NOT (run AND level > 2.0)}\n      assumptions: {in the tank: level <= 2.3}\n"

@@ -21,7 +21,9 @@ from fieldtwin.plc.st.syntax.parse import parse_expression
 from fieldtwin.scenarios.language.counterexample import outputs_seen, scenario_file
 from fieldtwin.twin.site.system import System
 
-NOT_EXACT = "# The violation needs inputs that change in certain scans. This scenario may not reproduce it.\n"
+NOT_EXACT = (
+    "# The violation needs messages, or inputs that change in certain scans. This scenario may not reproduce it.\n"
+)
 _LOGIC = {"AND": "and", "&": "and", "AND_THEN": "and", "OR": "or", "OR_ELSE": "or", "XOR": "!="}
 _COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 _ARITHMETIC = ("+", "-", "*")
@@ -42,13 +44,18 @@ def st_scenario(system: System, name: str, kind: type[StProgram], report: Report
         never = outputs_seen(system, name, Proof(make=kind, domain={}, invariants={}), way)
     comment = f"{len(result.answer.way or ())} scans, found by plc prove, violate this: {broken}"
     text = scenario_file(system, name, broken, comment, kind(), way, never)
-    return text if held else NOT_EXACT + text
+    messages = {v.name for v in kind.st_declared.variables if isinstance(v.kind, ty.MessagesIn)}
+    sent = any(value for scan in result.answer.way or () for each, value in scan.values if each in messages)
+    return text if held and not sent else NOT_EXACT + text
 
 
 def _given(report: Report, scan: Scan) -> Given:
     program, good = report.make(), dict(scan.good)
-    values = []
+    values: list[tuple[str, object]] = []
     for name, value in scan.values:
+        if isinstance(program.st_variables[name].kind, ty.MessagesIn):  # the counterexample has empty messages
+            values.append((name, b"" if value else None))
+            continue
         tag = tag_value(program, name, value)
         bad = TagValue(tag, Quality.BAD, Reason.TIMEOUT, 0)
         values.append((name, tag if good.get(name, True) else bad))

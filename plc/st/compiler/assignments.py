@@ -165,7 +165,7 @@ class Assignments(ast.NodeTransformer):
         if not isinstance(call, ast.Call) or name not in ("put", "fill"):
             return [node]
         record, target = self._record(node), call.args[0]
-        lines = (self._lines_of(target) or _no_lines()) if name == "fill" else None
+        lines = (self._lines_of(target, whole=True) or _no_lines()) if name == "fill" else None
         kept, call.args[0] = self._keep(target)
         noted = _call("assigned_whole", kept, record) if lines is None else _call("assigned_array", kept, lines, record)
         return [node, _at(ast.Expr(noted), node)]
@@ -190,7 +190,7 @@ class Assignments(ast.NodeTransformer):
         """Return the statement that records the assignment of an element."""
         record = self._record(node)
         array, keys = self._rows(target)
-        lines = self._lines_of(array)
+        lines = self._lines_of(array, whole=True)
         if lines is None:
             return []
         key = keys[0] if len(keys) == 1 else ast.Tuple(keys, ast.Load())
@@ -205,8 +205,11 @@ class Assignments(ast.NodeTransformer):
             part = part.value
         return part, keys
 
-    def _lines_of(self, array: ast.expr) -> ast.expr | None:
-        """Return the expression of the records of an array that is a variable or a part of one; None for others."""
+    def _lines_of(self, array: ast.expr, *, whole: bool = False) -> ast.expr | None:
+        """Return the expression of the records of an array that is a variable or a part of one; None for others.
+
+        `whole`: `array` is an array also if it is the variable of a reference.
+        """
         at = array
         while isinstance(at, ast.Subscript):
             at = at.value
@@ -223,7 +226,7 @@ class Assignments(ast.NodeTransformer):
             lines = ast.Attribute(self._again(at), line_of(at.attr), ast.Load())
         elif at.attr in self._known.arrays | self._known.lent:
             lines = _call("lines_in", self._again(at), ast.Constant(at.attr))
-        elif at.attr == "items" or (at.attr == "v" and at is not array):
+        elif at.attr == "items" or (at.attr == "v" and (whole or at is not array)):
             lines = ast.Attribute(self._again(at), "lines", ast.Load())
         else:
             return None

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from fieldtwin.plc.st.runtime.layouts import Overlay, Row, Stored
-from fieldtwin.plc.st.runtime.lines import NO_LINES, Record, WholeLines, noted
+from fieldtwin.plc.st.runtime.lines import NO_LINES, Record, RowLines, WholeLines, noted
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.memory import Memory, place_in_memory
 
@@ -25,8 +25,10 @@ class Reference(Protocol):
     """A reference to a variable, whose value is `v`."""
 
     v: Any
-    lines: Any
-    """The records of the elements, if the variable is an array."""
+
+    @property
+    def lines(self) -> Any:
+        """Return the records of the elements, if the variable is an array."""
 
     def key(self) -> Key: ...
 
@@ -98,7 +100,6 @@ class Element:
     """
 
     __slots__ = ("at", "of_array", "owner")
-    lines = NO_LINES
 
     def __init__(self, owner: Any, at: int, lines: Any = NO_LINES) -> None:
         self.owner, self.at = owner, at
@@ -124,6 +125,11 @@ class Element:
             self._fail()
         self.owner[self.at] = value
         self.of_array.assigned(self.at, ())
+
+    @property
+    def lines(self) -> RowLines:
+        """Return the records of the elements of the element, if that is an array."""
+        return RowLines(self.of_array, self.at)
 
     def assign(self, value: Any, record: Record) -> None:
         self.v = value

@@ -294,3 +294,27 @@ END_PROGRAM""",
     )
     scan(made)
     assert [why(made, name).get("inside") for name in "qrs"] == [None, None, None]
+
+
+def test_an_array_that_was_assigned_through_a_reference_has_the_line_of_the_statement() -> None:
+    made = program(
+        """TYPE Grid : ARRAY[1..2, 1..2] OF INT; Row : ARRAY[1..2] OF INT; END_TYPE
+PROGRAM p
+VAR_OUTPUT q, r, s : INT; END_VAR
+VAR a, b : Grid; to_grid : REF_TO Grid; rows : ARRAY[1..2] OF Row; one : Row; to_row : REF_TO Row; END_VAR
+  a[1, 1] := 1;
+  rows[1][2] := 1;
+  rows[2][2] := 1;
+  to_grid := REF(a);
+  to_grid^ := b;
+  to_row := REF(rows[1]);
+  to_row^ := one;
+  to_row := REF(rows[2]);
+  to_row^[2] := 3;
+  q := a[1, 1];
+  r := rows[1][2];
+  s := rows[2][2];
+END_PROGRAM"""
+    )
+    scan(made)
+    assert [shown(why(made, name)["inside"][0])[1] for name in "qrs"] == [9, 11, 13]

@@ -94,10 +94,11 @@ class Debugging:
 
     @property
     def status(self) -> str:
+        withheld = "; the outputs are safe until a scan without a stop" if self._runner.outputs.withheld else ""
         if self._session is None:
-            return ""
+            return f"detached{withheld}" if withheld else ""
         by = str(self._by.get("by") or "unknown")
-        return f"attached by {by}" + (f", stopped at {self._place}; the outputs are safe" if self._place else "")
+        return f"attached by {by}" + (f", stopped at {self._place}; the outputs are safe" if self._place else withheld)
 
     def refuse_in_a_scan(self, what: str) -> None:
         """Raise `UsageError` if a scan is stopped."""
@@ -169,9 +170,8 @@ class Debugging:
             from fieldtwin.plc.debug.tracer import Resume
 
             self._resume(Resume.CONTINUE)
-        else:
+        elif not self._runner.outputs.withheld:  # else the next scan publishes them, also a step of a paused PLC
             self._guard.tracer = None
-            self._runner.outputs.withheld = False
 
     def _send(self, kind: str, **more: Any) -> None:
         if len(self._messages) >= MAX_MESSAGES and more.get("event") == "output":

@@ -206,3 +206,21 @@ def test_a_client_that_goes_loses_its_session_and_the_plc_goes_on(shed: Path, as
     holds(lambda: ask("get", brief=True)["debugger"] == "" and tag(ask, "idle.n")["quality"] == "good")
     with pytest.raises(Exception, match="there is no such debugging session"):
         ask("debug", number=number, requests=[])
+
+
+def test_outputs_of_a_stopped_scan_stay_safe_while_the_plc_is_paused(editor: Editor, shed: Path, ask: Ask) -> None:
+    editor.begin({shed / "idle.st": [ADDS]}, "attach")
+    editor.wait("stopped")
+    holds(lambda: valve(shed) == 0)
+    ask("pause", by="test")
+    editor.breakpoints(shed / "idle.st")
+    editor.ask("continue", threadId=1)
+    holds(lambda: "until a scan without a stop" in ask("get", brief=True)["debugger"])
+    editor.ask("disconnect")
+    holds(lambda: ask("get", brief=True)["debugger"].startswith("detached; the outputs are safe"))
+    before = tag(ask, "idle.n")["time"]
+    holds(lambda: tag(ask, "idle.n")["time"] != before)  # the paused PLC has published again
+    assert (tag(ask, "idle.n")["quality"], valve(shed)) == ("bad", 0)
+    ask("step", count=1, by="test")
+    holds(lambda: tag(ask, "idle.n")["quality"] == "good" and valve(shed) == 1)
+    assert ask("get", brief=True)["debugger"] == ""

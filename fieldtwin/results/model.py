@@ -14,6 +14,7 @@ from fieldtwin.results.trace import TraceEvent
 # imported for types only, because verdicts and results are also created where the modules that read systems are not
 # installed
 if TYPE_CHECKING:
+    from fieldtwin.plc.st.coverage.compact import CompactCoverage
     from fieldtwin.plc.st.coverage.places import Coverage
     from fieldtwin.twin.site.system import System
 
@@ -155,6 +156,8 @@ class ScenarioResult:
     """The system that it ran against; None: the system of its report."""
     coverage: str = ""
     """The situations that a run of a campaign reached: the text of a `fieldtwin.run.campaigns.coverage.Coverage`."""
+    programs: CompactCoverage | None = None
+    """The coverage of Structured Text by a run of a campaign, None if it was not measured."""
 
     @property
     def why(self) -> str:

@@ -41,7 +41,7 @@ def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Pat
     Raises `FileInvalid` for the first error, with the others.
     """
     names = frozenset(library.stem.lower() for library in libraries)
-    return _compiled(_texts((path,)), _texts(libraries), str(path), dialect, names)
+    return _compiled(source_texts((path,)), source_texts(libraries), str(path), dialect, names)
 
 
 def read_with(
@@ -55,11 +55,12 @@ def read_with(
 
     `changed` is applied to each file. Also return the other files as they were read. Raises `FileInvalid`.
     """
-    library = _library(_texts((*beside, *libraries)), dialect, changed)
-    return with_library(changed(_parsed(_texts((path,)), dialect)), library), library.units
+    library = _library(source_texts((*beside, *libraries)), dialect, changed)
+    return with_library(changed(_parsed(source_texts((path,)), dialect)), library), library.units
 
 
-def _texts(paths: tuple[Path, ...]) -> Texts:
+def source_texts(paths: tuple[Path, ...]) -> Texts:
+    """Return the files of several sources with their content. Raises `FileInvalid`."""
     return tuple((str(file), _text(file)) for path in paths for file in source_files(path))
 
 

@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fieldtwin.cli.test.test_command import command
-from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.st.coverage.recording import Recording
+from fieldtwin.run.campaigns.ledger import read_entries
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 
@@ -85,7 +85,15 @@ def test_measuring_does_not_change_the_run(site: Path) -> None:
     assert any(recording.coverage().values())
 
 
-def test_a_campaign_has_no_coverage_of_structured_text(site: Path) -> None:
-    done = run("cycle.scenario.yaml", "--seeds", "1..2", "--coverage", "c.json")
-    assert isinstance(done.exception, UsageError)
-    assert "--coverage needs programs in Structured Text" in str(done.exception)
+def test_a_campaign_covers_what_its_seeds_execute_also_when_it_continues_with_a_ledger(site: Path) -> None:
+    files = ("--coverage", "c.json", "--html", "c.html")
+    one = run("cycle.scenario.yaml", "--seeds", "1..1", "--ledger", "l.jsonl", *files)
+    assert one.return_value == 0, one.output
+    alone = statements()
+    assert (alone["executed"], alone["of"], [one["line"] for one in alone["missed"]]) == (4, 6, [14, 17])
+    assert "lines 14, 17" in Path("c.html").read_text()
+    more = run("cycle.scenario.yaml", "--seeds", "1..2", "--ledger", "l.jsonl")
+    assert more.return_value == 0, more.output
+    assert "coverage of Structured Text: measured in 1 of 2 runs" in more.output
+    entries, _ = read_entries(Path("l.jsonl"))
+    assert [(bool(entry.places), bool(entry.executed)) for entry in entries] == [(True, True), (False, False)]

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
 OF_A_GROUP = (
-    "--for, --seed, --seeds, --shard, --jobs, --on, --ledger, --junit, --html, --commands, --faults, --trace, --json"
+    "--for, --seed, --seeds, --shard, --jobs, --on, --ledger, --junit, --html, --coverage, --commands, --faults, --trace, "
+    "--json"
 )
 
 

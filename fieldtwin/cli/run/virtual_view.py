@@ -6,6 +6,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +18,14 @@ from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, simulated_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaigns.failures import examine_failures
+from fieldtwin.cli.campaigns.st_coverage import CAMPAIGN_TITLE, measured_text, show_coverage
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
+    from fieldtwin.plc.st.coverage.places import Coverage as STCoverage
     from fieldtwin.reports.campaign.model import CampaignResult
     from fieldtwin.run.campaigns.coverage import Coverage
     from fieldtwin.run.campaigns.failure_traces import KeptTraces
@@ -32,7 +35,17 @@ if TYPE_CHECKING:
     from fieldtwin.run.virtual.run import VirtualOptions
 
 
-OF_MANY_RUNS = ("--seeds", "--shard", "--jobs", "--on", "--ledger", "--junit", "--junit-flavour", "--html")
+OF_MANY_RUNS = (
+    "--seeds",
+    "--shard",
+    "--jobs",
+    "--on",
+    "--ledger",
+    "--junit",
+    "--junit-flavour",
+    "--html",
+    "--coverage",
+)
 """Options that the command line of a single run does not have."""
 
 
@@ -94,8 +107,9 @@ def run_many(
     `ledger_path`: a file that records each run when it ends. Seeds that it already contains are not repeated, and count
     with their recorded result, also in `reports`.
     """
+    from fieldtwin.plc.st.coverage.compact import CompactCoverage
     from fieldtwin.run.campaigns.coverage import joined
-    from fieldtwin.run.campaigns.ledger import Ledger, entry_of
+    from fieldtwin.run.campaigns.ledger import FirstPlaces, Ledger, entry_of
     from fieldtwin.run.campaigns.many_seeds import SeedRuns, what_runs
     from fieldtwin.run.places.place import Repeats, run_units
     from fieldtwin.run.places.sample import sample_of
@@ -108,11 +122,12 @@ def run_many(
     hours = options.duration_s / 3600
     entries: list[LedgerEntry] = []
     results: list[SeedResult] = []
-    work = SeedRuns(options)
+    work = SeedRuns(options, reports.measures)
+    places = FirstPlaces(ledger.entries_of(what, seeds) if ledger is not None else ())
     repeats = Repeats(work, sample_of(left))
 
     def record(one: Ended[int, SeedResult]) -> None:
-        entry = entry_of(what, hours, one.result, system, again(one.unit), one.worker)
+        entry = places.once(entry_of(what, hours, one.result, system, again(one.unit), one.worker))
         if ledger is not None:
             ledger.record(entry)
         entries.append(entry)
@@ -120,7 +135,8 @@ def run_many(
     with CampaignView(system, len(left)) as view:
 
         def ended(one: Ended[int, SeedResult]) -> None:
-            results.append(one.result)  # first, because Ctrl-C may come while the entry is written
+            slim = replace(one.result, programs=CompactCoverage())  # the entry has it
+            results.append(slim)  # first, because Ctrl-C may come while the entry is written
             record(one)
             cause = None if one.result.ok else "; ".join(one.result.errors[:1]) or "failed"
             view.ended(one.unit, hours, cause, one.result.coverage)
@@ -150,10 +166,14 @@ def run_many(
         (lambda: simulated_causes(place, work, finished, len(left))) if has_faults else None,
         interrupted=interrupted,
     )
+    covered: STCoverage | None = None
+    partly = ""
     if reports.given:
         recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
         untested_all = untested and len(left) == len(seeds)
-        reports.write([_result(what, recorded, seeds, ledger_path, examined.traces, untested=untested_all)])
+        whole = _result(what, recorded, seeds, ledger_path, examined.traces, untested=untested_all)
+        reports.write([whole])
+        covered, partly = whole.programs, measured_text(whole.measured, len(whole.runs))
     if as_json:
         json.dump(
             {
@@ -196,6 +216,10 @@ def run_many(
             "the ledger", f"{shown_time(ledger.hours * 3600)} of virtual time in {len(ledger.entries)} runs{failures}"
         )
     stdout.print(table)
+    if covered is not None and covered.executed:
+        show_coverage(covered, CAMPAIGN_TITLE)
+    if partly:
+        stdout.print(partly, soft_wrap=True)
     for seed in before:
         stdout.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
     for line in different_texts(different, repeats):
@@ -262,7 +286,7 @@ def _plain(result: SeedResult) -> dict[str, Any]:
     """Return the result as plain data, without the time and place of the run, so that the same campaign gives the same text, and
     without its coverage, which the whole campaign has.
     """
-    return {name: getattr(result, name) for name in result.__slots__ if name not in ("made", "coverage")}
+    return {name: getattr(result, name) for name in result.__slots__ if name not in ("made", "coverage", "programs")}
 
 
 def shown_time(seconds: float) -> str:

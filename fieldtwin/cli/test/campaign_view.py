@@ -24,7 +24,7 @@ from fieldtwin.run.campaigns.campaign import Campaign, ScenarioRuns, broken_by, 
 from fieldtwin.run.campaigns.causes import Cause, shape_text
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.coverage import Coverage
-from fieldtwin.run.campaigns.ledger import Ledger, LedgerEntry
+from fieldtwin.run.campaigns.ledger import FirstPlaces, Ledger, LedgerEntry
 from fieldtwin.run.campaigns.merging import Runs
 from fieldtwin.run.campaigns.reporting import campaign_of
 from fieldtwin.run.campaigns.reruns import Shrunk
@@ -63,11 +63,15 @@ def run_scenario_campaign(
     options: CampaignOptions,
     place: Place,
     show: Callable[[ScenarioResult], None] | None,
+    *,
+    measures: bool,
 ) -> CampaignResults:
-    """Run a scenario with each seed that the ledger does not have yet. `show` None: nothing is printed to stdout."""
+    """Run a scenario with each seed that the ledger does not have yet. `show` None: nothing is printed to stdout. `measures`: the
+    runs measure the coverage of Structured Text.
+    """
     seeds = options.chosen()
     campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
-    work, what = ScenarioRuns(campaign), what_tests(campaign)
+    work, what = ScenarioRuns(campaign, measures), what_tests(campaign)
     ledger = Ledger(options.ledger) if options.ledger is not None else None
     before = ledger.recorded(what, seeds) if ledger is not None else []
     done = {entry.seed for entry in before}
@@ -76,16 +80,19 @@ def run_scenario_campaign(
     repeats = Repeats(work, sample_of(left))
     results: list[ScenarioResult] = []
     entries: list[LedgerEntry] = []
+    places = FirstPlaces(before)
 
     def record(one: Ended[int, ScenarioResult]) -> None:
-        entries.append(scenario_entry(what, one, WallClock().utc_ns() / 1e9))
+        entries.append(places.once(scenario_entry(what, one, WallClock().utc_ns() / 1e9)))
         if ledger is not None:
             ledger.record(entries[-1])
 
     with CampaignView(case_of(path), len(left)) as view:
 
         def ended(one: Ended[int, ScenarioResult]) -> None:
-            results.append(one.result)  # first, because Ctrl-C may come while the entry is written
+            results.append(
+                replace(one.result, programs=None)
+            )  # first, because Ctrl-C may come while the entry is written
             record(one)
             passed = one.result.verdict is Verdict.PASSED
             cause = None if passed else one.result.why or one.result.verdict.value

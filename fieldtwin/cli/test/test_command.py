@@ -21,6 +21,15 @@ from rich.table import Table
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.campaigns.ending import INTERRUPTED
+from fieldtwin.cli.campaigns.st_coverage import (
+    CAMPAIGN_TITLE,
+    CoverageOptions,
+    coverage_of,
+    measured_text,
+    recorded,
+    show_coverage,
+    write_measured,
+)
 from fieldtwin.cli.junit_options import JunitOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
@@ -28,7 +37,6 @@ from fieldtwin.cli.plc.finding_options import TARGET as CHECK_OF_PROGRAMS
 from fieldtwin.cli.plc.finding_options import FindingOptions
 from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.plain_result import plain_result
-from fieldtwin.cli.test.st_coverage import CoverageOptions, coverage_of, recorded, show_coverage
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
 from fieldtwin.cli.test.unit_tests import UnitTestOptions, is_unit_test, load_suites, run_suites
@@ -200,7 +208,8 @@ def command(
         controller,
         variables,
     )
-    recording = logic.recording(target, campaign=bool(campaign.seeds), html=html is not None)
+    measures = logic.wanted(html=html is not None)
+    recording = logic.recording(target, html=html is not None) if not campaign.seeds else None
     shown = Progress(Path(progress)) if progress else None
     results = [waive(one, waived, datetime.now(UTC).date()) for one in findings]
     for one in () if as_json else results:
@@ -213,7 +222,8 @@ def command(
             if campaign.seeds:
                 from fieldtwin.cli.test.campaign_view import run_scenario_campaign
 
-                found = run_scenario_campaign(scenario.path, folders, campaign, place, None if as_json else _show)
+                show = None if as_json else _show
+                found = run_scenario_campaign(scenario.path, folders, campaign, place, show, measures=measures)
                 today = datetime.now(UTC).date()
                 judged = [waive(replace(one, system=scenario.system), waived, today) for one in found.all]
                 results += judged
@@ -235,8 +245,11 @@ def command(
         results.append(waive(unit_test, waived, datetime.now(UTC).date()))
         if not as_json:
             _show(results[-1])
-    covered = coverage_of(suites, recording)
-    logic.write(covered)
+    covered = coverage_of(suites, recording, campaigns)
+    if logic.coverage is not None and campaign.seeds:
+        write_measured(covered, logic.coverage)
+    else:
+        logic.write(covered)
     draws = html is not None and not campaign.seeds
     machines = _machines([one.system for one in scenarios]) if draws else {}
     system = scenarios[0].system if scenarios else None
@@ -274,7 +287,9 @@ def command(
         sys.stdout.write("\n")
     else:
         if covered is not None:
-            show_coverage(covered)
+            show_coverage(covered, *([CAMPAIGN_TITLE] if campaign.seeds else []))
+            for partly in filter(None, (measured_text(one.measured, len(one.runs)) for one in campaigns)):
+                stdout.print(partly, soft_wrap=True)
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
         if not campaign.seeds:
             _tell_how_to_see_more(results)

@@ -15,6 +15,7 @@ from fieldtwin.reports.campaign.workers import BINS, Timeline, timeline_of, work
 from fieldtwin.reports.file import put
 from fieldtwin.reports.markup import Markup
 from fieldtwin.reports.pages import fill
+from fieldtwin.reports.run.logic import logic_section
 from fieldtwin.results.model import ScenarioResult, Verdict
 
 MOST_GROUPS = 50
@@ -71,6 +72,7 @@ def _section(campaign: CampaignResult, *, alone: bool) -> Markup:
         coverage_chart=curve_chart("different situations reached over virtual hours", campaign.coverage)
         if campaign.coverage
         else None,
+        programs=logic_section(campaign.programs) if campaign.programs is not None and campaign.measured else None,
         causes_chart=_causes_chart(campaign) if len(campaign.groups) > 1 else None,
         workers=workers[:MOST_WORKERS],
         more_workers=len(workers) - MOST_WORKERS,

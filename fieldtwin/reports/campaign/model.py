@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fieldtwin.plc.st.coverage.places import Coverage
 from fieldtwin.results.model import Verdict
 
 
@@ -68,6 +69,9 @@ class CampaignResult:
     reproduce: str = ""
     coverage: Sequence[tuple[float, int]] = ()
     inconclusive: Sequence[str] = ()
+    programs: Coverage | None = None
+    """The coverage of Structured Text by the runs that measured it, whose number is `measured`."""
+    measured: int = 0
 
     @property
     def failed(self) -> list[CampaignRun]:

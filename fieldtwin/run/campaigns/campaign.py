@@ -15,6 +15,7 @@ from typing import Any
 from fieldtwin.__about__ import __version__
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.st.coverage.compact import CompactCoverage
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.run.campaigns.coverage import joined
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
@@ -25,6 +26,7 @@ from fieldtwin.run.places.place import Ended
 from fieldtwin.run.targets.virtual_scenario import group_of, reproduce, run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.run.virtual.guided_faults import guide_of
+from fieldtwin.run.virtual.program_coverage import ProgramCoverage
 from fieldtwin.run.virtual.run import texts_of
 from fieldtwin.scenarios.judging.runner import ByChance
 from fieldtwin.scenarios.language.about import result_of
@@ -110,10 +112,12 @@ def run_seed(
     faults: Sequence[dict[str, Any]] | None = None,
     trace: Path | None = None,
     most_trace_bytes: int | None = None,
+    *,
+    measures: bool = False,
 ) -> ScenarioResult:
     """Run the scenario with a seed; if `faults` are given, they replace the faults that the seed chooses.
 
-    `trace` is a file for every event, limited by `most_trace_bytes`.
+    `trace` is a file for every event, limited by `most_trace_bytes`. `measures`: also measure the coverage of Structured Text.
     """
     scenario = campaign.check()
     by_chance, guide, wanted = None, None, campaign.random_faults
@@ -123,35 +127,39 @@ def run_seed(
             faults = random_schedule(group, seed, length_s, wanted)
             guide = guide_of(group, seed, length_s, wanted)
         by_chance = ByChance(tuple(faults), length_s)
-    seen = CoverageCollector()
-    result = run_virtual(
-        scenario, seed, trace, by_chance, guide=guide, most_trace_bytes=most_trace_bytes, watch=seen.listen
-    )
-    result = replace(result, coverage=seen.coverage.text())
+    seen, programs = CoverageCollector(), ProgramCoverage(wanted=measures)
+    with programs.active():
+        result = run_virtual(
+            scenario, seed, trace, by_chance, guide=guide, most_trace_bytes=most_trace_bytes, watch=seen.listen
+        )
+    result = replace(result, coverage=seen.coverage.text(), programs=programs.compact())
     if by_chance is None:
         return result
     return replace(result, reproduce=reproduce(scenario, *campaign.words, "--seeds", str(seed)))
 
 
-def slim_run(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None) -> ScenarioResult:
+def slim_run(
+    campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None, *, measures: bool = False
+) -> ScenarioResult:
     """Run a seed as `run_seed` does and drop the events of its run, because the events of two hundred seeds would not fit into
     memory. To see them, run the seed again.
     """
-    return replace(run_seed(campaign, seed, faults), trace=(), dropped=0)
+    return replace(run_seed(campaign, seed, faults, measures=measures), trace=(), dropped=0)
 
 
 @dataclass(frozen=True, slots=True)
 class ScenarioRuns:
-    """Runs of a scenario with many seeds, as work for a place."""
+    """Runs of a scenario with many seeds, as work for a place. `measures`: the runs measure the coverage of Structured Text."""
 
     campaign: Campaign
+    measures: bool = False
 
     @property
     def virtual_s(self) -> float:
         return self.campaign.length_s(self.campaign.check())
 
     def run(self, seed: int) -> ScenarioResult:
-        return slim_run(self.campaign, seed)
+        return slim_run(self.campaign, seed, measures=self.measures)
 
     def run_traced(self, seed: int, trace: Path, most_bytes: int) -> ScenarioResult:
         return run_seed(self.campaign, seed, trace=trace, most_trace_bytes=most_bytes)
@@ -180,7 +188,7 @@ class ScenarioRuns:
         campaign = self.campaign
         files = files_of(group_of(campaign.check()), campaign.profiles)
         moved = replace(campaign, path=relative(campaign.path), profiles=profile_folders(campaign.profiles))
-        return ScenarioRuns(moved), (campaign.path, *files)
+        return ScenarioRuns(moved, self.measures), (campaign.path, *files)
 
 
 def what_tests(campaign: Campaign) -> str:
@@ -195,6 +203,7 @@ def scenario_entry(what: str, ended: Ended[int, ScenarioResult], ended_s: float)
     result = ended.result
     checks = [check for check in result.checks if not check.vacuous]
     passed = result.verdict is Verdict.PASSED
+    programs = result.programs or CompactCoverage()
     return LedgerEntry(
         what,
         __version__,
@@ -214,6 +223,8 @@ def scenario_entry(what: str, ended: Ended[int, ScenarioResult], ended_s: float)
         verdict=result.verdict.value,
         judged=tuple(check.number for check in checks if not check.number.isdigit()),
         struck=sum(fault.struck for fault in result.faults),
+        places=programs.places,
+        executed=programs.executed,
     )
 
 

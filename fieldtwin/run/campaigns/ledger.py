@@ -49,6 +49,10 @@ class LedgerEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     """The numbers of the scenario's rules that the run checked, such as ``within 1``."""
     struck: int = 0
     """How often random faults took effect."""
+    places: str = ""
+    """The places of the programs in Structured Text. Only the first of several runs with the same places has them."""
+    executed: str = ""
+    """Which of these places the run executed (`fieldtwin.plc.st.coverage.compact`); empty if this was not measured."""
 
     @property
     def finished(self) -> bool:
@@ -85,7 +89,23 @@ def entry_of(
         round(result.made.took_s, 3),
         worker or result.made.worker,
         result.coverage,
+        places=result.programs.places,
+        executed=result.programs.executed,
     )
+
+
+class FirstPlaces:
+    """Keep the places of programs in the first entry that has them, because they are equal for all runs of a campaign."""
+
+    def __init__(self, entries: Iterable[LedgerEntry]) -> None:
+        self._known = {entry.places for entry in entries}
+
+    def once(self, entry: LedgerEntry) -> LedgerEntry:
+        """Return the entry, without its places if an earlier entry has them."""
+        if entry.places in self._known:
+            return msgspec.structs.replace(entry, places="")
+        self._known.add(entry.places)
+        return entry
 
 
 def differing(entries: Iterable[LedgerEntry]) -> set[int]:
@@ -163,8 +183,14 @@ class Ledger:
         return [e for e in self.entries if e.what == what and e.version == __version__]
 
     def entries_of(self, what: str, seeds: range) -> list[LedgerEntry]:
-        """Return the runs of these seeds that this version made with this fingerprint."""
-        return [e for e in self._of(what) if e.seed in seeds]
+        """Return the runs of these seeds that this version made with this fingerprint. The first one gets the places of the
+        programs if only a run of a different seed has them.
+        """
+        every = self._of(what)
+        found = [e for e in every if e.seed in seeds]
+        if found and not any(e.places for e in found):
+            found[0] = msgspec.structs.replace(found[0], places=next((e.places for e in every if e.places), ""))
+        return found
 
     def recorded(self, what: str, seeds: range) -> list[LedgerEntry]:
         """Return the finished runs of these seeds by this version with this fingerprint, each seed once."""

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.plc.st.coverage.compact import CompactCoverage
 from fieldtwin.run.campaigns.coverage_collector import CoverageCollector
 from fieldtwin.run.places.bundle import files_of, profile_folders, relative
+from fieldtwin.run.virtual.program_coverage import ProgramCoverage
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.twin.site.data_files import find_recording
 
@@ -50,6 +52,8 @@ class SeedResult:
     made: Made = field(default=Made(), compare=False)
     coverage: str = ""
     """The situations that the run reached: the text of a `fieldtwin.run.campaigns.coverage.Coverage`."""
+    programs: CompactCoverage = field(default=CompactCoverage())
+    """The coverage of Structured Text, if it was measured."""
 
 
 def fingerprint(*parts: str) -> str:
@@ -69,12 +73,14 @@ def what_runs(options: VirtualOptions) -> str:
     return fingerprint(*run.files, repr(anyhow))
 
 
-def run_seed(options: VirtualOptions) -> SeedResult:
-    """Make one complete run with the seed in `options`."""
+def run_seed(options: VirtualOptions, *, measures: bool = False) -> SeedResult:
+    """Make one complete run with the seed in `options`. `measures`: also measure the coverage of Structured Text."""
     clock = WallClock()
     began_ns = clock.monotonic_ns()
-    run, collector = VirtualRun(options), CoverageCollector()
-    run.run(watch=collector.listen)
+    collector, programs = CoverageCollector(), ProgramCoverage(wanted=measures)
+    with programs.active():
+        run = VirtualRun(options)
+        run.run(watch=collector.listen)
     summary = run.summary()
     systems: dict[str, dict[str, Any]] = summary.get("systems", {})
     errors = summary["errors"] + [f"{name}: {error}" for name, one in systems.items() for error in one["errors"]]
@@ -90,6 +96,7 @@ def run_seed(options: VirtualOptions) -> SeedResult:
         _by_name([one for part in [summary, *systems.values()] for one in part.get("faults", ())]),
         Made(clock.utc_ns() / 1e9, (clock.monotonic_ns() - began_ns) / 1e9, f"{platform.node()}:{os.getpid()}"),
         collector.coverage.text(),
+        programs.compact(),
     )
 
 
@@ -111,16 +118,19 @@ def _known_faults(options: VirtualOptions, seed: int) -> VirtualRun:
 
 @dataclass(frozen=True, slots=True)
 class SeedRuns:
-    """Runs of a system with many seeds, as work for a place. `options` has no seed and no trace file."""
+    """Runs of a system with many seeds, as work for a place. `options` has no seed and no trace file. `measures`: the runs
+    measure the coverage of Structured Text, which does not change them.
+    """
 
     options: VirtualOptions
+    measures: bool = False
 
     @property
     def virtual_s(self) -> float:
         return self.options.duration_s
 
     def run(self, seed: int) -> SeedResult:
-        return run_seed(replace(self.options, seed=seed))
+        return run_seed(replace(self.options, seed=seed), measures=self.measures)
 
     def run_traced(self, seed: int, trace: Path, most_bytes: int) -> SeedResult:
         return run_seed(replace(self.options, seed=seed, trace=trace, most_trace_bytes=most_bytes))
@@ -153,4 +163,4 @@ class SeedRuns:
             faults=run.given_faults,
             fault_file=None,
         )
-        return SeedRuns(moved), (*files_of(run.group, options.profiles), *recordings.values())
+        return SeedRuns(moved, self.measures), (*files_of(run.group, options.profiles), *recordings.values())

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from fieldtwin.plc.st.coverage.compact import CompactCoverage, joined_coverage
+from fieldtwin.plc.st.coverage.places import Coverage as STCoverage
 from fieldtwin.run.campaigns.coverage import Coverage, joined
 from fieldtwin.run.campaigns.ledger import LedgerEntry, differing, unfinished_left
 
@@ -44,6 +46,12 @@ class Runs:
         return joined(entry.coverage for entry in self.entries)
 
     @property
+    def programs(self) -> tuple[STCoverage, int]:
+        """Return the coverage of Structured Text by all runs, and the number of seeds that measured it. Raises `FileInvalid`."""
+        every = joined_coverage(CompactCoverage(entry.places, entry.executed) for entry in self.entries)
+        return every, len({entry.seed for entry in self.entries if entry.executed})
+
+    @property
     def different(self) -> list[int]:
         """Return the seeds that have different results: a run was not reproduced, which is a defect."""
         return sorted(differing(self.entries))
@@ -52,7 +60,7 @@ class Runs:
 def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:
     """Return each different result of all ledgers once, in an order that depends on the entries only."""
     found = {entry for ledger in ledgers for entry in ledger}
-    ordered = sorted(found, key=lambda entry: (*_place(entry), not entry.coverage, repr(entry)))
+    ordered = sorted(found, key=lambda entry: (*_place(entry), *_lacks(entry), repr(entry)))
     unique: dict[tuple[object, ...], LedgerEntry] = {}
     for entry in ordered:
         unique.setdefault(entry.result, entry)
@@ -61,6 +69,11 @@ def merged(ledgers: Iterable[Iterable[LedgerEntry]]) -> list[LedgerEntry]:
 
 def _place(entry: LedgerEntry) -> tuple[str, str, int]:
     return entry.what, entry.version, entry.seed
+
+
+def _lacks(entry: LedgerEntry) -> tuple[bool, ...]:
+    """Return an order that prefers the entry with more information about the same run."""
+    return not entry.places, not entry.executed, not entry.coverage
 
 
 def by_fingerprint(entries: Iterable[LedgerEntry]) -> list[Runs]:

@@ -38,6 +38,7 @@ def campaign_of(
     )  # of several results, a failure is shown
     of_seed = {entry.seed: entry for entry in failures_last}
     every = [_run(of_seed[seed], traces.get(seed, "")) for seed in sorted(of_seed)]
+    programs, measured = runs.programs if with_coverage else (None, 0)
     return CampaignResult(
         next((entry.system for entry in runs.entries if entry.system), ""),
         runs.what,
@@ -51,6 +52,8 @@ def campaign_of(
         reproduce,
         coverage_of(of_seed.values()) if with_coverage else (),
         inconclusive,
+        programs,
+        measured,
     )
 
 

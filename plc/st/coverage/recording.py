@@ -10,15 +10,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.coverage.places import Place
 from fieldtwin.plc.st.coverage.probes import Probes
 from fieldtwin.plc.st.dialects import Dialect
-from fieldtwin.plc.st.project import read_with
+from fieldtwin.plc.st.project import Texts, read_with, source_texts
 
 
 class Recording:
@@ -41,13 +41,8 @@ class Recording:
         key = path, dialect, libraries
         if key not in self._units:
             recorded: set[Any] = set()
-            probes = Probes()
-            unit, _ = read_with(path, (), libraries, dialect, lambda read: read)
-            left_out = {str(file) for library in libraries for file in source_files(library)}
-            used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
-            files = (*map(str, source_files(path)), *sorted(used & left_out))
-            compiled = compile_unit(probes.insert(unit, left_out), str(path), tuple(dict.fromkeys(files)), dialect)
-            self._units[key] = replace(compiled, source=unit, record=recorded.add), probes, recorded
+            compiled, probes = _compiled(source_texts((path,)), source_texts(libraries), path, dialect, libraries)
+            self._units[key] = replace(compiled, record=recorded.add), probes, recorded
         return self._units[key][0]
 
     def coverage(self) -> Mapping[Place, bool]:
@@ -57,6 +52,22 @@ class Recording:
             for place, executed in probes.result(recorded, unit.probed).items():
                 found[place] = executed or found.get(place, False)
         return found
+
+
+@lru_cache(maxsize=32)
+def _compiled(
+    texts: Texts, library_texts: Texts, path: Path, dialect: Dialect, libraries: tuple[Path, ...]
+) -> tuple[CompiledUnit, Probes]:
+    """Return a program with its probes, from a cache, because the runs of a campaign load the same programs. The texts are those
+    of the files, so that a changed file is compiled again.
+    """
+    probes = Probes()
+    unit, _ = read_with(path, (), libraries, dialect, lambda read: read)
+    left_out = {file for file, _ in library_texts}
+    used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
+    files = (*(file for file, _ in texts), *sorted(used & left_out))
+    compiled = compile_unit(probes.insert(unit, left_out), str(path), tuple(dict.fromkeys(files)), dialect)
+    return replace(compiled, source=unit), probes
 
 
 _active: ContextVar[Recording | None] = ContextVar("_active", default=None)

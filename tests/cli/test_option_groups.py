@@ -84,7 +84,16 @@ def test_headings_of_run_and_simulate() -> None:
     shown = headings("simulate")
     assert shown["Virtual time and seeds"] == ["--for", "--seed", "--seeds", "--shard", "--jobs", "--on", "--ledger"]
     assert shown["Faults"] == ["--faults", "--fault-every", "--fault-kinds", "--fault-aims"]
-    assert shown["Output"] == ["--trace", "--variable", "--compare", "--json", "--junit", "--junit-flavour", "--html"]
+    assert shown["Output"] == [
+        "--trace",
+        "--variable",
+        "--compare",
+        "--json",
+        "--junit",
+        "--junit-flavour",
+        "--html",
+        "--coverage",
+    ]
     assert shown["Profiles and templates"] == headings("run")["Profiles and templates"]
 
 

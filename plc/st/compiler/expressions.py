@@ -20,7 +20,7 @@ from fieldtwin.plc.st.compiler.scope import (
     Symbol,
     Value,
 )
-from fieldtwin.plc.st.compiler.variables import character_type, lookup, part_of, variable
+from fieldtwin.plc.st.compiler.variables import character_type, followed, lookup, part_of, variable
 from fieldtwin.plc.st.syntax import tree as t
 
 MAX_DEEP = 80
@@ -137,7 +137,10 @@ class Expressions:
             if isinstance(expr, t.Ref):
                 return variable(self, expr)
             if isinstance(expr, t.Call):
-                return self.flat(self.call(expr), expr.pos)
+                made = self.call(expr)
+                if not (isinstance(wanted, ty.Pointer) and wanted.word == references.REFERENCE):
+                    made = followed(self, made, expr.pos)
+                return self.flat(made, expr.pos)
             return self.flat(unary(self, expr) if isinstance(expr, t.Unary) else binary(self, expr), expr.pos)
         finally:
             self._deep -= 1

@@ -30,7 +30,7 @@ def variable(x: Compiling, ref: t.Ref) -> Value:
     """Compile the name of a variable, a property or a part of one, or a value of an enumeration. A REFERENCE TO stands for its
     variable.
     """
-    return _followed(x, place(x, ref), ref.pos)
+    return followed(x, place(x, ref), ref.pos)
 
 
 def place(x: Compiling, ref: t.Ref) -> Value:
@@ -41,7 +41,7 @@ def place(x: Compiling, ref: t.Ref) -> Value:
         found = None if ref.name.lower() in x.symbols else own_property(x, ref)
         value, selectors = found if found is not None else _variable(x, ref)
     for selector in selectors:
-        value = _followed(x, value, selector.pos)
+        value = followed(x, value, selector.pos)
         if isinstance(selector, t.Deref):
             value = _dereferenced(x, value, selector.pos)
         elif isinstance(selector, t.Member):
@@ -87,7 +87,7 @@ def _variable(x: Compiling, ref: t.Ref) -> tuple[Value, tuple[t.Selector, ...]]:
     return value, selectors
 
 
-def _followed(x: Compiling, value: Value, pos: t.Pos) -> Value:
+def followed(x: Compiling, value: Value, pos: t.Pos) -> Value:
     """Return the variable to which a REFERENCE TO refers; other values as they are."""
     is_reference = isinstance(value.type, ty.Pointer) and value.type.word == "REFERENCE TO"
     return _dereferenced(x, value, pos) if is_reference else value

@@ -222,3 +222,22 @@ def test_what_would_need_the_memory_of_a_controller_is_refused(body: str, messag
 
 def test_a_program_may_still_have_variables_with_these_names() -> None:
     assert run("pointer, reference, ref : INT := 2; n : INT;", "n := pointer + reference + ref;")["n"] == 6
+
+
+REFERRED = """VAR_GLOBAL cells : ARRAY[1..3] OF INT := [1, 2, 3]; END_VAR
+FUNCTION cell : REFERENCE TO INT VAR_INPUT n : INT; END_VAR cell REF= cells[n]; END_FUNCTION
+FUNCTION raised : INT VAR_INPUT r : REFERENCE TO INT; END_VAR r := r + 10; raised := r; END_FUNCTION
+FUNCTION none : REFERENCE TO INT END_FUNCTION
+FUNCTION_BLOCK Box VAR inner : INT := 5; END_VAR
+METHOD PUBLIC fetch : REFERENCE TO INT fetch REF= inner; END_METHOD END_FUNCTION_BLOCK
+"""
+
+
+def test_the_result_of_a_function_may_be_a_reference_which_stands_for_its_variable() -> None:
+    """Defect: such a result was neither a value nor accepted by REF= and by an input that is a REFERENCE TO."""
+    body = """r REF= cell(2); r := 7; q REF= b.fetch(); q := 6; m := raised(cell(1)); n := cell(2) + b.fetch();
+    k := cells[1];"""
+    found = run("r, q : REFERENCE TO INT; b : Box; m, n, k : INT;", body, REFERRED)
+    assert (found["m"], found["n"], found["k"]) == (11, 13, 11)
+    with pytest.raises(LogicError, match="NULL"):
+        run("n : INT;", "n := none();", REFERRED)

@@ -65,9 +65,14 @@ def adr(x: Compiling, expr: t.Expr) -> Value:
 
 
 def referring(x: Compiling, expr: t.Expr, target: ty.Pointer, pos: t.Pos) -> str:
-    """Return the reference that a REFERENCE TO gets from the variable `expr`, by ``REF=`` or as an argument."""
+    """Return the reference that a REFERENCE TO gets, by ``REF=`` or as an argument, from the variable `expr`, or a call whose
+    result is a reference."""
     if isinstance(expr, t.Literal):
         return coerced(x, x.value(expr), target, pos)
+    if isinstance(expr, t.Call):
+        made = x.value(expr, target)
+        if isinstance(made.type, ty.Pointer) and made.type.word == REFERENCE:
+            return coerced(x, made, target, pos)
     found = place(x, expr) if isinstance(expr, t.Ref) else None
     if found is not None and found.type == target:
         return found.code

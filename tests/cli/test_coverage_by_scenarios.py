@@ -85,6 +85,8 @@ def test_measuring_does_not_change_the_run(site: Path) -> None:
     assert any(recording.coverage().values())
 
 
+@pytest.mark.long
+@pytest.mark.timeout(300)
 def test_a_campaign_covers_what_its_seeds_execute_also_when_it_continues_with_a_ledger(site: Path) -> None:
     files = ("--coverage", "c.json", "--html", "c.html")
     one = run("cycle.scenario.yaml", "--seeds", "1..1", "--ledger", "l.jsonl", *files)

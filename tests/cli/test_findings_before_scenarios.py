@@ -27,6 +27,8 @@ def test_a_finding_is_listed_once_and_the_scenarios_pass(
     assert done.stderr.count("ST101 spare is not used") == (0 if waiver else 1)
 
 
+@pytest.mark.long
+@pytest.mark.timeout(300)
 def test_the_report_of_a_campaign_lists_findings_and_waivers_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

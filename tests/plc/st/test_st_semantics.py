@@ -166,7 +166,7 @@ def test_comments_nest_and_hide_whatever_is_in_them() -> None:
         ("VAR_GLOBAL a : INT; b : INT := a; END_VAR", 1, 32, "not a constant"),
         ("PROGRAM p VAR CONSTANT n : INT := 0; END_VAR VAR a : ARRAY[0..1 / n] OF INT; END_VAR END_PROGRAM",
          1, 65, "division by zero"),
-        ("PROGRAM p VAR execute : INT; END_VAR END_PROGRAM", 1, 15, "another name"),
+        ("PROGRAM p VAR variables : INT; END_VAR END_PROGRAM", 1, 15, "another name"),
         ("PROGRAM p VAR i : INT; END_VAR\ni := 1e; END_PROGRAM", 2, 7, "not Structured Text"),
     ],
 )  # fmt: skip

@@ -230,14 +230,20 @@ class Attachment:
         return {"variables": shown, "more": len(names) - len(rows)}
 
     async def variable_names(self) -> list[str]:
-        """Return the names of the programs' variables that have a value, those that are tags first."""
+        """Return the names of the programs' variables that have a value, those that are tags first.
+
+        While the PLC does not answer, those that are not tags are missing.
+        """
         tags = [
             f"{program}.{name}"
             for program, described in self.programs.items()
             for name, about in described["variables"].items()
             if about["kind"] != TagKind.MESSAGE.value and about["tag"] not in self.secrets
         ]
-        internal: list[str] = (await self.plc_channel.call("image"))["internal"]
+        try:
+            internal: list[str] = (await self.plc_channel.call("image"))["internal"]
+        except FieldtwinError:  # the troubles in the status give the reason
+            return tags
         return tags + internal
 
     def is_secret_variable(self, name: str) -> bool:

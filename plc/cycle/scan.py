@@ -223,6 +223,7 @@ class Scan:
     def may_skip(self, *, skip: bool) -> None:
         """Determine whether a scan that would change nothing may be skipped from now on."""
         self._settling = Settling(self._programs if skip else (), _state_of)
+        self._steady = False  # else a scan without programs to compare would count as one that changed nothing
 
     def programs_changed(self) -> None:
         """Execute the logic of the next scan in any case, because programs of this task were replaced."""

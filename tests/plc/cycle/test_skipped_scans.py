@@ -269,3 +269,13 @@ def test_room_in_a_mailbox_ends_the_skipping() -> None:
     assert rig.execute(Given(scans=20))[-1].value("m.outbox").value == 2
     assert rig.scan.skipped > 0
     assert rig.execute(Given(taken=1))[-1].value("m.outbox").value == 3
+
+
+def test_every_scan_is_executed_when_a_debugger_attaches_to_settled_programs() -> None:
+    rig = delayed(may_skip=True)
+    rig.execute(Given(scans=20))
+    skipped = rig.scan.skipped
+    assert skipped > 0
+    rig.scan.may_skip(skip=False)
+    rig.execute(Given(scans=20))
+    assert rig.scan.skipped == skipped

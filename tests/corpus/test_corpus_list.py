@@ -165,6 +165,13 @@ def test_the_tests_of_a_file_in_rust_are_executed(tmp_path: Path) -> None:
     ]
 
 
+def test_without_checkouts_all_files_of_both_lists_are_missing(tmp_path: Path) -> None:
+    found = subprocess.run([sys.executable, str(SCRIPT), str(tmp_path)], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    assert "PLC-lang/rusty: 0 of 0 valid files compile, " in found.stdout
+    assert "ironplc/ironplc: 0 tests in Rust pass, 0 differ, 0 are not executed, 75 files missing" in found.stdout
+
+
 def test_each_reason_of_the_list_of_ironplc_is_used() -> None:
     listed = yaml.safe_load((Path(__file__).parent / "ironplc.yaml").read_text(encoding="utf-8"))
     used: set[str] = set()

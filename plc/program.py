@@ -318,16 +318,13 @@ class Program(ABC):
         """
         return None
 
-    def place(self, name: str) -> SourceLine | None:
-        """Return the line that assigned output `name` last; None while it has its initial value, or a value set from outside."""
-        assigned = self._assigned.get(name)
-        return SourceLine(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
+    def last_assignment(self, name: str) -> tuple[SourceLine | None, Described | None]:
+        """Return the line that assigned output `name` last, and its statement with what decided, each None if it is not known.
 
-    def decided(self, name: str, place: SourceLine) -> Described | None:
-        """Return the statement in the line `place` that assigned output `name` last, with what decided; None if that is not
-        known.
+        Both are None while the output has its initial value, or a value set from outside.
         """
-        return None
+        assigned = self._assigned.get(name)
+        return (SourceLine(code=assigned[0], instruction=assigned[1]) if assigned is not None else None), None
 
     def put(self, name: str, value: Scalar) -> None:
         """Set a variable from outside the logic, for example for a force."""

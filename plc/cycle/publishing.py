@@ -246,8 +246,7 @@ class OutputImage:
                     kept = self.changes[output.tag] = deque(maxlen=MAX_CHANGES)
                 if inputs is None:
                     inputs = seen()
-                place = output.program.place(output.name) if force is None else None
-                decided = output.program.decided(output.name, place) if place is not None else None
+                place, decided = output.program.last_assignment(output.name) if force is None else (None, None)
                 change = TagChange(
                     output.tag, now_ns, scan, output.owner, before, value, inputs, force is not None, place, decided
                 )

@@ -189,26 +189,19 @@ class StProgram(Program):
         owner = self.st_resource.globals if variable.shared else self.st_body
         return record_of(owner, str(variable.attribute), (), self.source_path)
 
-    def place(self, name: str) -> SourceLine | None:
-        """Return the line that assigned the output; for an output with its initial value, the line of its
-        declaration."""
+    def last_assignment(self, name: str) -> tuple[SourceLine | None, Decided | None]:
+        """Return the line that assigned the output, and its statement with what decided; for an output with its initial value,
+        the line of its declaration.
+        """
         found = self.st_variables.get(name)
         record = self.st_record(found) if found is not None else ()
-        if not record:
-            return None
-        path, line = record[1][:SOURCE]
-        place = self.st_places.get((path, line))
+        if found is None or not record:
+            return None, None
+        source = record[1][:SOURCE]
+        place = self.st_places.get(source)
         if place is None:
-            place = self.st_places[path, line] = SourceLine(path, line)
-        return place
-
-    def decided(self, name: str, place: SourceLine) -> Decided | None:
-        found = self.st_variables.get(name)
-        if found is None or found.shared:
-            return None
-        record = self.st_record(found)
-        known = record and record[1][:SOURCE] == (place.path, place.line)
-        return self.st_decisions.read(self.st_body, name, record) if known else None
+            place = self.st_places[source] = SourceLine(*source)
+        return place, None if found.shared else self.st_decisions.read(self.st_body, name, record)
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)

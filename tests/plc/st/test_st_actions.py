@@ -50,7 +50,7 @@ def test_actions_run_in_their_instance_and_share_its_temporary_variables() -> No
 def test_an_output_that_an_action_assigns_names_its_line() -> None:
     made = program(TANK)
     scan(made, 1)
-    place = made.place("seen")
+    place = made.last_assignment("seen")[0]
     assert place is not None
     assert TANK.splitlines()[place.line - 1].strip() == "seen := c[1].n;"
 

@@ -35,8 +35,7 @@ END_PROGRAM
 
 
 def decision_of(made: StProgram, name: str) -> Decided | None:
-    place = made.place(name)
-    return made.decided(name, place) if place is not None else None
+    return made.last_assignment(name)[1]
 
 
 def decided(level: float, t_s: int, name: str) -> dict[str, Any] | None:
@@ -279,7 +278,7 @@ END_PROGRAM
 def test_an_output_that_a_pointer_assigned_has_the_line_of_the_statement_with_the_pointer() -> None:
     made = program(POINTERS, dialect="codesys")
     scan(made, 1)
-    place, found = made.place("q"), decision_of(made, "r")
+    place, found = made.last_assignment("q")[0], decision_of(made, "r")
     assert place is not None
     assert place.line == 15
     assert found is not None
@@ -288,7 +287,7 @@ def test_an_output_that_a_pointer_assigned_has_the_line_of_the_statement_with_th
     found = decision_of(made, "r")
     assert found is not None
     assert [(one["place"], one["statement"]) for one in found.describe()["inside"]] == [("test.st:6", "p^ := 5")]
-    place, found = made.place("q"), decision_of(made, "q")
+    place, found = made.last_assignment("q")[0], decision_of(made, "q")
     assert (place and place.line, found and found.decision.text) == (18, "at^ := 5")
 
 

@@ -13,9 +13,8 @@ from fieldtwin.plc.st.program import StProgram
 
 
 def why(made: StProgram, name: str) -> dict[str, Any]:
-    place = made.place(name)
+    place, found = made.last_assignment(name)
     assert place is not None
-    found = made.decided(name, place)
     assert found is not None
     return found.describe()
 
@@ -117,7 +116,7 @@ def test_an_output_that_an_instance_assigned_through_a_var_in_out_has_the_line_i
     made = program(RECORDS)
     made.on = True
     scan(made)
-    place = made.place("sum")
+    place = made.last_assignment("sum")[0]
     assert place is not None
     assert place.line == 8
     found = why(made, "sum")
@@ -268,10 +267,10 @@ END_PROGRAM""",
         ("drive.run", 0, 4, "drive.run := TRUE"),
         ("speeds[2]", 9, 5, "speeds[i] := 4"),
     ):
-        place = made.place(name)
+        place = made.last_assignment(name)[0]
         assert (place and place.line, why(made, name)["statement"]) == (line, statement)
         made.put(name, value)
-        assert made.place(name) is None
+        assert made.last_assignment(name)[0] is None
 
 
 def test_memory_that_has_no_lines_has_no_old_ones() -> None:

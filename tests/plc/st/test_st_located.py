@@ -140,11 +140,11 @@ def test_the_line_that_wrote_a_located_global_is_known() -> None:
     made: Any = program(
         GLOBALS + "FUNCTION_BLOCK F\nlamp := TRUE; END_FUNCTION_BLOCK\nPROGRAM p VAR f : F; END_VAR f(); END_PROGRAM"
     )
-    assert made.place("lamp") is None
+    assert made.last_assignment("lamp")[0] is None
     scan(made)
-    assert made.place("lamp").line == 8
+    assert made.last_assignment("lamp")[0].line == 8
     made.put("lamp", False)
-    assert made.place("lamp") is None
+    assert made.last_assignment("lamp")[0] is None
 
 
 def test_a_retained_located_global_is_kept() -> None:

@@ -74,11 +74,13 @@ def test_an_unbound_input_keeps_the_value_that_the_program_gives_it() -> None:
 
 def test_the_line_that_assigned_an_output_of_an_instance_is_known() -> None:
     made: Any = program(TWO)
-    assert str(made.place("a.run")) == "test.st:4", "an output with its initial value: the line of its declaration"
+    assert str(made.last_assignment("a.run")[0]) == "test.st:4", (
+        "an output with its initial value: the line of its declaration"
+    )
     scan(made)
-    assert str(made.place("a.run")) == "test.st:6"
+    assert str(made.last_assignment("a.run")[0]) == "test.st:6"
     made.put("a.run", False)
-    assert (made.place("a.run"), made.st_body.v_a.v_run) == (None, False)
+    assert (made.last_assignment("a.run")[0], made.st_body.v_a.v_run) == (None, False)
 
 
 def test_a_derived_block_has_the_located_variables_of_its_base() -> None:
@@ -87,7 +89,7 @@ def test_a_derived_block_has_the_located_variables_of_its_base() -> None:
     assert set(roles(made)) == {"b.fault", "b.run", "b.hot"}
     scan(made)
     assert made.__dict__["b.run"] is True
-    assert str(made.place("b.run")) == "test.st:6"
+    assert str(made.last_assignment("b.run")[0]) == "test.st:6"
 
 
 def test_blocks_inside_blocks_and_structures_have_longer_paths() -> None:
@@ -358,4 +360,4 @@ def test_the_line_of_an_output_is_in_the_file_of_its_function_block(tmp_path: Pa
     (tmp_path / "Main.st").write_text("PROGRAM Main VAR a : Pump; END_VAR a(on := TRUE); END_PROGRAM")
     made: Any = load_program(str(tmp_path))
     scan(made)
-    assert str(made.place("a.run")) == f"{tmp_path / 'Pump.st'}:6"
+    assert str(made.last_assignment("a.run")[0]) == f"{tmp_path / 'Pump.st'}:6"

@@ -291,4 +291,4 @@ def test_the_text_of_the_export_may_be_a_file(tmp_path: Path) -> None:
     made: Any = load_source(path)()
     scan(made, 1, a=True)
     assert made.x is True
-    assert made.place("x").line == 5
+    assert made.last_assignment("x")[0].line == 5

@@ -8,9 +8,11 @@ source can contain it. Users see it as a part of the owner: ``pump.Next.n`` is t
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.dialects import Dialect
 from fieldtwin.plc.st.syntax import tree as t
@@ -33,6 +35,8 @@ def without_instance_variables(unit: t.SourceUnit, dialect: Dialect) -> t.Source
             if block.kind == _KIND:
                 hint = "the dialects codesys and twincat have it in a METHOD"
                 errors.add(invalid(block.pos, _KIND, "VAR", hint=hint))
+        for error in (each for method in pou.methods for each in _declared_again(method)):
+            errors.add(error)
         pous.append(_moved(pou))
     errors.raise_all()
     return replace(unit, pous=tuple(pous))
@@ -61,6 +65,19 @@ def own_name(shown: str) -> str:
     """Return the name in the POU of a variable that users see as `shown`."""
     method, *accessor, variable = ("", *shown.split(".")) if "." not in shown else shown.split(".")
     return f"{beginning(accessor[0] if accessor else 'method', method)}{variable}" if method else shown
+
+
+def _declared_again(method: t.Pou) -> Iterator[FileInvalid]:
+    """Yield an error for each VAR_INST that has the name of the result or of a different variable of the method."""
+    result = {method.name.lower()} if method.returns is not None else set()
+    others = {v.name.lower() for block in method.blocks if block.kind != _KIND for v in block.variables}
+    for variable in (v for block in method.blocks if block.kind == _KIND for v in block.variables):
+        name = variable.name.lower()
+        if name in result:
+            yield invalid(variable.pos, f"{variable.name} is the name of the method's result, and is declared again")
+        elif name in others:
+            yield invalid(variable.pos, f"{variable.name} is declared twice")
+        others.add(name)
 
 
 def _moved(pou: t.Pou) -> t.Pou:

@@ -64,6 +64,9 @@ def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
         before = text.rstrip()
         got, line, column = "the end of the file", before.count("\n") + 1, len(before) - before.rfind("\n")
         names = getattr(e, "accepts", None) or (set() if isinstance(e, UnexpectedEOF) else e.expected)  # type: ignore[attr-defined]
+    word = re.match(r"\w+", text.split("\n")[line - 1][column - 1 :]) if got.isalnum() else None
+    if word is not None:  # the token may be the beginning of a word, such as DO of done
+        got = word[0]
     construct = _unsupported(got, text, line, column)
     if construct:
         return FileInvalid(f"{construct} are not supported", path=path, line=line, column=column, got=shortened(got))

@@ -399,6 +399,16 @@ def test_variables_in_var_inst_keep_their_values_in_each_instance() -> None:
     for number in (2, 3):
         scan(made, number)
     assert (made.x, made.y, made.z) == (-13, -16, 3)
+    for names, message in (
+        ("VAR_INST next : INT; END_VAR", "next is the name of the method's result, and is declared again"),
+        ("VAR n : INT; END_VAR VAR_INST N : INT; END_VAR", "N is declared twice"),
+        ("VAR_INST n, N : INT; END_VAR", "N is declared twice"),
+    ):
+        with pytest.raises(FileInvalid, match=f"test.st:1:.*{message}"):
+            program(
+                f"FUNCTION_BLOCK F METHOD Next : INT {names} Next := 1; END_METHOD END_FUNCTION_BLOCK\nPROGRAM p END_PROGRAM",
+                "p", "codesys",
+            )  # fmt: skip
     for refused, dialect in ((text, "standard"), ("PROGRAM p VAR_INST n : INT; END_VAR END_PROGRAM", "codesys")):
         with pytest.raises(FileInvalid, match="VAR_INST; expected VAR"):
             compile_text(refused, "", DIALECTS[dialect])

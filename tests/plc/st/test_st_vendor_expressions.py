@@ -234,6 +234,11 @@ def test_constructs_that_are_not_supported_are_named(body: str, construct: str) 
         program(f"PROGRAM p VAR x : INT; END_VAR\n{body}\nEND_PROGRAM", "p", "codesys")
 
 
+def test_an_error_names_the_whole_word_if_it_begins_with_a_keyword() -> None:
+    with pytest.raises(FileInvalid, match=r"got done$"):
+        program("PROGRAM p VAR done : BOOL; END_VAR\nJMP done;\nEND_PROGRAM", "p", "codesys")
+
+
 def test_semicolons_and_comments_between_declarations_have_no_effect() -> None:
     text = """(* first *);
     TYPE T1 : STRUCT a : INT;; b : INT; END_STRUCT; END_TYPE; // second

@@ -144,7 +144,7 @@ def test_killed_and_added_workers_change_neither_the_causes_nor_the_count_of_run
             cluster.add(f"instead-of-{kills[count]}")
             cluster.kill(kills[count])
 
-    assert found_causes(cluster.place(), WatchedRuns(RUNS.options, heard), failed) == (here, left_here)
+    assert found_causes(cluster.place(), WatchedRuns(RUNS.options, heard=heard), failed) == (here, left_here)
     assert count > max(kills)
 
 
@@ -165,7 +165,7 @@ def test_guided_faults_are_found_again_on_the_workers_and_not_on_this_computer(
         if count == len(failed):  # the next unit finds the faults of the first seed
             cluster.kill("w1")
 
-    assert found_causes(cluster.place(), WatchedRuns(GUIDED.options, heard), failed) == (here, left_here)
+    assert found_causes(cluster.place(), WatchedRuns(GUIDED.options, heard=heard), failed) == (here, left_here)
     assert count > len(failed)
     assert not (site / "ran").exists()
     GUIDED.faults_of(1)

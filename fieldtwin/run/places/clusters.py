@@ -98,8 +98,9 @@ def _existing(address: str) -> Iterator[Client]:
 def _client(address: Any, name: str) -> Client:
     from distributed import Client
 
-    # it would log tracebacks when the scheduler is lost, which the campaign reports itself
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # they would log tracebacks when the scheduler is lost, which the campaign reports itself
+    for logger in ("distributed", "distributed.client", "tornado.application"):
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as e:

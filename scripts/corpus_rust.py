@@ -32,7 +32,7 @@ _BINARY = [["||"], ["&&"], ["==", "!=", "<", ">", "<=", ">="], ["+", "-"], ["*",
 
 
 class NotRead(Exception):
-    """The file uses a construct that is not read. The text names it."""
+    """The file or test uses a construct that is not read. The text names it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from corpus_rust import NotRead
+
 from fieldtwin.cli.plc.checking import checked
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
@@ -31,10 +33,6 @@ _WIDTHS = {"hh": 8, "h": 16, "": 32}
 _KINDS = ("", "-NEXT", "-SAME", "-NOT", "-EMPTY")
 _MAIN = "TEST 'main'\n  main();\n  ASSERT_TRUE(TRUE);\nEND_TEST\n"
 _printed: list[str] = []
-
-
-class NotRead(Exception):
-    """A test has a form that its reader does not know."""
 
 
 def lit_result(text: str, dialect: Dialect) -> str:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from rusty_lit import NotRead, executed, shown
+from corpus_rust import NotRead
+from rusty_lit import executed, shown
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.dialects import Dialect

@@ -103,13 +103,15 @@ def coverage_of(
     return found if found.executed else None
 
 
-CAMPAIGN_TITLE = "programs"
-"""The heading for a campaign, whose coverage of situations is a different line."""
-
-
-def measured_text(measured: int, runs: int) -> str:
-    """Return in how many runs of a campaign the coverage of Structured Text was measured; empty if in all of them or in none."""
-    return f"coverage of Structured Text: measured in {measured} of {runs} runs" if 0 < measured < runs else ""
+def show_campaign_coverage(coverage: Coverage | None, counts: Iterable[tuple[int, int]]) -> None:
+    """Print the coverage by campaigns, None or empty if nothing was measured. `counts` has, for each campaign, the number of runs
+    that measured it, and the number of all its runs; they are printed if only a part of the runs measured it.
+    """
+    if coverage is not None and coverage.executed:
+        show_coverage(coverage, "programs")  # "coverage" is the line about the situations of a campaign
+    for measured, runs in counts:
+        if 0 < measured < runs:
+            stdout.print(f"coverage of Structured Text: measured in {measured} of {runs} runs", soft_wrap=True)
 
 
 def show_coverage(coverage: Coverage, title: str = "coverage") -> None:

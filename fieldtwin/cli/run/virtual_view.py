@@ -18,14 +18,13 @@ from fieldtwin.cli.campaign_reports import CampaignReports
 from fieldtwin.cli.campaigns.causes import SEARCH_INTERRUPTED, simulated_causes
 from fieldtwin.cli.campaigns.ending import INTERRUPTED, different_texts, ends_early, interrupted_text, repeats_text
 from fieldtwin.cli.campaigns.failures import examine_failures
-from fieldtwin.cli.campaigns.st_coverage import CAMPAIGN_TITLE, measured_text, show_coverage
+from fieldtwin.cli.campaigns.st_coverage import show_campaign_coverage
 from fieldtwin.cli.run.campaign_progress import CampaignView
 from fieldtwin.cli.run.summary_view import print_summary
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
-    from fieldtwin.plc.st.coverage.places import Coverage as STCoverage
     from fieldtwin.reports.campaign.model import CampaignResult
     from fieldtwin.run.campaigns.coverage import Coverage
     from fieldtwin.run.campaigns.failure_traces import KeptTraces
@@ -166,14 +165,12 @@ def run_many(
         (lambda: simulated_causes(place, work, finished, len(left))) if has_faults else None,
         interrupted=interrupted,
     )
-    covered: STCoverage | None = None
-    partly = ""
+    whole: CampaignResult | None = None
     if reports.given:
         recorded = ledger.entries_of(what, seeds) if ledger is not None else entries
         untested_all = untested and len(left) == len(seeds)
         whole = _result(what, recorded, seeds, ledger_path, examined.traces, untested=untested_all)
         reports.write([whole])
-        covered, partly = whole.programs, measured_text(whole.measured, len(whole.runs))
     if as_json:
         json.dump(
             {
@@ -216,10 +213,8 @@ def run_many(
             "the ledger", f"{shown_time(ledger.hours * 3600)} of virtual time in {len(ledger.entries)} runs{failures}"
         )
     stdout.print(table)
-    if covered is not None and covered.executed:
-        show_coverage(covered, CAMPAIGN_TITLE)
-    if partly:
-        stdout.print(partly, soft_wrap=True)
+    if whole is not None:
+        show_campaign_coverage(whole.programs, [(whole.measured, len(whole.runs))])
     for seed in before:
         stdout.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
     for line in different_texts(different, repeats):

@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from fieldtwin.cli.campaign_reports import CampaignReports
-from fieldtwin.cli.campaigns.st_coverage import CAMPAIGN_TITLE, measured_text, show_coverage
+from fieldtwin.cli.campaigns.st_coverage import show_campaign_coverage
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.output_files import replacing
@@ -126,10 +126,7 @@ def _show(groups: list[Runs], expected: frozenset[int], files: int) -> None:
             table.add_row("missing", _listed(sorted(expected - runs.seeds)))
         stdout.print(table)
         programs, measured = runs.programs
-        if programs.executed:
-            show_coverage(programs, CAMPAIGN_TITLE)
-        if partly := measured_text(measured, len(runs.seeds)):
-            stdout.print(partly, soft_wrap=True)
+        show_campaign_coverage(programs, [(measured, len(runs.seeds))])
         for entry in runs.failed[:SHOWN_SEEDS]:
             reason = entry.errors[0] if entry.errors else "no reason is recorded"
             stdout.print(f"  seed {entry.seed}: {reason}", soft_wrap=True, markup=False)

@@ -22,11 +22,10 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.campaigns.ending import INTERRUPTED
 from fieldtwin.cli.campaigns.st_coverage import (
-    CAMPAIGN_TITLE,
     CoverageOptions,
     coverage_of,
-    measured_text,
     recorded,
+    show_campaign_coverage,
     show_coverage,
     write_measured,
 )
@@ -286,10 +285,10 @@ def command(
         json.dump([plain_result(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        if covered is not None:
-            show_coverage(covered, *([CAMPAIGN_TITLE] if campaign.seeds else []))
-            for partly in filter(None, (measured_text(one.measured, len(one.runs)) for one in campaigns)):
-                stdout.print(partly, soft_wrap=True)
+        if campaign.seeds:
+            show_campaign_coverage(covered, [(one.measured, len(one.runs)) for one in campaigns])
+        elif covered is not None:
+            show_coverage(covered)
         stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
         if not campaign.seeds:
             _tell_how_to_see_more(results)

@@ -109,6 +109,12 @@ async def write_value(request: Request) -> Any:
 
 
 TAG = INSTANCE + "/tags/{tag}"
+HISTORY = (
+    Parameter("from_ns", "integer", "begin, on the run's monotonic clock"),
+    Parameter("to_ns", "integer", "end"),
+    Parameter("points", "integer", "at most this many points; more are thinned out, extremes and bad values stay"),
+)
+"""The interval and the resolution of a history."""
 OPERATIONS = (
     Operation("GET", f"{INSTANCE}/tags", list_tags, "Read all tags"),
     Operation("GET", f"{INSTANCE}/recent", get_recent, "Read the last minute of all tags"),
@@ -117,13 +123,7 @@ OPERATIONS = (
         f"{TAG}/history",
         get_history,
         "Read the history of a tag",
-        (
-            Parameter("from_ns", "integer", "begin, on the run's monotonic clock"),
-            Parameter("to_ns", "integer", "end"),
-            Parameter(
-                "points", "integer", "at most this many points; more are thinned out, extremes and bad values stay"
-            ),
-        ),
+        HISTORY,
     ),
     Operation("GET", f"{INSTANCE}/marks", list_marks, "List faults and changes of states with their times"),
     Operation("POST", f"{TAG}/write", write_value, "Write a writable tag of a device", body=WriteValue, changes=True),

@@ -21,6 +21,7 @@ MOST_RECENT_OF_ALL = 50_000
 """Largest number of points of all tags of the last minute in one answer: about 1.5 MB. Above 417 tags, each has fewer."""
 
 GOOD = "good"
+BAD = "bad"
 
 
 class Point(NamedTuple):

@@ -17,14 +17,13 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.control import RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.plc.runtime.variable_trace import MAX_VARIABLES
-from fieldtwin.studio.live.tag_history import GOOD, MOST_POINTS, Point, thinned
+from fieldtwin.studio.live.tag_history import BAD, GOOD, MOST_POINTS, Point, thinned
 from fieldtwin.twin.plant.channel import Channel
 
 MOST_SCANS = 20_000
 """The largest number of scans of a variable that are kept: 200 s with a scan every 10 ms. 32 variables take about 40 MB."""
 NOT_RECORDED = "not_recorded"
 """The reason of a time whose scans are missing."""
-BAD = "bad"
 RING_SCANS = 2_000
 """The size of a ring in the PLC in scans: 2 s with a scan every 1 ms."""
 READ_EVERY_S = 0.25

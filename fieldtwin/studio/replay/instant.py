@@ -11,12 +11,11 @@ from itertools import islice
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
-from fieldtwin.studio.live.tag_history import Point
+from fieldtwin.studio.live.tag_history import BAD, Point
 from fieldtwin.studio.replay.alarms import alarms_at
 from fieldtwin.studio.replay.marks import faults_at, state_changes, step_at
 from fieldtwin.studio.replay.replay import Replay
 
-BAD = "bad"
 NEVER = Point(0, None, BAD, "never_read")
 RATE_OVER_NS = 5 * NS_PER_S
 LOOKS_BACK = 200

@@ -9,7 +9,8 @@ from starlette.requests import Request
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.studio.api.common import INSTANCE, attached
 from fieldtwin.studio.api.errors import NotFound
-from fieldtwin.studio.api.operation import Operation, Parameter, whole
+from fieldtwin.studio.api.operation import Operation, whole
+from fieldtwin.studio.api.tags import HISTORY
 from fieldtwin.studio.live.tag_history import MOST_POINTS
 
 
@@ -51,10 +52,6 @@ OPERATIONS = (
         VARIABLES + "/{variable}/history",
         get_variable_history,
         "Read the values of a variable after each scan",
-        (
-            Parameter("from_ns", "integer", "begin, on the run's monotonic clock"),
-            Parameter("to_ns", "integer", "end"),
-            Parameter("points", "integer", "at most this many points; more are thinned out, extremes stay"),
-        ),
+        HISTORY,
     ),
 )

@@ -13,19 +13,15 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 from fieldtwin.plc.st import types as ty
-from fieldtwin.plc.st.runtime.lines import indices_of, line_of
+from fieldtwin.plc.st.runtime.lines import MEMBER, RECORD_HEAD, indices_of, line_of
 
 GLOBALS = "_G"
 """The name of the object that holds the global variables in the Python code."""
 MAX_INDICES = 8
 """The largest number of variables in indices whose values one assignment records."""
-_MEMBER = "m_"
-"""The beginning of the attributes that hold the members of structures."""
 _VARIABLE = "v_"
 _INDEXING = {"index": 0, "view": 1, "moved": 1}
 """The functions that check an index, with the number of the argument that is the index."""
-_WITHOUT_INDICES = 3
-"""The length of a record without values of indices."""
 _KEPT = "_w"
 """The beginning of the local variables that keep a part of a target for its record."""
 
@@ -143,7 +139,7 @@ class Assignments(ast.NodeTransformer):
         if target.attr == "v":  # through a reference, which knows where the line belongs
             assign = ast.Attribute(target.value, "assign", ast.Load())
             return [_at(ast.Expr(ast.Call(assign, [node.value, self._record(node)], [])), node)]
-        if target.attr.startswith(_MEMBER):
+        if target.attr.startswith(MEMBER):
             record = self._record(node, own)
             line = ast.Attribute(self._again(target), line_of(target.attr), ast.Store())
             return [node, _at(ast.Assign([line], record), node)]
@@ -290,7 +286,7 @@ class Assignments(ast.NodeTransformer):
             of = ast.Name(owner, ast.Load())
             made.append(_at(ast.Assign([ast.Attribute(of, line_of(name), ast.Store())], place), node))
             record = self._record(node, without) if isinstance(node, ast.Assign) else ast.Tuple([], ast.Load())
-            if len(record.elts) > _WITHOUT_INDICES:
+            if len(record.elts) > RECORD_HEAD:
                 made.append(_at(ast.Assign([ast.Attribute(of, indices_of(name), ast.Store())], record), node))
         return made
 

@@ -6,7 +6,7 @@ import copy
 from typing import Any
 
 _PREFIX = "line_"
-_MEMBER = "m_"
+MEMBER = "m_"
 """The beginning of the attributes that hold the members of structures."""
 _INDICES = "at_"
 
@@ -139,7 +139,7 @@ def lines_in(owner: Any, attribute: str) -> Any:
 def noted(owner: Any, attribute: str, record: Record) -> None:
     """Note the assignment of a variable or member through a reference."""
     line = line_of(attribute)
-    if attribute.startswith(_MEMBER):
+    if attribute.startswith(MEMBER):
         setattr(owner, line, record)
     elif record or getattr(owner, line, None):
         try:

@@ -19,6 +19,7 @@ from fieldtwin.plc.st.compiler.scope import (
     by_reference,
     default_value,
     identifier,
+    open_outputs,
     wrapped,
 )
 from fieldtwin.plc.st.compiler.variables import bit, lookup, part_of, place, unknown_variable, variable
@@ -148,6 +149,13 @@ class Calls(Expressions):
         for p in signature.in_outs:
             expr = _value_of(given.get(p.name.lower()))
             codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
+        targets = {argument.name.lower(): argument.target for argument in outputs}
+        for p in open_outputs(signature.outputs):
+            target = targets.get(p.name.lower())
+            if target is None:
+                self.env.fail(call.pos, f"{_into(p, signature)} needs an array")
+            assert isinstance(p.type, ty.OpenArray)
+            codes.append(self._open_array(self.writable(target), p.type, target.pos, _into(p, signature)))
         arguments = ", ".join(codes)
         code = f"f_{identifier(signature.name)}({arguments})" if method is None else method.called(arguments)
         more = bool(signature.outputs)
@@ -163,7 +171,11 @@ class Calls(Expressions):
                 self.env.unknown(
                     argument.pos, f"in {signature.name}, an output", argument.name, [p.name for p in signature.outputs]
                 )
-            self.take(argument, Value(f"{result}[{places[key]}]", types[key]))
+            code, kind = f"{result}[{places[key]}]", types[key]
+            if isinstance(kind, ty.OpenArray):
+                self._take_open(argument, code, kind)
+            else:
+                self.take(argument, Value(code, kind))
         return Value(f"{result}[0]" if more else result, signature.returns)
 
     def given(self, expr: t.Expr, kind: ty.Type, pos: t.Pos, what: str) -> str:
@@ -183,10 +195,25 @@ class Calls(Expressions):
             self.env.fail(pos, what, expected=str(kind), got=str(source))
         return f"_v.OpenArray({value.code}, {source.ranges})"
 
+    def _check_inverted(self, argument: t.Argument, kind: ty.Type) -> None:
+        """Refuse ``NOT output => target`` for an output of a type other than BOOL."""
+        if kind != ty.BOOL:
+            self.env.fail(argument.pos, f"NOT before the output {argument.name}", expected="a BOOL", got=str(kind))
+
+    def _take_open(self, argument: t.Argument, result: str, kind: ty.OpenArray) -> None:
+        """Write the assignment of an output of variable length to the array whose limits it has."""
+        assert argument.target is not None
+        if argument.inverted:
+            self._check_inverted(argument, kind)
+        target, pos = self.writable(argument.target), argument.pos
+        items = f"{target.code}.items" if isinstance(target.type, ty.OpenArray) else target.code
+        self.out.line(f"_v.fill({items}, {result}.items)", pos)
+
     def take(self, argument: t.Argument, value: Value) -> None:
         """Compile the output argument ``name => target``: write the assignment of `value` to the target."""
         assert argument.target is not None
         if argument.inverted:
+            self._check_inverted(argument, value.type)
             value = Value(f"(not {value.code})", value.type)
         self.assign(argument.target, value, argument.pos)
 

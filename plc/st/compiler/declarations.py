@@ -161,9 +161,10 @@ class Declarations:
         return self._messages(spec, role)
 
     def _open_array(self, spec: t.ArrayType, role: str) -> ty.OpenArray:
-        if role not in ("VAR_IN_OUT", "VAR_INPUT"):
-            expected = "a VAR_IN_OUT, or a VAR_INPUT of a FUNCTION or METHOD"
-            self.env.fail(spec.pos, "an array of variable length (ARRAY[*])", expected=expected)
+        if role not in ty.GIVEN:
+            expected = "a VAR_IN_OUT, or a VAR_INPUT or VAR_OUTPUT of a FUNCTION or METHOD"
+            hint = "in a FUNCTION_BLOCK use VAR_IN_OUT, elsewhere an array with limits"
+            self.env.fail(spec.pos, "an array of variable length (ARRAY[*])", expected=expected, hint=hint)
         return ty.OpenArray(spec.open, self.type_of(spec.of))
 
     def _array(self, spec: t.ArrayType) -> ty.Array:

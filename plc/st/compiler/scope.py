@@ -3,7 +3,7 @@ writes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
@@ -188,6 +188,11 @@ def repeated(code: str, kind: ty.Array) -> str:
     for low, high in reversed(kind.ranges):
         code = f"[{code} for _ in range({high - low + 1})]"
     return code
+
+
+def open_outputs(outputs: Sequence[Parameter]) -> list[Parameter]:
+    """Return the outputs of variable length, whose limits the caller passes as arguments after the inputs and VAR_IN_OUT."""
+    return [p for p in outputs if isinstance(p.type, ty.OpenArray)]
 
 
 def by_reference(kind: ty.Type) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fieldtwin.plc.st.runtime.lines import NO_LINES
@@ -25,6 +26,16 @@ class OpenArray:
     def copied(self) -> OpenArray:
         """Return an array with copies of the items, for a parameter that is an input."""
         return OpenArray(copy.deepcopy(self.items), self.ranges)
+
+    def fresh(self, made: Callable[[], Any]) -> OpenArray:
+        """Return an array with the same limits, for a parameter that is an output. `made` returns the initial value of an
+        element.
+        """
+
+        def row(sizes: Sequence[int]) -> list[Any]:
+            return [row(sizes[1:]) if len(sizes) > 1 else made() for _ in range(sizes[0])]
+
+        return OpenArray(row([high - low + 1 for low, high in self.ranges]), self.ranges)
 
 
 def bound(ranges: Ranges, dimension: int, end: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.pous.variables import Variables, addressed_in
-from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol, by_reference, identifier
+from fieldtwin.plc.st.compiler.scope import Parameter, Signature, Symbol, by_reference, identifier, open_outputs
 from fieldtwin.plc.st.compiler.statements import Statements
 from fieldtwin.plc.st.syntax import tree as t
 
@@ -63,7 +63,8 @@ class Functions:
             result = f"{reference}.v"
         if pou.returns is not None:
             symbols[key] = Symbol(pou.name, signature.returns, result, reference=reference)
-        arguments = [f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs]
+        lent = open_outputs(signature.outputs)
+        arguments = [f"v_{p.name.lower()}" for p in (*signature.inputs, *signature.in_outs, *lent)]
         results = [result, *(symbols[p.name.lower()].code for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
         with self.out.block(f"def {name}({', '.join([instance] * bool(instance) + arguments)}):", pou.pos):

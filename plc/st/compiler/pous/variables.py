@@ -237,6 +237,10 @@ class Variables:
             value = "()"  # messages are passed in from outside
         elif isinstance(symbol.type, ty.Pointer) and isinstance(v.initial, t.Call | t.Ref):
             value = compiler.given(v.initial, symbol.type, v.initial.pos, "an initial value")
+        elif isinstance(symbol.type, ty.OpenArray):
+            of = v.type.of if isinstance(v.type, t.ArrayType) else None
+            made = InitialValues(self.declarations).of(symbol.type.of, None, of)
+            value = f"{symbol.code}.fresh(lambda: {made})"  # the argument has the limits of the caller's array
         else:
             values = InitialValues(self.declarations, compiler if self.env.dialect.vendor else None)
             value = values.of(symbol.type, v.initial, v.type)

@@ -51,6 +51,12 @@ _MEANINGS = {
         "execute the two methods.",
         "Move what has to happen at a start into FB_init. For a reaction to an online change, compare values in the body.",
     ),
+    "ST010": (
+        "SHL, ROL or ROR of a constant without a type, such as `SHL(1, n)`, whose result depends on its width. Here the constant "
+        "has the type of its context, such as that of the variable to which the result is assigned. Manuals of CODESYS say that "
+        "a constant has the narrowest type that holds it, so a controller may lose bits.",
+        "Write the type of the constant, such as `SHL(DWORD#1, n)`.",
+    ),
     "ST100": (
         "A comment `fieldtwin: allow ID: REASON` accepts a warning in its line or the next one. This one names no warning, "
         "has no reason, or there is no such warning any more.",

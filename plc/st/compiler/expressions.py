@@ -147,13 +147,21 @@ class Expressions:
             self.wanted = before
 
     def declared(self, *exprs: t.Expr) -> ty.Type | None:
-        """Return the type of the first of `exprs` that is a variable or literal of a bit string type or BOOL, or None."""
+        """Return the type of the first of `exprs` that is a variable or literal of a bit string type or BOOL, or None. In the
+        dialects of CODESYS, this includes integers.
+        """
         for expr in exprs:
             if isinstance(expr, t.Literal | t.Ref):
                 kind = self._literal(expr).type if isinstance(expr, t.Literal) else self.type_of(expr)
-                if kind is not None and ty.of_bits(kind):
+                if kind is not None and self.of_context(kind):
                     return kind
         return None
+
+    def of_context(self, kind: ty.Type) -> bool:
+        """Return whether a constant that is shifted gets the type of the other operand, `kind`."""
+        return ty.of_bits(kind) or (
+            self.env.dialect.vendor and isinstance(kind, ty.Elementary) and ty.is_kind(kind, "int")
+        )
 
     def type_of(self, ref: t.Ref) -> ty.Type | None:
         """Return the type of a variable or of its part without compiling it, or None if it has no such part."""

@@ -62,7 +62,7 @@ def binary(x: Compiling, expr: t.Binary) -> Value:
 
 def _joined(x: Compiling, expr: t.Binary, left: Value) -> Value:
     mark = len(x.out.lines)
-    wanted = left.type if ty.of_bits(left.type) else x.wanted if expr.op in _LOGIC else None
+    wanted = left.type if x.of_context(left.type) else x.wanted if expr.op in _LOGIC else None
     right = x.value(expr.right, wanted)
     if expr.op in ("AND_THEN", "OR_ELSE") and len(x.out.lines) > mark:
         left, right = _only_if_needed(x, expr, left, right, x.out.since(mark))

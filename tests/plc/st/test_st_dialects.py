@@ -76,6 +76,48 @@ def test_a_vendors_dialect_computes_what_the_standard_refuses(
             compiled(body, "matiec")
 
 
+@pytest.mark.parametrize(
+    ("body", "name", "expected", "bits"),
+    [
+        ("w := SHL(1, 4);", "w", 16, None),
+        ("w := SHR(16#F000, i);", "w", 0x1E0, None),
+        ("w := SHL(1, i);", "w", 128, "SHL of the constant 1 has 16 bits here, and may have 8 on a controller"),
+        ("w := w AND SHL(1, 8);", "w", 0x100, "SHL of the constant 1 has 16 bits here, and may have 8 on a controller"),
+        ("w := ROL(16#81, 1);", "w", 0x102, "ROL of the constant 129 has 16 bits here, and may have 8 on a controller"),
+        ("d := SHL(1, 20);", "d", 1 << 20, "SHL of the constant 1 has 32 bits here, and may have 8 on a controller"),
+        ("d := d + SHL(1, 9);", "d", 70512, "SHL of the constant 1 has 32 bits here, and may have 8 on a controller"),
+        ("d := SHL(1, 9) + d;", "d", 70512, "SHL of the constant 1 has 32 bits here, and may have 8 on a controller"),
+        ("r := SHL(-2, 2);", "r", -8, None),
+        (
+            "r := WORD_TO_INT(SHL(1, 9));",
+            "r",
+            512,
+            "SHL of the constant 1 has 16 bits here, and may have 8 on a controller",
+        ),
+        ("a[SHL(1, 2)] := 3; r := a[4];", "r", 3, None),
+        ("IF SHL(1, 8) = 0 THEN r := 1; END_IF", "r", 1, "SHL of the constant 1 has 8 bits"),
+    ],
+)
+def test_a_shifted_constant_has_the_type_of_its_context(body: str, name: str, expected: int, bits: str | None) -> None:
+    """Manuals of CODESYS give it the narrowest type, so a warning names each result that depends on the width."""
+    assert after(body)[name] == expected
+    assert [found.message for found in compiled(body, "codesys").warnings if found.id == "ST010"] == [bits] * bool(bits)
+
+
+@pytest.mark.parametrize("dialect", ["standard", "matiec"])
+def test_a_shifted_constant_has_the_type_of_its_context_in_the_standard_too(dialect: str) -> None:
+    found = after("w := SHL(1, i); d := UDINT_TO_DINT(DWORD_TO_UDINT(SHL(1, 20)));", dialect)
+    assert (found["w"], found["d"]) == (128, 1 << 20)
+    with pytest.raises(FileInvalid, match="the width of this literal is unknown here"):
+        compiled("IF SHL(1, 8) = 0 THEN r := 1; END_IF", dialect)
+
+
+def test_matiec_shifts_a_constant_as_an_integer() -> None:
+    assert after("d := SHL(1, 20);", "matiec")["d"] == 1 << 20
+    with pytest.raises(FileInvalid, match="the width of this literal is unknown here"):
+        compiled("d := SHL(1, 20);", "standard")
+
+
 def test_a_warning_has_id_file_line_and_column() -> None:
     (found,) = compiled("r := 1;\n  r := d;", "codesys").warnings
     assert str(found) == "p.st:4:8: ST002 DINT is converted to INT"

@@ -40,7 +40,7 @@ def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Write:
 
 
 def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
-    value = x.value(expr)
+    value = x.value(expr, source)
     kind = ty.plain(value.type)
     if source is not None and not isinstance(source, ty.String):
         code: str | None = x.coerced(value, source, expr.pos, f"the argument of {call.ref.name}")

@@ -144,6 +144,42 @@ def _move(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     return x.value(given[0], x.wanted)
 
 
+_WIDTHS = tuple(ty.ELEMENTARY[name] for name in ("BYTE", "WORD", "DWORD", "LWORD", "SINT", "INT", "DINT", "LINT"))
+
+
+def _type_of_shifted(x: Compiling, kind: ty.AnyInt, wanted: ty.Type | None) -> ty.Elementary | None:
+    """Return the type of a constant without a type that is shifted: the one which the context demands, else, in the dialects
+    of CODESYS, the narrowest one that holds the constant. None if it is unknown.
+    """
+    if ty.takes_bits(wanted, kind) and wanted.kind != "bool":
+        return wanted
+    integer = isinstance(wanted, ty.Elementary) and wanted.kind == "int" and ty.fits(kind, wanted)
+    if isinstance(wanted, ty.Elementary) and integer and "ST004" in x.env.dialect.accepts:
+        return wanted
+    return _narrowest(kind) if x.env.dialect.vendor else None
+
+
+def _narrowest(kind: ty.AnyInt) -> ty.Elementary:
+    return next(one for one in _WIDTHS if ty.fits(kind, one))
+
+
+def _most(name: str, kind: ty.AnyInt, count: Value) -> int | None:
+    """Return the largest number that a shift of a constant gives if no bit is lost; None if the width changes its result."""
+    if name == "SHR":
+        return kind.value
+    if name == "SHL" and isinstance(count.constant, int) and 0 <= count.constant < 64:
+        return kind.value << count.constant
+    return None
+
+
+def _warn_of_width(x: Compiling, pos: t.Pos, what: str, kind: ty.AnyInt, made: ty.Elementary, most: int | None) -> None:
+    """Warn of a constant that CODESYS may shift with fewer bits: its manuals name the narrowest type, whatever the target is."""
+    narrow = _narrowest(kind)
+    if most is None or not narrow.low <= most <= narrow.high:
+        other = f" here, and may have {narrow.bits} on a controller" if narrow.bits < made.bits else ""
+        x.env.accepts("ST010", pos, f"{what} has {made.bits} bits{other}")
+
+
 _SHIFTS = {"SHL": "shift_left", "SHR": "shift_right", "ROL": "rotate_left", "ROR": "rotate_right"}
 
 
@@ -152,15 +188,17 @@ def _shift(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     what, by = given
     wanted = ty.plain(x.wanted) if x.wanted is not None else None
     value, count = x.value(what, wanted), number(x, by, "int")
-    kind = ty.plain(value.type)
+    kind, name = ty.plain(value.type), call.ref.name.upper()
     if isinstance(kind, ty.AnyInt):
-        if not ty.takes_bits(wanted, kind) or wanted.kind == "bool":
+        made = _type_of_shifted(x, kind, wanted)
+        if made is None:
             x.env.fail(
                 what.pos, "the width of this literal is unknown here", expected="a bit string", got=str(kind),
                 hint="write its type before it, such as WORD#16#0001",
             )  # fmt: skip
-        value, kind = Value(x.coerced(value, wanted, what.pos), wanted), wanted
-    name = call.ref.name.upper()
+        if x.env.dialect.vendor:
+            _warn_of_width(x, what.pos, f"{name} of the constant {kind.value}", kind, made, _most(name, kind, count))
+        value, kind = Value(x.coerced(value, made, what.pos), made), made
     if not isinstance(kind, ty.Elementary) or not (
         kind.kind == "bits" or (kind.kind == "int" and x.env.accepts("ST004", what.pos, f"{name} of {kind}"))
     ):

@@ -75,6 +75,7 @@ class StProgram(Program):
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.created(f"P_{identifier(self.st_declared.name)}")
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
+        self.st_resource.bodies.append(self.st_body)
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""
         inputs = [v for v in self.st_variables.values() if v.role == "input" and _tag_kind(v.kind) is not None]
@@ -201,7 +202,7 @@ class StProgram(Program):
         place = self.st_places.get(source)
         if place is None:
             place = self.st_places[source] = SourceLine(*source)
-        return place, None if found.shared else self.st_decisions.read(self.st_body, name, record)
+        return place, self.st_decisions.read(self.st_body, self.st_resource, name, record)
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)
@@ -377,7 +378,7 @@ def program_class(
     decided = DecisionReader(
         unit,
         found.name,
-        [(v.name, v.kind) for v in found.variables if not v.steps],
+        found.own,
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
     )

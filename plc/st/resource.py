@@ -88,6 +88,8 @@ class Resource:
             for part in unit.code:
                 exec(part, self.space)
         self.globals: Any = self.space["_G"]
+        self.bodies: list[Any] = []
+        """The objects of the programs that use these global variables."""
         self.absolute = ".scan_ns" in unit.python
         """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""
         self._has_references = "_v.pointed(" in unit.python
@@ -149,6 +151,7 @@ class Resource:
         new.context, new.space, new.absolute = self.context, self.space, self.absolute
         new._has_references = self._has_references
         new.globals = copy.deepcopy(self.globals, memo)
+        new.bodies = copy.deepcopy(self.bodies, memo)
         return new
 
 

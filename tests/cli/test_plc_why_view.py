@@ -19,6 +19,7 @@ def test_the_statement_its_conditions_and_its_variables_are_shown(capsys: pytest
             ],
             "variables": {"timer.Q": "TRUE", "levels[2]": "90"},
             "indices": {"i": "2"},
+            "pointed": {"limit": "levels[3]"},
             "notes": ["at^: at is NULL"],
             "inside": [
                 {
@@ -37,6 +38,7 @@ def test_the_statement_its_conditions_and_its_variables_are_shown(capsys: pytest
         "        timer.Q is TRUE after the scan",
         "        levels[2] is 90 after the scan",
         "        i was 2 in this line",
+        "        limit pointed to levels[3] in this line",
         "        not followed: at^: at is NULL",
         "    levels[2]: in pump.st:9, scan 510  levels[n] := raw",
         "    level was 10.5",

@@ -295,6 +295,8 @@ def _print_statement(where: str, decided: Mapping[str, Any]) -> None:
         stdout.print(f"        {name} is {value} after the scan", markup=False, soft_wrap=True)
     for name, value in decided.get("indices", {}).items():
         stdout.print(f"        {name} was {value} in this line", markup=False, soft_wrap=True)
+    for name, path in decided.get("pointed", {}).items():
+        stdout.print(f"        {name} pointed to {path} in this line", markup=False, soft_wrap=True)
     for note in decided.get("notes", ()):
         stdout.print(f"        not followed: {note}", markup=False, soft_wrap=True)
 

@@ -2,8 +2,8 @@
 Structured Text was compiled to.
 
 After each such assignment (a statement, an output of a block or function, a VAR_IN_OUT) it inserts an assignment of the line's
-number; for elements and members, of a record with the number of the scan and the values of the indices. The Python text of a
-unit stays without them, and the model checker reads that.
+number; for elements, members and global variables, of a record with the number of the scan, the object that executed the
+statement, and the values of indices and pointers. The Python text of a unit stays without them, and the model checker reads that.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ MAX_INDICES = 8
 _VARIABLE = "v_"
 _INDEXING = {"index": 0, "view": 1, "moved": 1}
 """The functions that check an index, with the number of the argument that is the index."""
+_POINTED = "pointed"
+"""The function that checks a pointer."""
 _KEPT = "_w"
 """The beginning of the local variables that keep a part of a target for its record."""
 
@@ -82,14 +84,14 @@ class Assignments(ast.NodeTransformer):
     """The pass over a class or function. `recorded` names the attributes of ``self`` whose assignments are recorded, `known`
     has the arrays of the unit.
 
-    `shared` are the outputs among the global variables. Code of several files assigns them, so their lines have the file
-    `path`, and so do those of a function block (`with_path`), which may be in another file than the program.
+    `shared` are the global variables. Any program or instance may assign them, so their records have the object. Lines of a
+    function block have the file `path` (`with_path`), because it may be in another file than the program.
     """
 
     def __init__(
         self, recorded: Recorded, known: Arrays, shared: frozenset[str], path: str, *, with_path: bool
     ) -> None:
-        self._with_path = {"self": with_path, GLOBALS: True}
+        self._with_path = with_path
         self._outputs = {"self": recorded.outputs, GLOBALS: shared}
         self._recorded_here, self._known, self._path = recorded, known, path
         self._indices: list[list[str]] = []
@@ -121,7 +123,7 @@ class Assignments(ast.NodeTransformer):
 
     def visit_For(self, node: ast.For) -> ast.For:
         self.generic_visit(node)
-        node.body[:0] = self._lines(self._outputs_in(node.target), node)
+        node.body[:0] = self._lines(self._outputs_in(node.target), node, node.iter)
         return node
 
     # -- assignments --------------------------------------------------------------------------------------------------
@@ -152,7 +154,7 @@ class Assignments(ast.NodeTransformer):
                 ]
             handed = ast.Attribute(_load(target.value), line_of(target.attr), ast.Store())
             return [node, _at(ast.Assign([handed], lines), node)]
-        return [node, *self._lines(self._outputs_in(target), node, own)]
+        return [node, *self._lines(self._outputs_in(target), node, node, own)]
 
     def visit_Expr(self, node: ast.Expr) -> list[ast.stmt]:
         call = node.value
@@ -176,6 +178,8 @@ class Assignments(ast.NodeTransformer):
                 lines = self._lines_of(call.args[0])
                 if lines is not None:
                     call.keywords.append(ast.keyword("lines", lines))
+            elif _writes_memory(call):
+                call.keywords.append(ast.keyword("record", self._record(node)))
             elif not name and not _is_context(call):
                 for n, argument in enumerate(call.args):
                     lines = self._lines_of(argument)
@@ -231,10 +235,13 @@ class Assignments(ast.NodeTransformer):
 
     # -- records ------------------------------------------------------------------------------------------------------
 
-    def _record(self, node: ast.stmt, without: Collection[str] = ()) -> ast.Tuple:
-        """Return the record of a statement that is executed in this line, without the variables that it assigns itself."""
+    def _record(self, node: ast.stmt, without: Collection[str] = (), read: ast.AST | None = None) -> ast.Tuple:
+        """Return the record of a statement that is executed in this line, without the variables that it assigns itself.
+
+        `read` is the part of the statement that uses variables; None for all of it.
+        """
         scan = ast.Attribute(ast.Name("_c", ast.Load()), "scan", ast.Load())
-        used = [*(name for names in self._indices for name in names), *self._indices_in(node)]
+        used = [*(name for names in self._indices for name in names), *self._indices_in(read or node)]
         names = [name for name in dict.fromkeys(used) if name not in without][:MAX_INDICES]
         codes = [ast.Constant(name.removeprefix("self.")) for name in names]
         source = ast.Tuple([ast.Constant(self._path), ast.Constant(node.lineno), *codes], ast.Load())
@@ -243,12 +250,15 @@ class Assignments(ast.NodeTransformer):
         return ast.Tuple([scan, source, instance, *values], ast.Load())
 
     def _indices_in(self, expression: ast.AST) -> list[str]:
-        """Return the variables in the indices of an expression or a simple statement, as Python code."""
+        """Return the variables in the indices of an expression or a simple statement, and its pointers, as Python code."""
         found = []
         for node in ast.walk(expression):
             at = _INDEXING.get(_function(node))
             if at is not None and isinstance(node, ast.Call):
                 found += list(_variables(node.args[at]))
+            elif isinstance(node, ast.Call) and _function(node) == _POINTED:
+                pointer = node.args[0]
+                found += list(_variables(pointer)) if isinstance(pointer, ast.Name | ast.Attribute) else []
             elif isinstance(node, ast.Name):
                 found += self._temporaries.get(node.id, [])
         return found
@@ -277,16 +287,22 @@ class Assignments(ast.NodeTransformer):
             return [(owner, target.attr)] if target.attr in self._outputs.get(owner, ()) else []
         return []
 
-    def _lines(self, found: list[tuple[str, str]], node: ast.stmt, without: Collection[str] = ()) -> list[ast.stmt]:
+    def _lines(
+        self, found: list[tuple[str, str]], node: ast.stmt, read: ast.AST, without: Collection[str] = ()
+    ) -> list[ast.stmt]:
+        """Return the statements that record the assignment of outputs and global variables by `node`, which uses the variables
+        in `read`.
+        """
         made: list[ast.stmt] = []
         for owner, name in found:
+            record, of = self._record(node, without, read), ast.Name(owner, ast.Load())
             place: ast.expr = ast.Constant(node.lineno)
-            if self._with_path[owner]:
+            if owner == GLOBALS:
+                place = record
+            elif self._with_path:
                 place = ast.Tuple([ast.Constant(self._path), place], ast.Load())
-            of = ast.Name(owner, ast.Load())
             made.append(_at(ast.Assign([ast.Attribute(of, line_of(name), ast.Store())], place), node))
-            record = self._record(node, without) if isinstance(node, ast.Assign) else ast.Tuple([], ast.Load())
-            if len(record.elts) > RECORD_HEAD:
+            if owner != GLOBALS and len(record.elts) > RECORD_HEAD:
                 made.append(_at(ast.Assign([ast.Attribute(of, indices_of(name), ast.Store())], record), node))
         return made
 
@@ -313,6 +329,11 @@ def _function(node: ast.AST) -> str:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name):
         return node.func.attr if node.func.value.id == "_v" else ""
     return ""
+
+
+def _writes_memory(call: ast.Call) -> bool:
+    """Return whether an expression calls one of the functions that write memory, such as MEMCPY."""
+    return ast.unparse(call.func) in ("_v.copying.copied", "_v.copying.filled")
 
 
 def _call(name: str, *arguments: ast.expr) -> ast.Call:

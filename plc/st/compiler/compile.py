@@ -82,6 +82,8 @@ class CompiledUnit:
     global_symbols: tuple[Symbol, ...] = ()
     places: tuple[t.Pos, ...] = ()
     """The position in the source of each line of `python`."""
+    types: Mapping[str, ty.Type] = field(default_factory=dict)
+    """The structures, function blocks and classes by name in lower case, to which pointers may refer."""
     environment: Environment | None = field(default=None, compare=False, repr=False)
     """The declarations, for expressions that are compiled later; None if the unit was compiled in a different process."""
     record: Callable[[Any], None] | None = None
@@ -161,7 +163,7 @@ class _Unit:
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
         assignments = {**self.programs.recorded, **self.blocks.recorded}
         arrays = self._arrays(assignments.values())
-        lines = SourceLines(self.out, self.path, assignments, self.programs.shared_outputs, arrays)
+        lines = SourceLines(self.out, self.path, assignments, self._recorded_globals(), arrays)
         code = lines.code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
@@ -183,8 +185,14 @@ class _Unit:
             {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
             tuple(dict.fromkeys(self.env.globals.values())),
             tuple(lines.places()),
+            {key: kind for key, kind in self.env.types.items() if isinstance(kind, ty.Struct | ty.Block)},
             self.env,
         )
+
+    def _recorded_globals(self) -> frozenset[str]:
+        """Return the attributes of the global variables that are assigned as a whole. The others have records of their parts."""
+        parts = ty.Array | ty.Struct | ty.Block
+        return frozenset(v.attribute for v in self.variables.kept_globals().values() if not isinstance(v.kind, parts))
 
     def _arrays(self, recorded: Collection[Recorded]) -> Arrays:
         """Return the attributes that hold arrays of simple values."""

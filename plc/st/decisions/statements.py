@@ -221,6 +221,8 @@ def _targets(statement: _Assignment) -> Iterator[str]:
         return
     for argument in statement.call.arguments:
         passed = argument.target or argument.value  # the value may be a VAR_IN_OUT
+        if isinstance(passed, t.Call) and passed.ref.name.upper() == "ADR":  # memory that is written
+            passed = passed.arguments[0].value if passed.arguments else None
         if isinstance(passed, t.Ref):
             yield passed.name.lower()
 

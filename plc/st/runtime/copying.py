@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fieldtwin.plc.st.runtime.layouts import Layout, Members, Rows, Stored
-from fieldtwin.plc.st.runtime.lines import assigned_array, assigned_whole
+from fieldtwin.plc.st.runtime.layouts import Layout, Rows, Stored
+from fieldtwin.plc.st.runtime.lines import Record, assigned_elements, assigned_whole, noted
 from fieldtwin.plc.st.runtime.logic_error import LogicError
-from fieldtwin.plc.st.runtime.references import Element, Reference, Single, Whole
+from fieldtwin.plc.st.runtime.references import Element, MemberReference, Reference, Single, Whole
 
 
 class _Region:
@@ -34,8 +34,8 @@ class _Region:
         """Return the first `count` bytes."""
         return bytes(self._filled(count)[:count])
 
-    def write(self, data: bytes) -> None:
-        """Replace the first bytes by `data`."""
+    def write(self, data: bytes, record: Record) -> None:
+        """Replace the first bytes by `data`, and note the record of the statement."""
         memory = self._filled(len(data))
         memory[: len(data)] = data
         for n, i in enumerate(self._touched(len(data))):
@@ -44,11 +44,19 @@ class _Region:
                 _assign(self._items[i], value)
             else:
                 self._items[i] = value
-        lines = self._reference.of_array if isinstance(self._reference, Element) else self._reference.lines
-        if isinstance(self._items, list):  # the lines of these assignments are not known here
-            assigned_array(self._items, lines, ())
-        elif isinstance(self._of, Members) and not isinstance(self._items[0], Stored):
-            assigned_whole(self._items[0], ())
+        self._note(self._touched(len(data)), record)
+
+    def _note(self, touched: range, record: Record) -> None:
+        reference = self._reference
+        lines = reference.of_array if isinstance(reference, Element) else reference.lines
+        if isinstance(self._items, list):
+            assigned_elements(self._items, touched, lines, record)
+        elif isinstance(reference, Element):  # memory that is seen as another type
+            lines.assigned(None, record)
+        elif isinstance(reference, MemberReference):
+            noted(reference.owner, reference.name, record)
+        elif hasattr(self._items[0], "copy"):  # a structure or a union
+            assigned_whole(self._items[0], record)
 
     def _touched(self, count: int) -> range:
         return range(self._first, self._first - (-count // self._of.size))
@@ -96,19 +104,19 @@ def _region(place: Place, count: int, name: str, parameter: str) -> _Region:
     return found
 
 
-def copied(name: str, parameters: Sequence[str], target: Place, source: Place, count: int) -> int:
+def copied(name: str, parameters: Sequence[str], target: Place, source: Place, count: int, record: Record = ()) -> int:
     """Copy `count` bytes, also between parts of one variable, and return the number.
 
-    `parameters` are the names of the pointers.
+    `parameters` are the names of the pointers, and `record` is that of the statement.
     """
     data = _region(source, count, name, parameters[1]).read(count)
-    _region(target, count, name, parameters[0]).write(data)
+    _region(target, count, name, parameters[0]).write(data, record)
     return count
 
 
-def filled(name: str, parameters: Sequence[str], target: Place, byte: int, count: int) -> int:
+def filled(name: str, parameters: Sequence[str], target: Place, byte: int, count: int, record: Record = ()) -> int:
     """Give `count` bytes the value `byte`, and return the number."""
-    _region(target, count, name, parameters[0]).write(bytes([byte]) * count)
+    _region(target, count, name, parameters[0]).write(bytes([byte]) * count, record)
     return count
 
 

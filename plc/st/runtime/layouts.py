@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, Protocol
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.plc.st.runtime.lines import NO_LINES, is_line
+from fieldtwin.plc.st.runtime.lines import NO_LINES, MemoryLines, Record, is_line
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 
 Key = tuple[Any, ...]
@@ -171,6 +171,22 @@ text = cache(Text)
 # -- arrays, structures and unions in memory ------------------------------------------------------------------------------
 
 
+class UnionMemory(bytearray):
+    """The memory of a union, with the record of the statement that wrote it last."""
+
+    __slots__ = ("record",)
+    record: Record
+
+    def __init__(self, content: int | bytes) -> None:
+        super().__init__(content)
+        self.record = ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> UnionMemory:
+        new = memo[id(self)] = UnionMemory(bytes(self))
+        new.record = deepcopy(self.record, memo)
+        return new
+
+
 class Stored:
     """An array, a structure or a union that is `size` bytes of `memory` from `at` on."""
 
@@ -238,13 +254,22 @@ class Overlay(Stored):
     layout: Members
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not is_line(name):  # an assignment of one member changes others, so lines are not kept
+        if not is_line(name):
             super().__setattr__(name, value)
+        else:  # an assignment of one member changes others
+            self.written(value)
 
     def __getattr__(self, name: str) -> Any:
         if is_line(name):
-            return NO_LINES
+            memory = self.memory
+            return MemoryLines(memory) if isinstance(memory, UnionMemory) else NO_LINES
         raise AttributeError(name)
+
+    def written(self, record: Record) -> None:
+        """Note the statement that wrote the memory last."""
+        memory = self.memory
+        if isinstance(memory, UnionMemory):
+            memory.record = record
 
 
 class StructureInMemory(Overlay):
@@ -272,7 +297,7 @@ class Union(Overlay):
     __slots__ = ()
 
     def __init__(self, memory: bytearray | None = None, at: int = 0) -> None:
-        super().__init__(bytearray(self.layout.size) if memory is None else memory, at)
+        super().__init__(UnionMemory(self.layout.size) if memory is None else memory, at)
         if memory is None:
             self.initialise()
 
@@ -280,7 +305,7 @@ class Union(Overlay):
         """Assign the initial values that members state. The compiler overrides this."""
 
     def copy(self) -> Union:
-        return type(self)(bytearray(self.content), 0)
+        return type(self)(UnionMemory(self.content), 0)
 
     def assign(self, source: Union) -> None:
         self.content = source.content

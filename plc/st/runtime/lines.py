@@ -17,8 +17,8 @@ SOURCE = 2
 
 Record = tuple[Any, ...]
 """A record of an assignment: the number of the scan, the source, the object of the program or function block whose statement it
-was, and the values of variables in indices. The source has the file, the line and the Python code of these variables. A
-function has no object (None). Empty for an assignment whose line is not known."""
+was, and the values of variables in indices and of pointers. The source has the file, the line and the Python code of these
+variables. A function has no object (None). Empty for an assignment whose line is not known."""
 Key = int | tuple[int | None, ...] | None
 """The place of an element in its array, from 0: a number, or one for each dimension. None stands for the whole array, and as
 the last number for a whole row."""
@@ -100,6 +100,25 @@ class WholeLines:
 _OF_ELEMENTS = (ElementLines, RowLines)
 
 
+class MemoryLines:
+    """The record of the last write to the memory of a union, which is that of all its members, because they share the memory."""
+
+    __slots__ = ("_memory",)
+
+    def __init__(self, memory: Any) -> None:
+        self._memory = memory
+
+    def __setitem__(self, at: Key, record: Record) -> None:
+        self._memory.record = record
+
+    def assigned(self, key: Key, record: Record) -> None:
+        self._memory.record = record
+
+    def of(self, at: tuple[int, ...]) -> Record:
+        found: Record = self._memory.record
+        return found
+
+
 class _NoLines:
     """The records of an array that has none, such as a local variable of a function."""
 
@@ -159,7 +178,7 @@ def record_of(owner: Any, attribute: str, at: tuple[int, ...], path: str) -> Rec
     if type(line) is int:
         place = (path, line)
     elif type(line) is not tuple:
-        return line.of(at) if at and isinstance(line, _OF_ELEMENTS) else ()
+        return line.of(at) if isinstance(line, MemoryLines) or (at and isinstance(line, _OF_ELEMENTS)) else ()
     elif len(line) >= RECORD_HEAD:
         return line
     else:
@@ -178,7 +197,10 @@ def forget(owner: Any, attribute: str, at: tuple[int, ...]) -> None:
 
 
 def assigned_whole(target: Any, record: Record) -> None:
-    """Note the assignment of a structure: each of its members was assigned."""
+    """Note the assignment of a structure or a union: each of its members was assigned."""
+    written = getattr(target, "written", None)
+    if written is not None:
+        written(record)
     for name in target.__slots__:
         held = getattr(target, name)
         if isinstance(held, list):
@@ -201,6 +223,21 @@ def assigned_array(held: list[Any], lines: Any, record: Record) -> None:
             assigned_whole(element, record)
         else:
             return
+
+
+def assigned_elements(held: list[Any], touched: range, lines: Any, record: Record) -> None:
+    """Note the assignment of some elements of an array."""
+    if len(touched) == len(held):
+        assigned_array(held, lines, record)
+        return
+    for i in touched:
+        element = held[i]
+        if isinstance(element, list):
+            assigned_array(element, RowLines(lines, i), record)
+        elif hasattr(element, "copy"):
+            assigned_whole(element, record)
+        else:
+            lines.assigned(i, record)
 
 
 def lent(array: Any, lines: Any, record: Record) -> Any:

@@ -273,26 +273,44 @@ END_PROGRAM""",
         assert made.last_assignment(name)[0] is None
 
 
-def test_memory_that_has_no_lines_has_no_old_ones() -> None:
+def test_memory_has_the_statement_that_wrote_it_last() -> None:
     made = program(
         """TYPE U : UNION w : WORD; b : ARRAY[0..1] OF BYTE; END_UNION R : STRUCT x : INT; END_STRUCT END_TYPE
 PROGRAM p
 VAR_OUTPUT q, r, s : INT; END_VAR
-VAR u : U; a, b : ARRAY[0..1] OF INT; one, two : R; END_VAR
+VAR u, bytes, set, other : U; a, b : ARRAY[0..3] OF INT; one, two : R; i : INT := 1; END_VAR
+VAR_OUTPUT t, v, w, x, y : INT; END_VAR
   u.b[1] := 1;
   u.w := 5;
-  a[1] := 4;
+  bytes.b[0] := 9;
+  other := bytes;
+  set.w := 7;
+  MEMSET(ADR(set), 1, SIZEOF(set));
+  a[0] := 4;
+  a[2] := 5;
   one.x := 3;
-  MEMCPY(ADR(a), ADR(b), SIZEOF(a));
-  MEMCPY(ADR(one), ADR(two), SIZEOF(one));
+  MEMCPY(ADR(a[i]), ADR(b), 2 * SIZEOF(b[0]));
+  v := UDINT_TO_INT(MEMCPY(ADR(one), ADR(two), SIZEOF(one)));
   q := u.b[1];
-  r := a[1];
+  r := a[2];
   s := one.x;
+  t := a[0];
+  w := bytes.w;
+  x := set.w;
+  y := other.w;
 END_PROGRAM""",
         dialect="twincat",
     )
     scan(made)
-    assert [why(made, name).get("inside") for name in "qrs"] == [None, None, None]
+    assert [shown(why(made, name)["inside"][0]) for name in "qrstwxy"] == [
+        ("u.b[1]", 7, 1, "u.w := 5"),
+        ("a[2]", 15, 1, "MEMCPY(ADR(a[i]), ADR(b), 2 * SIZEOF(b[0]))"),
+        ("one.x", 16, 1, "v := UDINT_TO_INT(MEMCPY(ADR(one), ADR(two), SIZEOF(one)))"),
+        ("a[0]", 12, 1, "a[0] := 4"),
+        ("bytes.w", 8, 1, "bytes.b[0] := 9"),
+        ("set.w", 11, 1, "MEMSET(ADR(set), 1, SIZEOF(set))"),
+        ("other.w", 9, 1, "other := bytes"),
+    ]
 
 
 def test_an_array_that_was_assigned_through_a_reference_has_the_line_of_the_statement() -> None:

@@ -40,6 +40,7 @@ function Decision({ decided }) {
     </table>`}
     ${Object.keys(decided.indices ?? {}).length > 0 &&
     html`<p>In this line ${Object.entries(decided.indices).map(([name, v], n) => html`${n ? ", " : ""}${name} was <strong>${v}</strong>`)}.</p>`}
+    ${Object.entries(decided.pointed ?? {}).map(([name, path]) => html`<p key=${name}>In this line ${name} pointed to <strong>${path}</strong>.</p>`)}
     ${(decided.notes ?? []).map((note) => html`<p key=${note} class="soft">Not followed: ${note}.</p>`)}
     ${(decided.inside ?? []).map((one) => html`<p key=${one.instance + one.place}>In <strong>${one.instance}</strong>${one.block ? ` (${one.block})` : ""}, line <code>${one.place}</code>${one.scan ? `, scan ${one.scan}` : ""}:</p>
       <${Decision} decided=${one} />`)}`;

@@ -66,6 +66,11 @@ class CompiledProgram:
     path: str
     variables: tuple[ProgramVariable, ...]
 
+    @property
+    def own(self) -> list[tuple[str, ty.Type]]:
+        """Return the names and types of the variables that are neither global ones nor parts of others."""
+        return [(v.name, v.kind) for v in self.variables if not v.shared and not v.steps]
+
 
 class Programs(Bodies):
     """The compiler of the programs of a unit."""
@@ -77,8 +82,6 @@ class Programs(Bodies):
         self.configured = ConfiguredParts(self.env, self.declarations, unit)
         self.recorded: dict[str, Recorded] = {}
         """By class of a PROGRAM: the attributes whose assignments are recorded, among them its outputs and local variables."""
-        self.shared_outputs: set[str] = set()
-        """The attributes of global variables that are outputs."""
 
     def write(self, pou: t.Pou) -> CompiledProgram:
         """Write the class of a PROGRAM."""
@@ -112,8 +115,6 @@ class Programs(Bodies):
         own = [part for v in variables for part in self._parts_of(pou, v, f"{pou.name}.{v.name}")]
         variables += own
         variables += self._offered(pou, {v.name.lower() for v in variables})
-        shared = (v for v in variables if v.shared and v.role != "input" and not v.steps)
-        self.shared_outputs.update(str(v.attribute) for v in shared)
         arrays = frozenset(
             f"v_{s.name.lower()}" for s in symbols.values() if s.code.startswith("self.") and is_recorded(s.type)
         )

@@ -25,7 +25,7 @@ class SourceLines:
         arrays: Arrays,
     ) -> None:
         """`recorded` has the attributes whose assignments are recorded by class of a program or block; `shared` are those of
-        global variables. `arrays` has the arrays of the unit.
+        global variables that are assigned as a whole. `arrays` has the arrays of the unit.
         """
         self.out, self.path, self.recorded = out, path, recorded
         self.shared, self.arrays = frozenset(shared), arrays

@@ -13,8 +13,10 @@ RUN python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['p
       > /tmp/requirements.txt \
  && pip --python /opt/fieldtwin/bin/python install -r /tmp/requirements.txt
 COPY . .
+# parser(): keeps the parse tables of Structured Text, which the image's user cannot write (docs/decisions/0086-parse-tables.md).
 # share: the folder of the shipped profiles and recordings, independent of the Python version in their path.
 RUN pip --python /opt/fieldtwin/bin/python install --no-deps . \
+ && /opt/fieldtwin/bin/python -c 'from fieldtwin.plc.st.syntax.grammar import parser; parser()' \
  && cd / && ln -s "$(/opt/fieldtwin/bin/python -c 'from fieldtwin.twin.site.data_files import data_root; print(data_root())')" \
       /opt/fieldtwin/share
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from functools import cache
 from importlib import resources
+from pathlib import Path
 
 from lark import Lark, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken
 from lark.exceptions import UnexpectedInput
 from lark.lexer import PatternStr
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.syntax.parse_tables import parser_with_tables, place_of
 from fieldtwin.plc.st.syntax.source import shortened
 
 MAX_EXPECTED = 8
@@ -46,10 +48,12 @@ _READABLE = {
 def parser() -> Lark:
     """Return the parser, with the rules `start`, `expression` and `body` as its starts."""
     grammar = resources.files("fieldtwin.plc.st.syntax").joinpath("grammar.lark").read_text(encoding="utf-8")
-    starts = ["start", "expression", "body"]
-    return Lark(
-        grammar, start=starts, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII
-    )
+    options = {
+        "start": ["start", "expression", "body"], "parser": "lalr", "propagate_positions": True, "maybe_placeholders": False,
+        "g_regex_flags": re.ASCII,
+    }  # fmt: skip
+    place = place_of(Path(__file__).with_name("grammar.lark"))
+    return parser_with_tables(place, f"{grammar}\n{options}", lambda: Lark(grammar, **options))
 
 
 def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.northbound.opcua.access.passwords import hash_of, is_hash, matches
+from fieldtwin.northbound.opcua.access.passwords import hash_of, is_hash, matches, unmatchable_hash
 from fieldtwin.northbound.opcua.access.users import OPERATE, VIEW, Account, UserForm, Users, thumbprint
 
 HASH = hash_of("correct horse")
@@ -92,3 +92,11 @@ def test_any_content_of_the_file_is_read_or_refused_with_an_error_of_ours(
 def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="No such file"):
         Users.load(tmp_path / "none.yaml")
+
+
+def test_the_hash_for_an_unknown_user_costs_as_much_as_the_hash_of_a_password() -> None:
+    costs, again = unmatchable_hash().split("$")[:4], unmatchable_hash()
+    assert costs == HASH.split("$")[:4]
+    assert is_hash(again)
+    assert again != unmatchable_hash()
+    assert not matches("", again)

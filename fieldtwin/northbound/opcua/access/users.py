@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import read_input, reading
 from fieldtwin.gateway.core.files.yaml_file import YamlFile, parse, validate
-from fieldtwin.northbound.opcua.access.passwords import hash_of, is_hash, matches
+from fieldtwin.northbound.opcua.access.passwords import is_hash, matches, unmatchable_hash
 
 Role = Literal["view", "operate"]
 VIEW: Role = "view"
@@ -135,4 +135,4 @@ def _check(file: YamlFile, name: str, form: UserForm) -> None:
         )
 
 
-_UNKNOWN = hash_of("")
+_UNKNOWN = unmatchable_hash()

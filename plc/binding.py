@@ -71,6 +71,7 @@ def load_program(
     libraries: Sequence[str] = (),
     *,
     takes_writes: bool = False,
+    machine_code: bool = False,
 ) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
@@ -81,13 +82,17 @@ def load_program(
     folder of such files (``plc``), followed by ``:NAME`` if there are several programs. `dialect` is the dialect of a text
     (`fieldtwin.plc.st.dialects`), and `libraries` are files or folders with declarations that it uses, searched like `source`.
     `takes_writes`: a program in Structured Text has a message input for writes of servers (`fieldtwin.plc.st.program.WRITES`).
+    `machine_code`: a program in Structured Text is compiled to machine code (`fieldtwin.plc.st.native`).
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
     if language.strip() == "python":
         made = _python_class(source, rest, python_path)
     else:
-        made = partial(_text_class(source, python_path, dialect, libraries, takes_writes=takes_writes), together)
+        found = _text_class(
+            source, python_path, dialect, libraries, takes_writes=takes_writes, machine_code=machine_code
+        )
+        made = partial(found, together)
     return _created(source, made)
 
 
@@ -141,7 +146,13 @@ def text_source(source: str, folders: Sequence[str]) -> tuple[Path, str] | None:
 
 
 def _text_class(
-    source: str, folders: Sequence[str], dialect: str, libraries: Sequence[str], *, takes_writes: bool
+    source: str,
+    folders: Sequence[str],
+    dialect: str,
+    libraries: Sequence[str],
+    *,
+    takes_writes: bool,
+    machine_code: bool,
 ) -> type[StProgram]:
     found = text_source(source, folders)
     if found is None:
@@ -149,7 +160,8 @@ def _text_class(
     from fieldtwin.plc.st.dialects import dialect_of
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
-    return load_source(*found, dialect_of(dialect), library_places(libraries, folders), takes_writes=takes_writes)
+    places = library_places(libraries, folders)
+    return load_source(*found, dialect_of(dialect), places, takes_writes=takes_writes, machine_code=machine_code)
 
 
 def library_places(libraries: Sequence[str], folders: Sequence[str]) -> tuple[Path, ...]:

@@ -146,6 +146,7 @@ def _renamed(program: ProgramForm, member: AcousticMember) -> ProgramForm:
         source=str(beside.resolve()) if beside.exists() else program.source,
         dialect=program.dialect,
         libraries=[str(member.system.path.parent / library) for library in program.libraries],
+        machine_code=program.machine_code,
         task=None,
         inputs={
             n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad)

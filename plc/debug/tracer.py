@@ -15,6 +15,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.debug.breakpoints import Breakpoint
+from fieldtwin.plc.st.native.suspension import resume, suspend
 
 MAX_FRAMES = 100
 """How many frames of a call stack are shown."""
@@ -107,12 +108,13 @@ class Tracer:
     def begin(self) -> None:
         """Control the code that this thread calls from now on."""
         self._frames = 0
+        suspend(self)  # machine code has no lines
         sys.settrace(self._call)
 
-    @staticmethod
-    def pass_by() -> None:
+    def pass_by(self) -> None:
         """Control no code of this thread any more, until `begin`."""
         sys.settrace(None)
+        resume(self)
 
     @property
     def needed(self) -> bool:

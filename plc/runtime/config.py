@@ -23,7 +23,7 @@ class ProgramConfig:
 
     It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
     empty), its policy while it waits for its inputs, and the dialect and the libraries of its source. With `takes_writes`,
-    servers write its variables.
+    servers write its variables; with `machine_code`, it is compiled to machine code.
     """
 
     name: str
@@ -35,11 +35,18 @@ class ProgramConfig:
     dialect: str = "standard"
     libraries: tuple[str, ...] = ()
     takes_writes: bool = False
+    machine_code: bool = False
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
         """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
         program = load_program(
-            self.source, python_path, together, self.dialect, self.libraries, takes_writes=self.takes_writes
+            self.source,
+            python_path,
+            together,
+            self.dialect,
+            self.libraries,
+            takes_writes=self.takes_writes,
+            machine_code=self.machine_code,
         )
         return BoundProgram(self.name, program, self.inputs, self.outputs)
 

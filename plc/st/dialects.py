@@ -46,6 +46,7 @@ FINDINGS = {
     "ST113": "time bound to a tag in a different unit",
     "ST114": "writable tag that nothing writes",
     "ST115": "STRING at an address, which cannot be a tag",
+    "ST116": "no machine code",
 }
 """The id and title of each finding of `fieldtwin plc check` (`fieldtwin.plc.st.findings`), in every dialect."""
 

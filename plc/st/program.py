@@ -43,7 +43,7 @@ from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
 from fieldtwin.plc.st.inspection import shown_value
 from fieldtwin.plc.st.project import compile_source
-from fieldtwin.plc.st.resource import Resource, Together, state_of
+from fieldtwin.plc.st.resource import Resource, Together, attributes_of, state_of
 from fieldtwin.plc.st.runtime.lines import SOURCE, Record, forget, is_line, record_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
@@ -104,6 +104,10 @@ class StProgram(Program):
         self.st_outputs = [name for name, _ in same]
         self.st_read = reader([attribute for _, attribute in same])
         """Reads the values of `st_outputs`, all at once, because a large program has hundreds."""
+        self.st_keys = self.st_published_by_machine_code({attribute: name for name, attribute in same})
+        """The names under which machine code publishes the variables that it changes; None if Python code may change some."""
+        self.st_shown = False
+        """Whether the tags have the values that the variables had after the last scan, which ended without an error."""
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
         self.st_places: dict[tuple[str, int], SourceLine] = {}
         """The lines that assigned outputs so far; all changes by one line share its object."""
@@ -123,20 +127,28 @@ class StProgram(Program):
             item.put(body, namespace[item.name])
         for item in self.st_part_inputs:
             item.put(self.st_holder(item.variable), namespace[item.name])
+        context = self.st_resource.context
+        keys = self.st_keys if self.st_shown else None
+        context.published = None if keys is None else (namespace, keys)
+        self.st_shown = False
         try:
             body.execute()
         except RecursionError as e:
             raise _too_deep(e) from None
         if self.st_instance:
             getattr(body, connection(self.st_instance, into=False))()
-        self.st_show()
+        if keys is not None and context.published is None:
+            self.st_show_others()
+        else:
+            self.st_show()
+        self.st_shown = True
 
     def whole_state(self, now_ns: int) -> Any:
         """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global
         variables.
         """
         resource = self.st_resource
-        held = [vars(self.st_body), vars(resource.globals)]
+        held = [attributes_of(self.st_body), vars(resource.globals)]
         numbers = resource.numbers(self.st_body)
         own = tuple(
             [tuple([state_of(v, now_ns, numbers) for name, v in of.items() if not is_line(name)]) for of in held]
@@ -146,6 +158,11 @@ class StProgram(Program):
     def st_show(self) -> None:
         body, namespace = self.st_body, self.__dict__
         namespace.update(zip(self.st_outputs, self.st_read(body), strict=True))
+        self.st_show_others()
+
+    def st_show_others(self) -> None:
+        """Publish the variables whose tags hold other values, and those that are elsewhere."""
+        body, namespace = self.st_body, self.__dict__
         for name, attribute, to_tag in self.st_converted:
             namespace[name] = to_tag(getattr(body, attribute))
         for name, attribute, convert in self.st_shared:
@@ -154,6 +171,17 @@ class StProgram(Program):
         for part in self.st_parts:
             value, convert = self.st_value(part), _to_tag(part.kind)
             namespace[part.name] = convert(value) if convert else value
+
+    def st_published_by_machine_code(self, names: Mapping[str, str]) -> tuple[str | None, ...] | None:
+        """Return the name of each variable of the machine code that is published as it is. `names` has them by attribute.
+
+        Return None if there is no machine code, or if Python code may change variables too.
+        """
+        code = self.st_unit.machine_code
+        attributes = code.published(type(self.st_body).__name__) if code is not None else None
+        if attributes is None or self.st_instance:
+            return None
+        return tuple(names.get(attribute) for attribute in attributes)
 
     def st_holder(self, variable: ProgramVariable) -> Any:
         """Return the object, or the list, that holds a variable's value as its attribute or element `variable.attribute`."""
@@ -494,13 +522,18 @@ def load_source(
     libraries: tuple[Path, ...] = (),
     *,
     takes_writes: bool = False,
+    machine_code: bool = False,
 ) -> type[StProgram]:
-    """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them, with probes for coverage if a
-    recording is active. Raises `FileInvalid`.
+    """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`.
+
+    It has probes for coverage if a recording is active. Otherwise `machine_code` gives it machine code.
     """
     recording = active_recording()
-    compiled = compile_source if recording is None else recording.compiled
-    return program_class(compiled(path, dialect, libraries), name, takes_writes=takes_writes)
+    if recording is not None:
+        unit = recording.compiled(path, dialect, libraries)
+    else:
+        unit = compile_source(path, dialect, libraries, machine_code=machine_code)
+    return program_class(unit, name, takes_writes=takes_writes)
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:

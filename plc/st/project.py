@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.gateway.core.files.input_file import read_input
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
-from fieldtwin.plc.st.dialects import STANDARD, Dialect
+from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.libraries import STANDARD_NAMES, Library, with_library, without_qualifiers
 from fieldtwin.plc.st.plcopen.elements import is_plcopen
 from fieldtwin.plc.st.plcopen.read import read_parts, read_plcopen
@@ -35,13 +35,17 @@ MAX_SOURCE_BYTES = 8 * 1024 * 1024
 """A larger source file is assumed to be a mistake."""
 
 
-def compile_source(path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = ()) -> CompiledUnit:
+def compile_source(
+    path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = (), *, machine_code: bool = False
+) -> CompiledUnit:
     """Read and compile a file or a folder, with the declarations of `libraries` (files or folders) that it uses.
 
-    Raises `FileInvalid` for the first error, with the others.
+    With `machine_code` the programs get machine code (`fieldtwin.plc.st.native`), and a warning if that is not possible. Raises
+    `FileInvalid` for the first error, with the others.
     """
     names = frozenset(library.stem.lower() for library in libraries)
-    return _compiled(source_texts((path,)), source_texts(libraries), str(path), dialect, names)
+    made = _with_machine_code if machine_code else _compiled
+    return made(source_texts((path,)), source_texts(libraries), str(path), dialect, names)
 
 
 def read_with(
@@ -85,6 +89,20 @@ def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect, names
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
     return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
+
+
+@lru_cache(maxsize=32)
+def _with_machine_code(
+    texts: Texts, libraries: Texts, path: str, dialect: Dialect, names: frozenset[str]
+) -> CompiledUnit:
+    from fieldtwin.plc.st.native.machine import NoCompiler, with_machine_code  # few programs need it
+
+    unit = _compiled(texts, libraries, path, dialect, names)
+    try:
+        return with_machine_code(unit)
+    except NoCompiler as e:
+        warning = StWarning("ST116", f"the program stays Python, because {e}", unit.path, 1, 1)
+        return replace(unit, warnings=(*unit.warnings, warning))
 
 
 def _library(

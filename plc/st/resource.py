@@ -20,6 +20,7 @@ from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT
 from fieldtwin.plc.st.compiler.pous.inlining import NAMES
+from fieldtwin.plc.st.native.programs import RUNS
 from fieldtwin.plc.st.runtime.layouts import Stored, Union
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
@@ -34,7 +35,7 @@ Together = dict[Any, Any]
 class Context:
     """The interface through which compiled code uses the running scan."""
 
-    __slots__ = ("executed", "first_scan", "instances", "left", "lookup", "now_ns", "scan")
+    __slots__ = ("executed", "first_scan", "instances", "left", "lookup", "now_ns", "published", "scan")
 
     def __init__(self) -> None:
         self.left = MAX_STEPS
@@ -43,6 +44,9 @@ class Context:
         self.scan = 0
         """The number of the scan, for the records of assignments."""
         self.first_scan = False
+        self.published: tuple[dict[str, Any], tuple[str | None, ...]] | None = None
+        """Where machine code publishes the variables that it changes: a dictionary, and the key of each variable of the PROGRAM.
+        Machine code that has published them sets it to None."""
         self.instances = 0
         """The number of instances that variables of an interface type can refer to."""
         self.lookup: Callable[[str], TagValue] | None = None
@@ -90,6 +94,8 @@ class Resource:
         self.globals: Any = self.space["_G"]
         self.bodies: list[Any] = []
         """The objects of the programs that use these global variables."""
+        if unit.machine_code is not None:
+            self.space[RUNS] = unit.machine_code.load(self.space)
         self.absolute = ".scan_ns" in unit.python
         """Whether a program uses SCAN_TIME, so that its behaviour depends on absolute time."""
         self._has_references = "_v.pointed(" in unit.python
@@ -153,6 +159,12 @@ class Resource:
         new.globals = copy.deepcopy(self.globals, memo)
         new.bodies = copy.deepcopy(self.bodies, memo)
         return new
+
+
+def attributes_of(body: Any) -> dict[str, Any]:
+    """Return the attributes of the object of a PROGRAM, whose class has slots if it has machine code."""
+    names = getattr(type(body), "__slots__", None)
+    return vars(body) if names is None else {name: getattr(body, name) for name in names if hasattr(body, name)}
 
 
 def line_of_error(error: BaseException, files: Sequence[str]) -> tuple[str, int] | None:

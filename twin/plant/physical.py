@@ -112,6 +112,7 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             form.dialect,
             tuple(form.libraries),
             takes_writes=name in written,
+            machine_code=form.machine_code,
         )
         for name, form in system.plc.programs.items()
     )

@@ -186,6 +186,11 @@ class ProgramForm(SiteModel):
         max_length=32,
         description="files or folders of Structured Text, from which used declarations are taken",
     )
+    machine_code: bool = Field(
+        default=False,
+        description="of a source in Structured Text: compile it with the computer's C compiler, so that a scan takes less time; "
+        "the results are the same",
+    )
     task: Name | None = Field(default=None, description="default: the first task")
     start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[VariableName, InputForm] = Field(default={})

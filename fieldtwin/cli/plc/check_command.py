@@ -12,6 +12,7 @@ from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.plc.checking import Checked, checked
+from fieldtwin.cli.plc.machine_code import stays_python
 from fieldtwin.cli.plc.sources import (
     agreed_system,
     dialect_option,
@@ -39,6 +40,11 @@ from fieldtwin.plc.st.dialects import chosen_ids
         help="Treat the warning ID (such as ST001), or all, as an error. Can be repeated.",
     ),
     library_option,
+    click.option(
+        "--machine-code",
+        is_flag=True,
+        help="Also list the statements that stay Python in a program with `machine_code: true`, and why.",
+    ),
     sources=TemplateSearchOptions,
 )
 @json_option
@@ -47,6 +53,7 @@ def check(
     dialect: str | None,
     as_errors: tuple[str, ...],
     libraries: tuple[Path, ...],
+    machine_code: bool,
     sources: TemplateSearchOptions,
     as_json: bool,
 ) -> int:
@@ -81,6 +88,9 @@ def check(
     for missing in found.missing():
         where = f"{missing.pos.path}:{missing.pos.line}:{missing.pos.column}"
         stdout.print(f"{where}: not imported: {missing.reason}", soft_wrap=True, markup=False)
+    if machine_code:
+        for line in stays_python(found.units):
+            stdout.print(line, soft_wrap=True, markup=False)
     stdout.print(_summary(found), style="red" if found.errors else "green", soft_wrap=True, markup=False)
     return 1 if found.errors else 0
 

@@ -102,7 +102,8 @@ def _compiled(config: ProgramConfig, folders: Sequence[str]) -> tuple[CompiledUn
     libraries = library_places(config.libraries, folders)
     # first, so that a file that is saved during the compilation still counts as changed
     digests = {str(file): digest_of(str(file)) for place in (path, *libraries) for file in source_files(place)}
-    return compile_source(path, dialect_of(config.dialect), libraries), name, digests
+    unit = compile_source(path, dialect_of(config.dialect), libraries, machine_code=config.machine_code)
+    return unit, name, digests
 
 
 def _version(name: str, made: type[StProgram], digests: Mapping[str, str]) -> Version:

@@ -9,8 +9,8 @@ statement, and the values of indices and pointers. The Python text of a unit sta
 from __future__ import annotations
 
 import ast
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.runtime.lines import MEMBER, RECORD_HEAD, indices_of, line_of
@@ -53,6 +53,17 @@ class Arrays:
     arrays: frozenset[str] = frozenset()
     lent: frozenset[str] = frozenset()
     members: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Assigned:
+    """Which assignments of a unit are recorded: by class of a program or block its attributes, the attributes of global variables
+    that are outputs (`shared`), and the arrays of the unit.
+    """
+
+    recorded: Mapping[str, Recorded] = field(default_factory=dict)
+    shared: frozenset[str] = frozenset()
+    arrays: Arrays = Arrays()
 
 
 class MemberLines(ast.NodeTransformer):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import CodeType
-from typing import Any
+from typing import Any, Protocol
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
@@ -19,7 +19,7 @@ from fieldtwin.plc.st.charts.translate import is_hidden, without_charts
 from fieldtwin.plc.st.classes.inheritance import with_inherited
 from fieldtwin.plc.st.classes.instance_variables import without_instance_variables
 from fieldtwin.plc.st.classes.structures import with_inherited_members
-from fieldtwin.plc.st.compiler.assignments import Arrays, Recorded, is_recorded
+from fieldtwin.plc.st.compiler.assignments import Arrays, Assigned, Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.called import with_called_programs
 from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
 from fieldtwin.plc.st.compiler.configurations.located import (
@@ -35,7 +35,7 @@ from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.hierarchy import KINDS, Hierarchy
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, Programs
 from fieldtwin.plc.st.compiler.pous.recursion import refuse_recursion
-from fieldtwin.plc.st.compiler.pous.source_lines import SourceLines
+from fieldtwin.plc.st.compiler.pous.source_lines import SourceLines, places_of
 from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable, Variables
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Environment, Symbol
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
@@ -43,6 +43,19 @@ from fieldtwin.plc.st.edges import without_edges
 from fieldtwin.plc.st.namespaces import with_full_names
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_all
+
+
+class MachineCode(Protocol):
+    """The machine code of a unit (`fieldtwin.plc.st.native`)."""
+
+    def load(self, space: Mapping[str, Any]) -> list[Any]:
+        """Return the functions of machine code for the Python code that was executed in `space`."""
+
+    def published(self, name: str) -> tuple[str, ...] | None:
+        """Return the attributes that machine code publishes of the class `name` of a PROGRAM, in the order of their keys.
+
+        Return None if Python code may change some of them.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +101,9 @@ class CompiledUnit:
     """The declarations, for expressions that are compiled later; None if the unit was compiled in a different process."""
     record: Callable[[Any], None] | None = None
     """The function that the probes of a unit with probes call (`fieldtwin.plc.st.coverage.recording`); None without probes."""
+    assigned: Assigned = field(default_factory=Assigned, repr=False)
+    machine_code: MachineCode | None = field(default=None, repr=False)
+    """The machine code that `code` calls; None without it."""
 
 
 def compile_text(text: str, path: str = "", dialect: Dialect = STANDARD) -> CompiledUnit:
@@ -163,8 +179,9 @@ class _Unit:
         kinds, warnings, missing = self._kinds(), self.env.warnings.sorted(), tuple(self.env.missing.values())
         assignments = {**self.programs.recorded, **self.blocks.recorded}
         arrays = self._arrays(assignments.values())
-        lines = SourceLines(self.out, self.path, assignments, self._recorded_globals(), arrays)
-        code = lines.code(text)
+        assigned = Assigned(assignments, self._recorded_globals(), arrays)
+        places = places_of(self.out, self.path)
+        code = SourceLines(places, self.path, assigned).code(text)
         recorded, probed = self.env.recorded, self.env.probed
         return CompiledUnit(
             self.path,
@@ -184,9 +201,10 @@ class _Unit:
             dict(self._names()),
             {name: tuple(dict.fromkeys(of.values())) for name, of in self.env.symbols.items()},
             tuple(dict.fromkeys(self.env.globals.values())),
-            tuple(lines.places()),
+            places,
             {key: kind for key, kind in self.env.types.items() if isinstance(kind, ty.Struct | ty.Block)},
             self.env,
+            assigned=assigned,
         )
 
     def _recorded_globals(self) -> frozenset[str]:

@@ -1,0 +1,221 @@
+"""The C structures that hold the variables of programs, function blocks and global variables, and where their values are.
+
+The kind of a variable is that of its initial value in the Python class: BOOL is a `bool`, every integer, enumeration, time and
+bit string an `int`, REAL and LREAL a `float`. Variables of other kinds have no place in a structure, and statements that use
+them stay Python.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from fieldtwin.plc.blocks import BLOCKS
+from fieldtwin.plc.st.runtime.lines import MEMBER, is_line
+
+MAX_ELEMENTS = 4096
+"""The largest number of elements of an array that is read and written in machine code, because each execution reads all."""
+NONE = "INT64_MIN"
+"""What stands for None, the time at which a timer started that does not run."""
+STANDARD = "T_"
+"""The beginning of the names of the structures of standard function blocks."""
+
+
+class Unsupported(Exception):
+    """A construct that is not translated. Its text says which one."""
+
+
+@dataclass(slots=True)
+class Field:
+    """A variable in a structure. `kind` is bool, int, float, optional (an int or None), block, array, line or lines.
+
+    `of` is the structure of a block, or the kind of the elements of an array; `size` their number. A `line` is the record of
+    the last assignment of a variable, `lines` those of the elements of an array; `values` is the largest number of values of
+    indices in such a record.
+    """
+
+    name: str
+    kind: str
+    of: str = ""
+    size: int = 0
+    values: int = 0
+
+    @property
+    def c_name(self) -> str:
+        return f"f_{self.name}"
+
+
+@dataclass(slots=True)
+class Layout:
+    """The structure of a class: its fields by the names of the attributes, and the Python code of its methods."""
+
+    name: str
+    fields: dict[str, Field] = field(default_factory=dict)
+    methods: dict[str, ast.FunctionDef] = field(default_factory=dict)
+    constants: Mapping[str, object] = field(default_factory=dict)
+    whole: bool = False
+    """Whether all attributes are fields, so that the structure is all of the state of an instance."""
+
+
+class Layouts:
+    """The structures of the classes in the Python code `body` of a unit."""
+
+    def __init__(self, body: list[ast.stmt]) -> None:
+        self._classes = {node.name: node for node in body if isinstance(node, ast.ClassDef)}
+        self._made: dict[str, Layout] = {}
+        self._waiting: set[str] = set()
+        self.functions = {node.name: node for node in body if isinstance(node, ast.FunctionDef)}
+        self.globals = self._globals(body)
+
+    def of(self, name: str) -> Layout:
+        """Return the structure of a class. Raises `Unsupported` for a class that is unknown, or contains itself."""
+        if name not in self._made:
+            if name in self._waiting:
+                raise Unsupported(f"{name} contains itself")
+            self._waiting.add(name)
+            self._made[name] = self._standard(name) if name.startswith(STANDARD) else self._of_class(name)
+            self._waiting.discard(name)
+        return self._made[name]
+
+    def block(self, name: str) -> Layout:
+        """Return the structure of a function block, which must have no other state. Raises `Unsupported`."""
+        found = self.of(name)
+        if not found.whole:
+            raise Unsupported(f"function block {name.partition('_')[2]}")
+        return found
+
+    def _of_class(self, name: str) -> Layout:
+        node = self._classes.get(name)
+        if node is None:
+            raise Unsupported(f"class {name}")
+        made = Layout(name)
+        made.methods = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
+        made.whole = self._is_plain(node)
+        for target, value in _assigned(made.methods.get("__init__")):
+            found = self._field(target, value)
+            if found is not None:
+                made.fields[target] = found
+            elif not is_line(target):
+                made.whole = False
+        for target in _lines_in(node):
+            made.fields.setdefault(target, Field(target, "line"))
+        return made
+
+    def _is_plain(self, node: ast.ClassDef) -> bool:
+        """Return whether the class has neither methods of its own nor variables of its caller, and inherits only records."""
+        own = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
+        in_outs = [
+            each for each in node.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "in_outs"
+        ]
+        bases = [ast.unparse(base) for base in node.bases]
+        return (
+            own <= {"__init__", "execute", "copy"}
+            and all(isinstance(each.value, ast.Tuple) and not each.value.elts for each in in_outs)
+            and all(base.startswith("L_") for base in bases)
+        )
+
+    def _field(self, name: str, value: ast.expr) -> Field | None:
+        if name.startswith(MEMBER):
+            return None
+        if is_line(name):
+            if ast.unparse(value) == "_v.ElementLines()":
+                return Field(name, "lines")
+            return Field(name, "line")
+        if isinstance(value, ast.Call) and ast.unparse(value.func) == "_v.with_members":
+            value = value.args[0]
+        kind = _kind(value)
+        if kind:
+            return Field(name, kind)
+        if isinstance(value, ast.Call) and not value.args and not value.keywords:
+            of = self._class_of(value.func)
+            return Field(name, "block", of) if of else None
+        elements = _elements(value)
+        if elements is not None and 0 < elements[1] <= MAX_ELEMENTS:
+            return Field(name, "array", *elements)
+        return None
+
+    def _class_of(self, function: ast.expr) -> str:
+        """Return the structure of the class that a call creates; empty if it cannot be one."""
+        if isinstance(function, ast.Subscript) and isinstance(function.slice, ast.Constant):
+            name = STANDARD + str(function.slice.value)
+        elif isinstance(function, ast.Name) and function.id.startswith("B_"):
+            name = function.id
+        else:
+            return ""
+        try:
+            return self.block(name).name
+        except Unsupported:
+            return ""
+
+    def _standard(self, name: str) -> Layout:
+        """Return the structure of a standard function block, from an instance and the source of its class."""
+        block = BLOCKS[name.removeprefix(STANDARD)]
+        made, new = Layout(name, whole=True), block()
+        constants = {}
+        for base in reversed(block.__mro__):
+            constants.update({key: value for key, value in vars(base).items() if isinstance(value, int)})
+            for slot in vars(base).get("__slots__", ()):
+                value = getattr(new, slot)
+                kind = "optional" if value is None else _kind(ast.Constant(value))
+                if not kind:
+                    raise Unsupported(f"function block {name.removeprefix(STANDARD)}")
+                made.fields[slot] = Field(slot, kind)
+        made.constants = constants
+        source = textwrap.dedent(inspect.getsource(block.execute))
+        made.methods["execute"] = next(each for each in ast.parse(source).body if isinstance(each, ast.FunctionDef))
+        return made
+
+    def _globals(self, body: list[ast.stmt]) -> Layout:
+        made = Layout("globals")
+        for node in body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
+                target = node.targets[0]
+                found = self._field(target.attr, node.value)
+                if (
+                    found is not None
+                    and ast.unparse(target.value) == "_G"
+                    and found.kind in ("bool", "int", "float", "block")
+                ):
+                    made.fields[target.attr] = found
+        return made
+
+
+def _assigned(init: ast.FunctionDef | None) -> Iterator[tuple[str, ast.expr]]:
+    """Yield the attributes that a class sets first, each with its value."""
+    for node in init.body if init is not None else ():
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
+            yield node.targets[0].attr, node.value
+
+
+def _lines_in(node: ast.ClassDef) -> Iterator[str]:
+    """Yield the attributes with records that methods of a class assign."""
+    for each in ast.walk(node):
+        if isinstance(each, ast.Assign) and isinstance(each.targets[0], ast.Attribute):
+            target = each.targets[0]
+            if is_line(target.attr) and isinstance(target.value, ast.Name) and target.value.id == "self":
+                yield target.attr
+
+
+def _kind(value: ast.expr) -> str:
+    """Return the kind of a constant; empty for other expressions."""
+    if isinstance(value, ast.UnaryOp) and isinstance(value.op, ast.USub):
+        value = value.operand
+    if isinstance(value, ast.Constant) and type(value.value) in (bool, int, float):
+        return type(value.value).__name__
+    return ""
+
+
+def _elements(value: ast.expr) -> tuple[str, int] | None:
+    """Return kind and number of the elements of a new array of one dimension; None for other expressions."""
+    if isinstance(value, ast.ListComp):
+        of, kind = value.generators[0].iter, _kind(value.elt)
+        if kind and isinstance(of, ast.Call) and len(of.args) == 1 and isinstance(of.args[0], ast.Constant):
+            return kind, int(str(of.args[0].value))
+    if isinstance(value, ast.List):
+        kinds = {_kind(each) for each in value.elts}
+        if len(kinds) == 1 and (kind := kinds.pop()):
+            return kind, len(value.elts)
+    return None

@@ -1,0 +1,225 @@
+"""The text of the C module of a unit: structures, tables of their fields, the translated functions, and what Python calls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from fieldtwin.plc.st.native.expressions import c_type
+from fieldtwin.plc.st.native.layouts import Field, Layout
+from fieldtwin.plc.st.native.statements import Translation
+
+MODULE = "fieldtwin_machine_code"
+_KINDS = {"bool": "BOOL", "int": "INT", "float": "FLOAT", "optional": "OPTIONAL"}
+_CONTEXT = Layout("Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")})
+_CONTEXT.fields["first_scan"] = Field("first_scan", "bool")
+_ORDER = ("bool", "int", "float", "optional", "array", "block", "line", "lines")
+"""The order of the variables in a structure: a loop over variables of one kind is faster."""
+_FIRST = 2
+"""The number of the first class after the context and the global variables."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Statements of a PROGRAM that were translated to the C function `c_name`, and the attributes that they use."""
+
+    c_name: str
+    layout: Layout
+    used: frozenset[tuple[str, str]]
+
+
+class ModuleText:
+    """The writer of the C module for the `runs` of a unit."""
+
+    def __init__(self, translation: Translation, runs: Sequence[Run]) -> None:
+        self._translation, self._runs = translation, runs
+        programs = {run.layout.name: run.layout for run in runs}
+        self._globals = translation.layouts.globals
+        for layout in (*programs.values(), self._globals):
+            for one in layout.fields.values():
+                if one.kind == "block":
+                    translation.structure(one.of)
+        self.classes = [*translation.structures.values(), *programs.values()]
+        """The classes whose objects are read and written, in the order of `bind`."""
+        self._numbers = {layout.name: n for n, layout in enumerate(self.classes, _FIRST)}
+        self._objects: dict[str, int] = {}
+        """By structure: the number of Python objects that its variables are."""
+        for layout in (*self.classes, self._globals, _CONTEXT):
+            layout.fields = dict(sorted(layout.fields.items(), key=lambda item: _ORDER.index(item[1].kind)))
+            self._objects[layout.name] = sum(self._objects_of(one) for one in layout.fields.values())
+
+    def _objects_of(self, one: Field) -> int:
+        if one.kind == "block":
+            return self._objects[one.of]
+        return one.size if one.kind == "array" else 0 if one.kind in ("line", "lines") else 1
+
+    def text(self) -> str:
+        layouts = [self._globals, *self.classes]
+        parts = [
+            files("fieldtwin.plc.st.native").joinpath("runtime.h").read_text(encoding="ascii"),
+            *(self._structure(layout) for layout in [*self._translation.structures.values()]),
+            self._structure(self._globals),
+            *(self._structure(layout) for layout in self.classes[len(self._translation.structures) :]),
+            self._entries(_CONTEXT),
+            *(self._entries(layout) for layout in layouts),
+            self._tables(),
+            *self._translation.texts,
+            *(self._run(run) for run in self._runs),
+            self._module(),
+        ]
+        return "\n".join(parts)
+
+    def _structure(self, layout: Layout) -> str:
+        members = "".join(f"  {_member(one)};\n" for one in layout.fields.values())
+        return f"struct S_{layout.name} {{\n{members}  char end;\n}};\n"
+
+    def _entries(self, layout: Layout) -> str:
+        structure = f"struct {'Context' if layout is _CONTEXT else f'S_{layout.name}'}"
+        entries, objects = "", 0
+        for one in layout.fields.values():
+            entries += f"  {self._entry(layout is _CONTEXT, structure, one, objects)},\n"
+            objects += self._objects_of(one)
+        names = "".join(f'"{name}", ' for name in layout.fields)
+        return (
+            f"static const struct Entry E_{layout.name}[] = {{\n{entries}  {{0}}\n}};\n"
+            f"static const char *const N_{layout.name}[] = {{{names}NULL}};\n"
+            f"static Py_ssize_t O_{layout.name}[{len(layout.fields) + 1}];\n"
+        )
+
+    def _entry(self, context: bool, structure: str, one: Field, objects: int) -> str:
+        member = one.name if context else one.c_name
+        kind, of, block = _KINDS.get(one.kind, one.kind.upper()), "0", "0"
+        if one.kind == "block":
+            block = str(self._numbers[one.of])
+        elif one.kind == "array":
+            of = _KINDS[one.of]
+        elif one.kind == "line" and one.values:
+            kind = "RECORD"
+        return f"{{{kind}, {of}, {block}, {one.size}, {objects}, offsetof({structure}, {member})}}"
+
+    def _tables(self) -> str:
+        layouts = [_CONTEXT, self._globals, *self.classes]
+        rows = "".join(
+            f"  {{{_values(one)}, {len(one.fields)}, E_{one.name}, N_{one.name}, O_{one.name}}},\n" for one in layouts
+        )
+        return f"static const struct Class TABLE[] = {{\n{rows}}};\nenum {{ COUNT = {len(layouts)} }};\n"
+
+    def _run(self, run: Run) -> str:
+        name, layout = run.c_name, run.layout
+        uses = {
+            owner: [n for n, attribute in enumerate(of.fields) if (owner, attribute) in run.used]
+            for owner, of in (("self", layout), ("_G", self._globals))
+        }
+        values = sum(1 for n in uses["self"] if n < _values(layout))
+        number, objects = self._numbers[layout.name], max(self._objects[layout.name], 1)
+        shared = max(self._objects["globals"], 1)
+        return f"""
+static const int U_{name}[] = {{{", ".join(map(str, [*uses["self"], 0]))}}};
+static const int UG_{name}[] = {{{", ".join(map(str, [*uses["_G"], 0]))}}};
+static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_t count) {{
+  static struct S_{layout.name} now, old;
+  static struct S_globals g_now, g_old;
+  static struct Context c_now, c_old;
+  static PyObject *objects[{objects}], *g_objects[{shared}], *c_objects[{len(_CONTEXT.fields)}];
+  const struct Values s = {{(char *)&now, (char *)&old, objects}}, g = {{(char *)&g_now, (char *)&g_old, g_objects}};
+  const struct Values c = {{(char *)&c_now, (char *)&c_old, c_objects}};
+  const struct Bound *b = PyCapsule_GetPointer(capsule, "{MODULE}");
+  if (b == NULL || count != 3) return NULL;
+  if (load(b, 0, NULL, {len(_CONTEXT.fields)}, given[1], &c)
+      || load(b, {number}, U_{name}, {values}, given[0], &s)
+      || load_globals(b, UG_{name}, {len(uses["_G"])}, given[2], &g)) Py_RETURN_NONE;
+  int result = {name}(&now, &c_now, &g_now);
+  if (result != 1) {{
+    int64_t scan = c_now.scan;
+    PyObject *published = PyObject_GetAttrString(given[1], "published");
+    struct Publication p;
+    int is_published = published && PyTuple_CheckExact(published);
+    if (is_published) p = (struct Publication){{PyTuple_GET_ITEM(published, 0), PyTuple_GET_ITEM(published, 1)}};
+    if (published && store({number}, U_{name}, {len(uses["self"])}, given[0], &s, scan, is_published ? &p : NULL) == 0
+        && store_globals(UG_{name}, {len(uses["_G"])}, given[2], &g, scan) == 0
+        && store(0, NULL, {len(_CONTEXT.fields)}, given[1], &c, scan, NULL) == 0
+        && (!is_published || PyObject_SetAttrString(given[1], "published", Py_None) == 0)) {{
+      Py_DECREF(published);
+      return PyBool_FromLong(result == 2);
+    }}
+    Py_XDECREF(published);
+  }}
+  forget(&s, sizeof now, {objects});
+  forget(&g, sizeof g_now, {shared});
+  forget(&c, sizeof c_now, {len(_CONTEXT.fields)});
+  if (result != 1) return NULL;
+  Py_RETURN_NONE;
+}}
+static PyMethodDef M_{name} = {{"{name}", (PyCFunction)(void (*)(void))run_{name}, METH_FASTCALL, NULL}};
+"""
+
+    def _module(self) -> str:
+        runs = ", ".join([*(f"&M_{run.c_name}" for run in self._runs), "NULL"])
+        return f"""
+static PyMethodDef *RUNS[] = {{{runs}}};
+static void release(PyObject *capsule) {{
+  struct Bound *b = PyCapsule_GetPointer(capsule, "{MODULE}");
+  for (int n = 0; b && n < COUNT; n++) Py_XDECREF((PyObject *)b->types[n]);
+  if (b) {{ PyMem_Free(b->types); PyMem_Free(b); }}
+}}
+/* bind(types, constants): return a function for each run; `types` are the classes in the order of TABLE, `constants` a tuple. */
+static PyObject *bind(PyObject *module, PyObject *given) {{
+  PyObject *types, *constants;
+  (void)module;
+  if (!PyArg_ParseTuple(given, "O!O!", &PyTuple_Type, &types, &PyTuple_Type, &constants)) return NULL;
+  if (PyTuple_GET_SIZE(types) != COUNT) {{ PyErr_SetString(PyExc_ValueError, "the number of classes"); return NULL; }}
+  struct Bound *b = PyMem_Calloc(1, sizeof *b);
+  if (b == NULL || (b->types = PyMem_Calloc(COUNT, sizeof *b->types)) == NULL) return PyErr_NoMemory();
+  PyObject *capsule = PyCapsule_New(b, "{MODULE}", release), *runs = PyList_New(0);
+  if (!capsule || !runs) return NULL;
+  CLASSES = TABLE;
+  for (int n = 0; n < COUNT; n++) {{
+    PyObject *type = PyTuple_GET_ITEM(types, n);
+    if (type == Py_None) continue;
+    b->types[n] = (PyTypeObject *)Py_NewRef(type);
+    for (int k = 0; k < TABLE[n].count; k++) {{
+      PyObject *found = PyObject_GetAttrString(type, TABLE[n].names[k]);
+      if (found == NULL) return NULL;
+      PyMemberDef *member = Py_IS_TYPE(found, &PyMemberDescr_Type) ? ((PyMemberDescrObject *)found)->d_member : NULL;
+      if (member == NULL || member->type != T_OBJECT_EX) {{
+        PyErr_Format(PyExc_TypeError, "%s is not a slot", TABLE[n].names[k]);
+        return NULL;
+      }}
+      TABLE[n].slots[k] = member->offset;
+      Py_DECREF(found);
+    }}
+  }}
+  if (CONSTANTS == NULL) {{
+    CONSTANTS = ((PyTupleObject *)Py_NewRef(constants))->ob_item;
+  }}
+  for (int n = 0; RUNS[n]; n++) {{
+    PyObject *run = PyCFunction_New(RUNS[n], capsule);
+    if (!run || PyList_Append(runs, run)) return NULL;
+    Py_DECREF(run);
+  }}
+  Py_DECREF(capsule);
+  return runs;
+}}
+static PyMethodDef METHODS[] = {{{{"bind", bind, METH_VARARGS, NULL}}, {{NULL, NULL, 0, NULL}}}};
+static struct PyModuleDef DEFINITION = {{PyModuleDef_HEAD_INIT, "{MODULE}", NULL, -1, METHODS, NULL, NULL, NULL, NULL}};
+PyMODINIT_FUNC PyInit_{MODULE}(void) {{ return PyModule_Create(&DEFINITION); }}
+"""
+
+
+def _values(layout: Layout) -> int:
+    """Return how many fields have values; the others, which come after them, are records."""
+    return sum(one.kind not in ("line", "lines") for one in layout.fields.values())
+
+
+def _member(one: Field) -> str:
+    if one.kind == "block":
+        return f"struct S_{one.of} {one.c_name}"
+    if one.kind == "array":
+        return f"{c_type(one.of)} {one.c_name}[{one.size}]"
+    if one.kind == "line":
+        return f"struct {'Record' if one.values else 'Line'} {one.c_name}"
+    if one.kind == "lines":
+        size = max(one.size, 1)
+        return f"struct {{ int32_t count; int32_t at[{size}]; struct Record records[{size}]; }} {one.c_name}"
+    return f"{c_type(one.kind)} {one.c_name}"

@@ -130,6 +130,12 @@ _MEANINGS = {
         "BOOL, numbers, times and enumerations. The variable keeps its initial value, or what the program assigns.",
         "Use an array of BYTE, whose elements can be bound, or MESSAGES for texts.",
     ),
+    "ST116": (
+        "The system file has `machine_code: true` for the program, but no machine code could be made. The program runs as Python "
+        "code, with the same results, and takes more time in each scan.",
+        "Install what the warning names: a C compiler and the headers of Python (on Debian gcc and python3-dev). Or remove "
+        "`machine_code`.",
+    ),
 }
 
 ST_WARNINGS = tuple(

@@ -175,7 +175,7 @@ class StProgram(Program):
     def st_published_by_machine_code(self, names: Mapping[str, str]) -> tuple[str | None, ...] | None:
         """Return the name of each variable of the machine code that is published as it is. `names` has them by attribute.
 
-        Return None if there is no machine code, or if Python code may change variables too.
+        Return None without machine code, or if Python code may change variables too.
         """
         code = self.st_unit.machine_code
         attributes = code.published(type(self.st_body).__name__) if code is not None else None

@@ -1,4 +1,4 @@
-"""What of a program becomes machine code, for `fieldtwin plc check --machine-code`."""
+"""The statements of a program that become machine code, for `fieldtwin plc check --machine-code`."""
 
 from __future__ import annotations
 

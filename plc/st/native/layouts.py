@@ -19,7 +19,7 @@ from fieldtwin.plc.st.runtime.lines import MEMBER, is_line
 MAX_ELEMENTS = 4096
 """The largest number of elements of an array that is read and written in machine code, because each execution reads all."""
 NONE = "INT64_MIN"
-"""What stands for None, the time at which a timer started that does not run."""
+"""The number that stands for None: a timer that does not run has no start time."""
 STANDARD = "T_"
 """The beginning of the names of the structures of standard function blocks."""
 
@@ -105,7 +105,7 @@ class Layouts:
         return made
 
     def _is_plain(self, node: ast.ClassDef) -> bool:
-        """Return whether the class has neither methods of its own nor variables of its caller, and inherits only records."""
+        """Return whether the class only has a body and values: no methods, no VAR_IN_OUT, and no base class but that of its records."""
         own = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
         in_outs = [
             each for each in node.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "in_outs"

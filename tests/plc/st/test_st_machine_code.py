@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any
 import pytest
 
 from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.plc.debug.breakpoints import Breakpoint
+from fieldtwin.plc.debug.tracer import Resume, Tracer
 from fieldtwin.plc.program import ScanInfo
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_text
@@ -19,6 +22,7 @@ from fieldtwin.plc.st.native.machine import MachineCode, with_machine_code
 from fieldtwin.plc.st.native.suspension import resume, suspend
 from fieldtwin.plc.st.program import StProgram, load_source, program_class
 from fieldtwin.plc.st.resource import line_of_error
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 BLOCKS = """
 TYPE Mode : (Idle, Run, Stop); Percent : INT(0..100); END_TYPE
@@ -416,3 +420,35 @@ def test_the_translation_is_part_of_the_unit() -> None:
     assert replace(made, code=unit.code, machine_code=None) == unit
     assert [str(v.kind) for v in made.programs[0].variables] == ["INT", "INT", "REAL", "TIME"]
     assert made.programs[0].variables[0].kind == ty.ELEMENTARY["INT"]
+
+
+# -- what else looks at programs --------------------------------------------------------------------------------------------
+
+
+def test_a_breakpoint_stops_a_program_with_machine_code() -> None:
+    both = Both(unit_of("n : INT;", "k : INT;", "k := k + n;\nk := k + 1;"))
+    both.scan(1)
+    line = max(place.line for place in both.machine.st_unit.places)
+    seen: list[str] = []
+    tracer = Tracer(lambda reason, _: seen.append(reason), lambda *_: None, lambda: Resume.CONTINUE)
+    tracer.files = frozenset({"p.st"})
+    tracer.breakpoints = {"p.st": {line: Breakpoint(lambda *_: pytest.fail("there is nothing to compile"))}}
+    tracer.run(lambda: both.machine.execute(ScanInfo(10**9, 2, False)))
+    assert seen == ["breakpoint"]
+    assert both.machine_runs() == [False]
+
+
+def test_a_virtual_run_has_the_same_trace(tmp_path: Path) -> None:
+    systems = Path(__file__).resolve().parents[3] / "profiles"
+    found = []
+    for name, key in (("python", "false"), ("machine", "true")):
+        shutil.copytree(systems, tmp_path / name)
+        file = tmp_path / name / "systems" / "lab_vehicle.yaml"
+        text = file.read_text()
+        file.write_text(text.replace("source: vehicle.st", f"source: vehicle.st\n      machine_code: {key}"))
+        run = VirtualRun(VirtualOptions(str(file), 20.0, seed=1))
+        run.run()
+        assert run.summary()["ok"]
+        found.append(run.summary()["trace"])
+    assert found[0]["events"] > 1000
+    assert found[0] == found[1]

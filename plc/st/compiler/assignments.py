@@ -58,7 +58,7 @@ class Arrays:
 @dataclass(frozen=True, slots=True)
 class Assigned:
     """Which assignments of a unit are recorded: by class of a program or block its attributes, the attributes of global variables
-    that are outputs (`shared`), and the arrays of the unit.
+    that are assigned as a whole (`shared`), and the arrays of the unit.
     """
 
     recorded: Mapping[str, Recorded] = field(default_factory=dict)

@@ -20,6 +20,8 @@ MAX_ELEMENTS = 4096
 """The largest number of elements of an array that is read and written in machine code, because each execution reads all."""
 NONE = "INT64_MIN"
 """The number that stands for None: a timer that does not run has no start time."""
+_GLOBAL = ("bool", "int", "float", "block")
+"""The kinds of global variables that have a place in a structure."""
 STANDARD = "T_"
 """The beginning of the names of the structures of standard function blocks."""
 
@@ -100,7 +102,7 @@ class Layouts:
                 made.fields[target] = found
             elif not is_line(target):
                 made.whole = False
-        for target in _lines_in(node):
+        for target in _lines_in(node, "self"):
             made.fields.setdefault(target, Field(target, "line"))
         return made
 
@@ -173,13 +175,11 @@ class Layouts:
         for node in body:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
                 target = node.targets[0]
-                found = self._field(target.attr, node.value)
-                if (
-                    found is not None
-                    and ast.unparse(target.value) == "_G"
-                    and found.kind in ("bool", "int", "float", "block")
-                ):
+                found = self._field(target.attr, node.value) if ast.unparse(target.value) == "_G" else None
+                if found is not None and found.kind in _GLOBAL:
                     made.fields[target.attr] = found
+        for name in _lines_in(ast.Module(body, []), "_G"):
+            made.fields[name] = Field(name, "line")
         return made
 
 
@@ -190,12 +190,12 @@ def _assigned(init: ast.FunctionDef | None) -> Iterator[tuple[str, ast.expr]]:
             yield node.targets[0].attr, node.value
 
 
-def _lines_in(node: ast.ClassDef) -> Iterator[str]:
-    """Yield the attributes with records that methods of a class assign."""
+def _lines_in(node: ast.AST, owner: str) -> Iterator[str]:
+    """Yield the attributes of `owner` with records that statements in `node` assign."""
     for each in ast.walk(node):
         if isinstance(each, ast.Assign) and isinstance(each.targets[0], ast.Attribute):
             target = each.targets[0]
-            if is_line(target.attr) and isinstance(target.value, ast.Name) and target.value.id == "self":
+            if is_line(target.attr) and isinstance(target.value, ast.Name) and target.value.id == owner:
                 yield target.attr
 
 

@@ -72,7 +72,7 @@ class ModuleText:
 
     def _structure(self, layout: Layout) -> str:
         members = "".join(f"  {_member(one)};\n" for one in layout.fields.values())
-        return f"struct S_{layout.name} {{\n{members}  char end;\n}};\n"
+        return f"struct S_{layout.name} {{\n  PyObject *object;\n{members}}};\n"
 
     def _entries(self, layout: Layout) -> str:
         structure = f"struct {'Context' if layout is _CONTEXT else f'S_{layout.name}'}"

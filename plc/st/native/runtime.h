@@ -15,7 +15,8 @@ enum { MAX_VALUES = 8 };
 
 struct Context { int64_t now_ns, left, scan; char first_scan; };
 struct Line { int32_t code, count; };
-struct Record { int32_t code, count; int64_t key; int64_t values[MAX_VALUES]; };
+/* The record of an assignment by the statement of `maker`; NULL for a FUNCTION, which has no object. */
+struct Record { int32_t code, count; PyObject *maker; int64_t key; int64_t values[MAX_VALUES]; };
 /* A variable: `kind` and `of`, the kind of its elements; their number; its class, if it is a block; the number of its first Python
    object; its place in the structure. Tables are read in each scan, so entries are small. */
 struct Entry { uint8_t kind, of; uint16_t block; uint32_t size, object, offset; };
@@ -159,6 +160,7 @@ INLINE int take(int kind, PyObject *v, const struct Values *s, size_t offset, in
 FAST static int load(const struct Bound *b, int of, const int *use, int n, PyObject *o, const struct Values *s) {
   const struct Class *c = &CLASSES[of];
   if (o == NULL || Py_TYPE(o) != b->types[of]) return 1;
+  if (of > 1) *(PyObject **)s->now = o;  /* the structure of each class but the context begins with its object */
   for (int k = 0; k < n; k++) {
     int i = use ? use[k] : k;
     const struct Entry *e = &c->entries[i];
@@ -194,12 +196,12 @@ static PyObject *made(int kind, const char *from) {
     default: return PyLong_FromLongLong(*(const int64_t *)from);
   }
 }
-static PyObject *record(const struct Record *r, PyObject *o, int64_t scan) {
+static PyObject *record(const struct Record *r, int64_t scan) {
   PyObject *found = PyTuple_New(3 + r->count), *number = PyLong_FromLongLong(scan);
   if (!found || !number) { Py_XDECREF(found); Py_XDECREF(number); return NULL; }
   PyTuple_SET_ITEM(found, 0, number);
   PyTuple_SET_ITEM(found, 1, Py_NewRef(CONSTANTS[r->code - 1]));
-  PyTuple_SET_ITEM(found, 2, Py_NewRef(o));
+  PyTuple_SET_ITEM(found, 2, Py_NewRef(r->maker ? r->maker : Py_None));
   for (int n = 0; n < r->count; n++) {
     PyObject *v = PyLong_FromLongLong(r->values[n]);
     if (!v) { Py_DECREF(found); return NULL; }
@@ -249,7 +251,7 @@ FAST static int store(int of, const int *use, int n, PyObject *o, const struct V
         struct Record *r = (struct Record *)(s->now + e->offset);
         if (!r->code) break;
         PyObject *constant = CONSTANTS[r->code - 1];
-        if (r->count >= 0 ? put(slot, record(r, o, scan)) : *slot != constant && put(slot, Py_NewRef(constant))) return -1;
+        if (r->count >= 0 ? put(slot, record(r, scan)) : *slot != constant && put(slot, Py_NewRef(constant))) return -1;
         r->code = 0;
         break;
       }
@@ -257,7 +259,7 @@ FAST static int store(int of, const int *use, int n, PyObject *o, const struct V
         struct Lines *lines = (struct Lines *)(s->now + e->offset);
         for (int at = 0; at < lines->count; at++) {
           struct Record *r = RECORDS(lines, e->size) + at;
-          PyObject *key = PyLong_FromLongLong(r->key), *made_one = record(r, o, scan);
+          PyObject *key = PyLong_FromLongLong(r->key), *made_one = record(r, scan);
           int failed = !key || !made_one || PyObject_SetItem(*slot, key, made_one);
           Py_XDECREF(key);
           Py_XDECREF(made_one);
@@ -285,6 +287,7 @@ FAST static int store(int of, const int *use, int n, PyObject *o, const struct V
 static int load_globals(const struct Bound *b, const int *use, int n, PyObject *o, const struct Values *s) {
   for (int k = 0; k < n; k++) {
     const struct Entry *e = &CLASSES[1].entries[use[k]];
+    if (e->kind == LINE || e->kind == RECORD) continue;
     PyObject *v = PyObject_GetAttrString(o, CLASSES[1].names[use[k]]);
     int failed;
     if (v == NULL) { PyErr_Clear(); return 1; }
@@ -304,6 +307,13 @@ static int store_globals(const int *use, int n, PyObject *o, const struct Values
       if ((v = PyObject_GetAttrString(o, CLASSES[1].names[use[k]])) == NULL) return -1;
       failed = store(e->block, NULL, CLASSES[e->block].count, v, &WITHIN(s, e), scan, NULL);
       Py_DECREF(v);
+    } else if (e->kind == LINE || e->kind == RECORD) {
+      struct Record *r = (struct Record *)(s->now + e->offset);
+      if (!r->code) continue;
+      v = r->count < 0 ? Py_NewRef(CONSTANTS[r->code - 1]) : record(r, scan);
+      r->code = 0;
+      failed = v == NULL || PyObject_SetAttrString(o, CLASSES[1].names[use[k]], v);
+      Py_XDECREF(v);
     } else if (differs(e->kind, s->now + e->offset, s->old + e->offset)) {
       failed = change(e->kind, &v, s, e->offset, e->object) < 0 || PyObject_SetAttrString(o, CLASSES[1].names[use[k]], v);
       Py_XDECREF(v);

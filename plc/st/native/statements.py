@@ -206,8 +206,6 @@ class _Body:
     # -- records of assignments ---------------------------------------------------------------------------------------
 
     def _line(self, target: ast.Attribute, value: ast.expr) -> str:
-        if isinstance(target.value, ast.Name) and target.value.id != "self":
-            raise Unsupported("an assignment of a global output")
         text, field = self.expressions.place(target)
         if field.kind != "line":
             raise Unsupported(ast.unparse(target))
@@ -231,11 +229,8 @@ class _Body:
         if isinstance(value, ast.Constant) or (isinstance(value, ast.Tuple) and _is_constant(value)):
             line = text.removeprefix("&")
             return f"{line}.code = {self._unit.constant(value)}; {line}.count = -1;\n"
-        if (
-            not isinstance(value, ast.Tuple)
-            or ast.unparse(value.elts[0]) != "_c.scan"
-            or ast.unparse(value.elts[2]) != "self"
-        ):
+        maker = ast.unparse(value.elts[2]) if isinstance(value, ast.Tuple) else ""
+        if not isinstance(value, ast.Tuple) or ast.unparse(value.elts[0]) != "_c.scan" or maker not in ("self", "None"):
             raise Unsupported("a record of an assignment")
         given = [self.expressions.of_kind(each, "int") for each in value.elts[RECORD_HEAD:]]
         if any(self.expressions.value(each).kind != "int" for each in value.elts[RECORD_HEAD:]):
@@ -243,7 +238,8 @@ class _Body:
         field.values = max(field.values, 1, len(given))
         code = self._unit.constant(value.elts[1])
         texts = [f"record_->values[{n}] = {each};" for n, each in enumerate(given)]
-        body = f"record_->code = {code}; record_->count = {len(given)}; {' '.join(texts)}"
+        of = "(PyObject *)self->object" if maker == "self" else "NULL"
+        body = f"record_->code = {code}; record_->maker = {of}; record_->count = {len(given)}; {' '.join(texts)}"
         return f"{{ struct Record *record_ = {text}; {body} }}\n"
 
     # -- control ------------------------------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ def content(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: content(each) for key, each in value.items()}
     if isinstance(value, tuple):
-        return tuple("object" if hasattr(each, "execute") else content(each) for each in value)
+        return tuple(type(each).__name__ if hasattr(each, "execute") else content(each) for each in value)
     if isinstance(value, list):
         return [content(each) for each in value]
     names = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]

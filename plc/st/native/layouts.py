@@ -107,7 +107,7 @@ class Layouts:
         return made
 
     def _is_plain(self, node: ast.ClassDef) -> bool:
-        """Return whether the class has only a body and values: no methods, VAR_IN_OUT or base class, except that of its records."""
+        """Return whether the class has only values and a body, and no base class except that of its records."""
         own = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
         in_outs = [
             each for each in node.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "in_outs"

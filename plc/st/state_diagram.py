@@ -126,7 +126,7 @@ def _parts(statement: t.Statement) -> Iterator[tuple[str, tuple[t.Statement, ...
         for labels, body in statement.branches:
             yield f"{selector} = {', '.join(map(case_label, labels))}", body
         yield "else", statement.otherwise
-    elif isinstance(statement, t.For | t.While | t.Repeat):
+    elif isinstance(statement, t.For | t.While | t.Repeat | t.Networks):
         yield "", statement.body
 
 

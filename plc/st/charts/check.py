@@ -86,8 +86,8 @@ def _check(of: str, chart: t.Chart, found: ErrorCollector) -> None:
                 message = f"step {name!r} is not declared"
                 found.add(invalid(transition.pos, message, hint=did_you_mean(name, known)))
         for one in nodes(transition.body):
-            if isinstance(one, t.Jump) and one.word == "RETURN":
-                found.add(invalid(one.pos, "RETURN in the body of a transition", hint="use IF and ELSE"))
+            if isinstance(one, t.Jump) and one.word in ("RETURN", "JMP"):
+                found.add(invalid(one.pos, f"{one.word} in the body of a transition", hint="use IF and ELSE"))
     if complete:
         for error in check_reachability(chart):
             found.add(error)

@@ -37,6 +37,8 @@ class Statements(Calls):
         self._loops: list[t.Expr | None] = []  # the loops around the statement; for a REPEAT its condition
         self._continues: dict[int, int] = {}
         self._inside = 0
+        self._target: tuple[str, dict[str, int]] = ("", {})
+        """The variable with the number of the part that a jump executes next, and the numbers of the labels in lower case."""
         self.actions: frozenset[str] = frozenset()
         """The names of the actions of the POU `owner`, in lower case."""
         self.owner = pou
@@ -422,9 +424,27 @@ class Statements(Calls):
         with self.out.block(f"if {code}:", condition.pos):
             self.out.line("break", condition.pos)
 
+    def _networks(self, s: t.Networks) -> None:
+        """Compile a drawn body with jumps: a loop over its parts, which a jump begins again with the number of its label."""
+        target = self.out.temporary()
+        numbers = {label.lower(): n for n, part in enumerate(s.parts) for label in part.labels}
+        self._target = target, numbers
+        self.out.line(f"{target} = 0", s.pos)
+        with self.out.block("while True:", s.pos):
+            for n, part in enumerate(s.parts):
+                with self.out.block(f"if {target} <= {n}:", s.pos):
+                    self.body(part.body)
+            self.out.line("break", s.pos)
+
     def _jump(self, s: t.Jump) -> None:
         if s.word == "RETURN":
             self.out.line(self.leave, s.pos)
+            return
+        if s.word == "JMP":
+            target, numbers = self._target
+            self.out.step(s.pos)
+            self.out.line(f"{target} = {numbers[s.label.lower()]}", s.pos)
+            self.out.line("continue", s.pos)
             return
         if not self._loops:
             self.env.fail(s.pos, f"{s.word} outside a loop")

@@ -180,7 +180,7 @@ class _Statements:
                 yield from self.of(statement.otherwise, before, expressions, changed)
             elif isinstance(statement, t.Case):
                 yield from self._case(statement, conditions, (*read, statement.selector), changed)
-            elif isinstance(statement, t.For | t.While | t.Repeat):
+            elif isinstance(statement, t.For | t.While | t.Repeat | t.Networks):
                 inside = changed | self._changed(statement) if conditions else changed
                 yield from self.of(statement.body, conditions, read, inside)
             if conditions:

@@ -176,7 +176,7 @@ def _text(element: Element) -> str:
         return f"{name} >" if element.tag == "connector" else f"> {name}"
     if element.tag == "comment":
         return " ".join("".join(text for _, text in element.texts()).split())
-    named = {"label": "{}:", "jump": ">> {}", "return": "RETURN"}.get(element.tag)
+    named = {"label": "{}:", "jump": "{}", "return": "<RETURN>"}.get(element.tag)
     return named.format(element.attributes.get("label", "")) if named is not None else written(element)
 
 

@@ -229,6 +229,8 @@ def nodes_in_order(body: Sequence[t.Statement]) -> Iterator[t.Statement]:
         if isinstance(one, t.If):
             for _, inner in one.branches:
                 yield from nodes_in_order(inner)
+        elif isinstance(one, t.Networks):
+            yield from nodes_in_order(one.body)
 
 
 def _shown(found: Typed | None) -> Any:

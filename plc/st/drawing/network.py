@@ -233,6 +233,17 @@ def _variable(canvas: Canvas, one: Figure, shown: Mapping[str, Figure]) -> None:
             canvas.circle(one.x + port.x - inward * _RADIUS, one.y + port.y, _RADIUS)
 
 
+def _control(canvas: Canvas, one: Figure, shown: Mapping[str, Figure]) -> None:
+    """Draw a label, a jump or a return as the standard does: its text without a box, behind a double arrow for a jump."""
+    middle, left = one.y + one.height / 2, one.x
+    if one.tag == "jump":
+        for tip in (left + 6, left + 12):
+            canvas.line((tip - 6, middle - 6), (tip, middle), (tip - 6, middle + 6))
+        left += 14
+    most = int((one.x + one.width - left) / CHAR)
+    canvas.text(left + 2, middle + 4, shortened(one.text, max(3, most)), "name", "start")
+
+
 def _comment(canvas: Canvas, one: Figure, shown: Mapping[str, Figure]) -> None:
     lines = wrapped(one.text, max(8, int((one.width - 12) / CHAR) - 8), max(1, int((one.height - 6) / LINE)))
     canvas.rect(one.x, one.y, one.width, one.height, "note")
@@ -242,4 +253,5 @@ def _comment(canvas: Canvas, one: Figure, shown: Mapping[str, Figure]) -> None:
 
 _DRAW = {
     "leftPowerRail": _rail, "rightPowerRail": _rail, "contact": _symbol, "coil": _symbol, "block": _block, "comment": _comment,
+    "label": _control, "jump": _control, "return": _control,
 }  # fmt: skip

@@ -26,14 +26,28 @@ _SOURCES = ("inVariable", "continuation")
 
 
 def networks_of(figures: Mapping[str, Figure]) -> list[list[Figure]]:
-    """Return the groups of connected elements from top to bottom, without power rails and comments."""
-    ids = [n for n, one in figures.items() if one.tag not in RAILS and one.tag != "comment"]
+    """Return the groups of connected elements from top to bottom, without power rails and comments. A label is in the group to
+    which it leads.
+    """
+    ids = [n for n, one in figures.items() if one.tag not in (*RAILS, "comment", "label")]
     links = ((one.id, link.source) for one in figures.values() for port in one.inputs for link in port.links)
     found = [[figures[n] for n in network] for network in connected(ids, links)]
     order = list(figures)
+
+    def place_of(one: Figure) -> tuple[float, float, int]:
+        return one.y, one.x, order.index(one.id)
+
+    found.sort(key=lambda network: min(map(place_of, network)))
+    for label in (one for one in figures.values() if one.tag == "label"):
+        following = (network for network in found if max(map(place_of, network)) > place_of(label))
+        network = next(following, None)
+        if network is None:
+            found.append([label])
+        else:
+            network.append(label)
     for network in found:
         network.sort(key=lambda one: order.index(one.id))
-    return sorted(found, key=lambda network: min((one.y, one.x, order.index(one.id)) for one in network))
+    return sorted(found, key=lambda network: min(map(place_of, network)))
 
 
 def place(figures: Mapping[str, Figure]) -> None:

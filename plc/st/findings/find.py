@@ -228,7 +228,7 @@ def _all_bodies(about: _About) -> Iterator[Sequence[t.Statement]]:
         if isinstance(one, t.If | t.Case):
             yield from (body for _, body in one.branches)
             yield one.otherwise
-        elif isinstance(one, t.For | t.While | t.Repeat):
+        elif isinstance(one, t.For | t.While | t.Repeat | t.Network):
             yield one.body
 
 

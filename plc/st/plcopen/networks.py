@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fieldtwin.plc.st.plcopen.elements import Element
+from fieldtwin.plc.st.plcopen.labels import Part, parts_of
 from fieldtwin.plc.st.plcopen.nodes import Node, Pin, in_order, nodes_of, refuse_elements, written
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_expression
@@ -33,7 +34,7 @@ def drawn(body: Element, of: str, path: str, standard: Callable[[str], str], suf
 
     Raises `Unsupported` for an element that is not supported, and `FileInvalid` for an error.
     """
-    refuse_elements(body, ("jump", "error", "actionBlock"), of, path)
+    refuse_elements(body, ("error", "actionBlock"), of, path)
     return replace(Drawing(nodes_of(body, of, path), standard, suffix).drawn(), graphic=t.Graphic(body))
 
 
@@ -46,11 +47,23 @@ class Drawing:
         self.suffix = suffix
         self.out: list[t.Statement] = []
         self.edges: list[t.VarDecl] = []
+        self.labels: frozenset[str] = frozenset()
+        """The names of the labels of the body, in lower case."""
 
     def drawn(self) -> Drawn:
-        for node in in_order(self.nodes):
+        parts = parts_of(in_order(self.nodes), self.nodes)
+        self.labels = frozenset(name.lower() for part in parts for name in part.labels)
+        networks = tuple(self._network(part) for part in parts)
+        body = tuple(statement for network in networks for statement in network.body)
+        if any(node.tag == "jump" for node in self.nodes.values()):
+            body = (t.Networks(body[0].pos, networks),)
+        return Drawn(body, tuple(self.edges))
+
+    def _network(self, part: Part) -> t.Network:
+        self.out = []
+        for node in part.nodes:
             getattr(self, f"_{node.tag.lower()}")(node)
-        return Drawn(tuple(self.out), tuple(self.edges))
+        return t.Network(tuple(part.labels), tuple(self.out))
 
     # -- values ---------------------------------------------------------------------------------------------------------
 
@@ -166,8 +179,21 @@ class Drawing:
                 return
 
     def _return(self, node: Node) -> None:
-        flow = self._negated(node.element, node, self._flow(node, next(iter(node.pins), None)))
-        self.out.append(t.If(node.pos, ((flow, (t.Jump(node.pos, "RETURN"),)),)))
+        self._leave(node, t.Jump(node.pos, "RETURN"))
+
+    def _jump(self, node: Node) -> None:
+        label = node.element.attributes.get("label", "").strip()
+        if label.lower() not in self.labels:
+            raise node.error(f"a jump to the label {label!r}, which the body does not have")
+        self._leave(node, t.Jump(node.pos, "JMP", label))
+
+    def _leave(self, node: Node, jump: t.Jump) -> None:
+        """Write a jump or return. Without an input it is unconditional."""
+        if not node.pins:
+            self.out.append(jump)
+            return
+        flow = self._negated(node.element, node, self._flow(node, node.pins[0]))
+        self.out.append(t.If(node.pos, ((flow, (jump,)),)))
 
     def _assign(self, node: Node, text: str, value: t.Expr) -> None:
         target = self._variable(node, text)

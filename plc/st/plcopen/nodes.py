@@ -18,7 +18,7 @@ from fieldtwin.plc.st.syntax.tree import Pos
 
 MAX_NODES = 5_000
 """The largest number of elements in one body."""
-EXECUTED = ("block", "contact", "coil", "outVariable", "inOutVariable", "return")
+EXECUTED = ("block", "contact", "coil", "outVariable", "inOutVariable", "jump", "return")
 
 
 class Unsupported(FileInvalid):

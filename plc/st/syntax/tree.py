@@ -555,10 +555,32 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """EXIT, CONTINUE or RETURN."""
+    """EXIT, CONTINUE, RETURN, or a JMP to a label of the `Networks` around it."""
 
     pos: Pos
     word: str
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """The statements of a drawn body from its `labels` to the next one. The first part of a body may have no label."""
+
+    labels: tuple[str, ...]
+    body: tuple[Statement, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Networks:
+    """A drawn body with jumps. They lead to the parts with their labels, from where the parts are executed in their order."""
+
+    pos: Pos
+    parts: tuple[Network, ...]
+
+    @property
+    def body(self) -> tuple[Statement, ...]:
+        """Return the statements of all parts."""
+        return tuple(statement for part in self.parts for statement in part.body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -627,5 +649,5 @@ class Probe:
 
 Statement = (
     Assertion | Finished | Ordered | Advance | Probe | Hold | Assign | Refer | Attempt | CallStatement
-    | If | Case | For | While | Repeat | Jump
+    | If | Case | For | While | Repeat | Jump | Networks
 )  # fmt: skip

@@ -44,8 +44,11 @@ class Expressions:
     def __init__(self, layouts: Layouts, own: Layout | None, calls: Callable[[str, list[Value]], Value]) -> None:
         """`calls` translates a call of a FUNCTION."""
         self.layouts, self.own, self._calls = layouts, own, calls
+        self._constants = own.constants if own is not None else {}
         self.locals: dict[str, str] = {}
         """The C variables of the function, with their kinds."""
+        self.objects: dict[str, str] = {}
+        """The C variables that refer to an object, with their structures."""
         self.ranges: set[str] = set()
         """The names of ranges, each held in three C variables."""
         self.used: set[tuple[str, str]] = set()
@@ -73,29 +76,54 @@ class Expressions:
     # -- variables ----------------------------------------------------------------------------------------------------
 
     def place(self, node: ast.Attribute) -> tuple[str, Field]:
-        """Return the C expression and the field of a variable, or of a block. Raises `Unsupported`."""
-        if isinstance(node.value, ast.Name):
-            owner = node.value.id
-            layout = self.own if owner == "self" else self.layouts.globals if owner == "_G" else None
-            text = "self->" if owner == "self" else "g->"
-        else:
-            if not isinstance(node.value, ast.Attribute):
-                raise Unsupported(f"the variable {ast.unparse(node)}")
-            text, field = self.place(node.value)
-            text, layout, owner = f"{text}.", self.layouts.of(field.of) if field.kind == "block" else None, ""
-        found = layout.fields.get(node.attr) if layout is not None else None
+        """Return the C expression and the field of a variable. Raises `Unsupported`."""
+        text, layout = self.object(node.value)
+        found = layout.fields.get(node.attr)
         if found is None:
             raise Unsupported(f"the variable {node.attr.partition('_')[2] or node.attr}, because of its type")
-        if owner:
-            self.used.add((owner, node.attr))
-        return f"{text}{found.c_name}", found
+        if text in ("(*self)", "(*g)"):
+            self.used.add(("self" if text == "(*self)" else "_G", node.attr))
+        return f"{text}.{found.c_name}", found
 
-    def element(self, node: ast.Subscript) -> tuple[str, Field]:
+    def object(self, node: ast.expr) -> tuple[str, Layout]:
+        """Return the C expression and the structure of an object: a program, a block or a structure. Raises `Unsupported`."""
+        if isinstance(node, ast.Name):
+            if node.id == "self" and self.own is not None:
+                return "(*self)", self.own
+            if node.id == "_G":
+                return "(*g)", self.layouts.globals
+            if node.id in self.objects:
+                return f"(*{node.id})", self.layouts.of(self.objects[node.id])
+        elif isinstance(node, ast.NamedExpr):
+            text, layout = self.object(node.value)
+            if self.objects.setdefault(node.target.id, layout.name) != layout.name or node.target.id in self.locals:
+                raise Unsupported(f"{node.target.id} with values of several kinds")
+            return f"(*({node.target.id} = &{text}))", layout
+        elif isinstance(node, ast.Attribute):
+            text, field = self.place(node)
+            if field.kind == "block":
+                return text, self.layouts.of(field.of)
+        elif isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute):
+            text, field = self.element(node, "blocks")
+            return text, self.layouts.of(field.of)
+        raise Unsupported(ast.unparse(node))
+
+    def named(self, name: str, node: ast.expr) -> str:
+        """Return the C statement that lets a local variable refer to an object; empty if the expression is not an object."""
+        at = node.value if isinstance(node, ast.Subscript) else node
+        if not isinstance(at, ast.Attribute) or ast.unparse(at.value) == "_c" or at.attr in self._constants:
+            return ""
+        if self.place(at)[1].kind != ("block" if at is node else "blocks"):
+            return ""
+        text, _ = self.object(ast.NamedExpr(ast.Name(name, ast.Store()), node))
+        return f"(void){text};\n"
+
+    def element(self, node: ast.Subscript, kind: str = "array") -> tuple[str, Field]:
         """Return the C expression of an element of an array, and the field of the array."""
         if not isinstance(node.value, ast.Attribute):
             raise Unsupported(f"the element {ast.unparse(node)}")
         array, field = self.place(node.value)
-        if field.kind != "array":
+        if field.kind != kind:
             raise Unsupported(f"the element {ast.unparse(node)}")
         at = self.of_kind(node.slice, "int")
         return f"{array}[({{ int64_t at = {at}; if (at < 0 || at >= {field.size}) goto bail; at; }})]", field
@@ -108,8 +136,8 @@ class Expressions:
             if node.attr == "first_scan":
                 return Value("c->first_scan", "bool")
             raise Unsupported(f"_c.{node.attr}")
-        if owner == "self" and self.own is not None and node.attr in self.own.constants:
-            return self._constant(ast.Constant(self.own.constants[node.attr]))  # type: ignore[arg-type]
+        if owner == "self" and node.attr in self._constants:
+            return self._constant(ast.Constant(self._constants[node.attr]))  # type: ignore[arg-type]
         text, field = self.place(node)
         if field.kind not in _C_TYPES:
             raise Unsupported(f"{node.attr} as a value")
@@ -131,7 +159,12 @@ class Expressions:
 
     def declare(self, name: str, kind: str) -> None:
         """Declare a C variable. Raises `Unsupported` if it has a different kind already."""
-        if self.locals.setdefault(name, kind) != kind or name in self.ranges or kind == "optional":
+        if (
+            self.locals.setdefault(name, kind) != kind
+            or name in self.ranges
+            or name in self.objects
+            or kind == "optional"
+        ):
             raise Unsupported(f"{name} with values of several kinds")
 
     # -- constants and operators --------------------------------------------------------------------------------------

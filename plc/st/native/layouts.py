@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from fieldtwin.plc.blocks import BLOCKS
-from fieldtwin.plc.st.runtime.lines import MEMBER, is_line
+from fieldtwin.plc.st.runtime.lines import MEMBER, is_line, line_of
 
 MAX_ELEMENTS = 4096
 """The largest number of elements of an array that is read and written in machine code, because each execution reads all."""
@@ -22,6 +22,8 @@ NONE = "INT64_MIN"
 """The number that stands for None: a timer that does not run has no start time."""
 _GLOBAL = ("bool", "int", "float", "block")
 """The kinds of global variables that have a place in a structure."""
+SIMPLE = ("bool", "int", "float")
+"""The kinds of variables without parts."""
 STANDARD = "T_"
 """The beginning of the names of the structures of standard function blocks."""
 
@@ -32,7 +34,8 @@ class Unsupported(Exception):
 
 @dataclass(slots=True)
 class Field:
-    """A variable in a structure. `kind` is bool, int, float, optional (an int or None), block, array, line or lines.
+    """A variable in a structure. `kind` is bool, int, float, optional (an int or None), block (also a structure of the source),
+    array, blocks (an array of them), line or lines.
 
     `of` is the structure of a block, or the kind of the elements of an array; `size` their number. A `line` is the record of
     the last assignment of a variable, `lines` those of the elements of an array; `values` is the largest number of values of
@@ -58,8 +61,6 @@ class Layout:
     fields: dict[str, Field] = field(default_factory=dict)
     methods: dict[str, ast.FunctionDef] = field(default_factory=dict)
     constants: Mapping[str, object] = field(default_factory=dict)
-    whole: bool = False
-    """Whether all attributes are fields, so that the structure is all of the state of an instance."""
 
 
 class Layouts:
@@ -82,80 +83,74 @@ class Layouts:
             self._waiting.discard(name)
         return self._made[name]
 
-    def block(self, name: str) -> Layout:
-        """Return the structure of a function block, which must have no other state. Raises `Unsupported`."""
-        found = self.of(name)
-        if not found.whole:
-            raise Unsupported(f"function block {name.partition('_')[2]}")
-        return found
-
     def _of_class(self, name: str) -> Layout:
         node = self._classes.get(name)
         if node is None:
             raise Unsupported(f"class {name}")
         made = Layout(name)
         made.methods = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
-        made.whole = self._is_plain(node)
         for target, value in _assigned(made.methods.get("__init__")):
             found = self._field(target, value)
             if found is not None:
                 made.fields[target] = found
-            elif not is_line(target):
-                made.whole = False
+                if target.startswith(MEMBER) and found.kind in SIMPLE:
+                    made.fields[line_of(target)] = Field(line_of(target), "line")
         for target in _lines_in(node, "self"):
             made.fields.setdefault(target, Field(target, "line"))
         return made
 
-    def _is_plain(self, node: ast.ClassDef) -> bool:
-        """Return whether the class has only values and a body, and no base class except that of its records."""
-        own = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
-        in_outs = [
-            each for each in node.body if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "in_outs"
-        ]
-        bases = [ast.unparse(base) for base in node.bases]
-        return (
-            own <= {"__init__", "execute", "copy"}
-            and all(isinstance(each.value, ast.Tuple) and not each.value.elts for each in in_outs)
-            and all(base.startswith("L_") for base in bases)
-        )
-
     def _field(self, name: str, value: ast.expr) -> Field | None:
-        if name.startswith(MEMBER):
-            return None
         if is_line(name):
             if ast.unparse(value) == "_v.ElementLines()":
                 return Field(name, "lines")
             return Field(name, "line")
-        if isinstance(value, ast.Call) and ast.unparse(value.func) == "_v.with_members":
-            value = value.args[0]
         kind = _kind(value)
         if kind:
             return Field(name, kind)
-        if isinstance(value, ast.Call) and not value.args and not value.keywords:
-            of = self._class_of(value.func)
-            return Field(name, "block", of) if of else None
-        elements = _elements(value)
-        if elements is not None and 0 < elements[1] <= MAX_ELEMENTS:
-            return Field(name, "array", *elements)
-        return None
+        of = self._created(value)
+        if of:
+            return Field(name, "block", of)
+        return self._array(name, value)
+
+    def _array(self, name: str, value: ast.expr) -> Field | None:
+        """Return the field of a new array of one dimension; None for other expressions."""
+        if isinstance(value, ast.ListComp) and isinstance(value.generators[0].iter, ast.Call):
+            counts, kinds = value.generators[0].iter.args, {_kind(value.elt) or self._created(value.elt)}
+            size = counts[0].value if len(counts) == 1 and isinstance(counts[0], ast.Constant) else 0
+        elif isinstance(value, ast.List):
+            size, kinds = len(value.elts), {_kind(each) or self._created(each) for each in value.elts}
+        else:
+            return None
+        kind = kinds.pop() if len(kinds) == 1 else ""
+        if not kind or not isinstance(size, int) or not 0 < size <= MAX_ELEMENTS:
+            return None
+        return Field(name, "array" if kind in SIMPLE else "blocks", kind, size)
+
+    def _created(self, value: ast.expr) -> str:
+        """Return the structure of the object that an expression creates; empty if it cannot be one."""
+        if isinstance(value, ast.Call) and ast.unparse(value.func) == "_v.with_members":
+            value = value.args[0]
+        return (
+            self._class_of(value.func) if isinstance(value, ast.Call) and not value.args and not value.keywords else ""
+        )
 
     def _class_of(self, function: ast.expr) -> str:
         """Return the structure of the class that a call creates; empty if it cannot be one."""
         if isinstance(function, ast.Subscript) and isinstance(function.slice, ast.Constant):
             name = STANDARD + str(function.slice.value)
-        elif isinstance(function, ast.Name) and function.id.startswith("B_"):
+        elif isinstance(function, ast.Name) and function.id.startswith(("B_", "S_")):
             name = function.id
         else:
             return ""
         try:
-            return self.block(name).name
+            return self.of(name).name
         except Unsupported:
             return ""
 
     def _standard(self, name: str) -> Layout:
         """Return the structure of a standard function block, from an instance and the source of its class."""
         block = BLOCKS[name.removeprefix(STANDARD)]
-        made, new = Layout(name, whole=True), block()
+        made, new = Layout(name), block()
         constants = {}
         for base in reversed(block.__mro__):
             constants.update({key: value for key, value in vars(base).items() if isinstance(value, int)})
@@ -206,16 +201,3 @@ def _kind(value: ast.expr) -> str:
     if isinstance(value, ast.Constant) and type(value.value) in (bool, int, float):
         return type(value.value).__name__
     return ""
-
-
-def _elements(value: ast.expr) -> tuple[str, int] | None:
-    """Return kind and number of the elements of a new array of one dimension; None for other expressions."""
-    if isinstance(value, ast.ListComp):
-        of, kind = value.generators[0].iter, _kind(value.elt)
-        if kind and isinstance(of, ast.Call) and len(of.args) == 1 and isinstance(of.args[0], ast.Constant):
-            return kind, int(str(of.args[0].value))
-    if isinstance(value, ast.List):
-        kinds = {_kind(each) for each in value.elts}
-        if len(kinds) == 1 and (kind := kinds.pop()):
-            return kind, len(value.elts)
-    return None

@@ -14,7 +14,7 @@ MODULE = "fieldtwin_machine_code"
 _KINDS = {"bool": "BOOL", "int": "INT", "float": "FLOAT", "optional": "OPTIONAL"}
 _CONTEXT = Layout("Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")})
 _CONTEXT.fields["first_scan"] = Field("first_scan", "bool")
-_ORDER = ("bool", "int", "float", "optional", "array", "block", "line", "lines")
+_ORDER = ("bool", "int", "float", "optional", "array", "block", "blocks", "line", "lines")
 """The order of the variables in a structure: a loop over variables of one kind is faster."""
 _FIRST = 2
 """The number of the first class after the context and the global variables."""
@@ -38,7 +38,7 @@ class ModuleText:
         self._globals = translation.layouts.globals
         for layout in (*programs.values(), self._globals):
             for one in layout.fields.values():
-                if one.kind == "block":
+                if one.kind in ("block", "blocks"):
                     translation.structure(one.of)
         self.classes = [*translation.structures.values(), *programs.values()]
         """The classes whose objects are read and written, in the order of `bind`."""
@@ -52,6 +52,8 @@ class ModuleText:
     def _objects_of(self, one: Field) -> int:
         if one.kind == "block":
             return self._objects[one.of]
+        if one.kind == "blocks":
+            return one.size * self._objects[one.of]
         return one.size if one.kind == "array" else 0 if one.kind in ("line", "lines") else 1
 
     def text(self) -> str:
@@ -90,7 +92,7 @@ class ModuleText:
     def _entry(self, context: bool, structure: str, one: Field, objects: int) -> str:
         member = one.name if context else one.c_name
         kind, of, block = _KINDS.get(one.kind, one.kind.upper()), "0", "0"
-        if one.kind == "block":
+        if one.kind in ("block", "blocks"):
             block = str(self._numbers[one.of])
         elif one.kind == "array":
             of = _KINDS[one.of]
@@ -100,10 +102,13 @@ class ModuleText:
 
     def _tables(self) -> str:
         layouts = [_CONTEXT, self._globals, *self.classes]
-        rows = "".join(
-            f"  {{{_values(one)}, {len(one.fields)}, E_{one.name}, N_{one.name}, O_{one.name}}},\n" for one in layouts
-        )
+        rows = "".join(f"  {{{self._row(one)}}},\n" for one in layouts)
         return f"static const struct Class TABLE[] = {{\n{rows}}};\nenum {{ COUNT = {len(layouts)} }};\n"
+
+    def _row(self, of: Layout) -> str:
+        size = f"sizeof(struct {'Context' if of is _CONTEXT else f'S_{of.name}'})"
+        tables = f"E_{of.name}, N_{of.name}, O_{of.name}"
+        return f"{_values(of)}, {len(of.fields)}, {self._objects[of.name]}, {size}, {tables}"
 
     def _run(self, run: Run) -> str:
         name, layout = run.c_name, run.layout
@@ -215,6 +220,8 @@ def _values(layout: Layout) -> int:
 def _member(one: Field) -> str:
     if one.kind == "block":
         return f"struct S_{one.of} {one.c_name}"
+    if one.kind == "blocks":
+        return f"struct S_{one.of} {one.c_name}[{one.size}]"
     if one.kind == "array":
         return f"{c_type(one.of)} {one.c_name}[{one.size}]"
     if one.kind == "line":

@@ -39,7 +39,7 @@ class Prepared:
     kept: dict[str, list[Kept]] = field(default_factory=dict)
     """By class of a PROGRAM: its statements that stay Python."""
     statements: dict[str, int] = field(default_factory=dict)
-    """By class of a PROGRAM: the number of its statements, each with those inside it."""
+    """By class of a PROGRAM: the number of its lines with statements, each with the statements inside it."""
     published: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """By class of a PROGRAM that is machine code as a whole: its attributes in the order of the C structure."""
 
@@ -53,7 +53,9 @@ def prepare(body: list[ast.stmt]) -> Prepared:
     statements: dict[str, int] = {}
     for node in body:
         if isinstance(node, ast.ClassDef) and node.name.startswith("P_"):
-            statements[node.name] = len(list(_inseparable(layouts.of(node.name).methods["execute"].body)))
+            statements[node.name] = len(
+                {group[0].lineno for group in _inseparable(layouts.of(node.name).methods["execute"].body)}
+            )
             kept[node.name] = list(_translate(node, layouts.of(node.name), translation, runs))
     if not runs:
         return Prepared("", (), (), 0, kept, statements)
@@ -69,9 +71,12 @@ def _translate(node: ast.ClassDef, layout: Layout, translation: Translation, run
     """Replace the statements of a PROGRAM that can be translated by calls of machine code. Yield the others."""
     execute = layout.methods["execute"]
     made: list[ast.stmt] = []
+    lines: set[int] = set()
     for group, is_native, reason in _groups(execute.body, layout, translation):
         if not is_native:
-            yield Kept(group[0].lineno, _written(reason))
+            if group[0].lineno not in lines:  # one assignment of a structure is several Python statements
+                yield Kept(group[0].lineno, _written(reason))
+            lines.add(group[0].lineno)
             made += group
             continue
         c_name = f"r_{len(runs)}"

@@ -10,7 +10,7 @@
 #error "the compiler computes REAL with more digits than Python"
 #endif
 
-enum { BOOL, INT, FLOAT, OPTIONAL, BLOCK, ARRAY, LINE, RECORD, LINES };
+enum { BOOL, INT, FLOAT, OPTIONAL, BLOCK, BLOCKS, ARRAY, LINE, RECORD, LINES };
 enum { MAX_VALUES = 8 };
 
 struct Context { int64_t now_ns, left, scan; char first_scan; };
@@ -20,8 +20,9 @@ struct Record { int32_t code, count; PyObject *maker; int64_t key; int64_t value
 /* A variable: `kind` and `of`, the kind of its elements; their number; its class, if it is a block; the number of its first Python
    object; its place in the structure. Tables are read in each scan, so entries are small. */
 struct Entry { uint8_t kind, of; uint16_t block; uint32_t size, object, offset; };
-/* The first `values` entries have values; the others are records. */
-struct Class { int values, count; const struct Entry *entries; const char *const *names; Py_ssize_t *slots; };
+/* The first `values` entries have values; the others are records. `objects` is the number of Python objects that the values are, and
+   `size` that of the structure. */
+struct Class { int values, count, objects; size_t size; const struct Entry *entries; const char *const *names; Py_ssize_t *slots; };
 /* The Python classes of one resource. */
 struct Bound { PyTypeObject **types; };
 /* The head of the records of the elements of an array. `at` has the number of the record of each element, from 1. */
@@ -42,6 +43,9 @@ static PyObject **CONSTANTS;
 #define FAST __attribute__((optimize("O2")))
 #endif
 #define WITHIN(s, e) ((struct Values){(s)->now + (e)->offset, (s)->old + (e)->offset, (s)->objects + (e)->object})
+#define ELEMENT(s, e, at) ((struct Values){ \
+    (s)->now + (e)->offset + (at) * CLASSES[(e)->block].size, (s)->old + (e)->offset + (at) * CLASSES[(e)->block].size, \
+    (s)->objects + (e)->object + (at) * CLASSES[(e)->block].objects})
 #define CHECKED(op, a, b) ({ int64_t r_; if (__builtin_##op##_overflow((int64_t)(a), (int64_t)(b), &r_)) goto bail; r_; })
 #define WITH(function, ...) ({ int bad_ = 0; int64_t value_ = function(&bad_, __VA_ARGS__); if (bad_) goto bail; value_; })
 
@@ -169,6 +173,11 @@ FAST static int load(const struct Bound *b, int of, const int *use, int n, PyObj
       case BLOCK:
         if (load(b, e->block, NULL, CLASSES[e->block].values, v, &WITHIN(s, e))) return 1;
         break;
+      case BLOCKS:
+        if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != e->size) return 1;
+        for (uint32_t at = 0; at < e->size; at++)
+          if (load(b, e->block, NULL, CLASSES[e->block].values, PyList_GET_ITEM(v, at), &ELEMENT(s, e, at))) return 1;
+        break;
       case ARRAY:
         if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != e->size) return 1;
         for (int at = 0; at < e->size; at++)
@@ -241,6 +250,10 @@ FAST static int store(int of, const int *use, int n, PyObject *o, const struct V
     switch (e->kind) {
       case BLOCK:
         if (store(e->block, NULL, CLASSES[e->block].count, *slot, &WITHIN(s, e), scan, NULL)) return -1;
+        break;
+      case BLOCKS:
+        for (uint32_t at = 0; at < e->size; at++)
+          if (store(e->block, NULL, CLASSES[e->block].count, PyList_GET_ITEM(*slot, at), &ELEMENT(s, e, at), scan, NULL)) return -1;
         break;
       case ARRAY:
         for (int at = 0; at < e->size; at++)

@@ -54,9 +54,9 @@ class Translation:
         """Note that the structure of a block is used, and those of the blocks in it."""
         if name in self.structures:
             return
-        layout = self.layouts.block(name)
+        layout = self.layouts.of(name)
         for one in layout.fields.values():
-            if one.kind == "block":
+            if one.kind in ("block", "blocks"):
                 self.structure(one.of)
         self.structures[name] = layout
 
@@ -64,7 +64,7 @@ class Translation:
         """Return the C function that executes a block. Raises `Unsupported`."""
         if name not in self.blocks:
             self.structure(name)
-            layout = self.layouts.block(name)
+            layout = self.layouts.of(name)
             method = layout.methods.get("execute")
             if method is None:
                 raise Unsupported(f"a call of {name}")
@@ -145,6 +145,7 @@ class _Body:
         kinds = self.expressions.locals
         made = "".join(f"{c_type(kind)} {name} = 0;\n" for name, kind in kinds.items() if name not in given)
         ranges = sorted(self.expressions.ranges)
+        made += "".join(f"struct S_{of} *{name} = NULL;\n" for name, of in self.expressions.objects.items())
         return made + "".join(f"int64_t {one}_start = 0, {one}_step = 1, {one}_count = 0;\n" for one in ranges)
 
     def _statement(self, node: ast.stmt) -> str:
@@ -171,6 +172,8 @@ class _Body:
             text = "".join(f"{c_type(v.kind)} {name} = {v.text};\n" for name, v in zip(names, values, strict=True))
             pairs = zip(target.elts, names, values, strict=True)
             return f"{{ {text}{''.join(self._set(one, Value(name, v.kind)) for one, name, v in pairs)} }}\n"
+        if isinstance(target, ast.Name) and (named := self.expressions.named(target.id, value)):
+            return named
         if isinstance(target, ast.Attribute) and is_line(target.attr):
             return self._line(target, value)
         if isinstance(target, ast.Subscript) and isinstance(target.value, ast.Attribute) and is_line(target.value.attr):
@@ -214,7 +217,8 @@ class _Body:
     def _element_line(self, target: ast.Subscript, value: ast.expr) -> str:
         assert isinstance(target.value, ast.Attribute)
         text, field = self.expressions.place(target.value)
-        array = self._layout.fields.get(target.value.attr.removeprefix("line_")) if self._layout is not None else None
+        _, layout = self.expressions.object(target.value.value)
+        array = layout.fields.get(target.value.attr.removeprefix("line_"))
         if field.kind != "lines" or array is None or array.kind != "array":
             raise Unsupported(ast.unparse(target))
         field.size = array.size
@@ -331,17 +335,13 @@ class _Body:
             raise Unsupported(ast.unparse(node))
         if ast.unparse(call.func) == "_c.too_long":
             return "goto bail;\n"
-        if (
-            isinstance(call.func, ast.Attribute)
-            and call.func.attr == "execute"
-            and isinstance(call.func.value, ast.Attribute)
-        ):
-            text, field = self.expressions.place(call.func.value)
-            if field.kind != "block":
-                raise Unsupported(ast.unparse(call))
-            function = self._unit.block(field.of)
+        if isinstance(call.func, ast.Attribute) and call.func.attr == "execute":
+            text, layout = self.expressions.object(call.func.value)
+            function = self._unit.block(layout.name)
             arguments = "".join(f", {self.expressions.of_kind(each, 'int')}" for each in call.args)
             return f"if ({function}(&{text}, c, g{arguments})) goto bail;\n"
+        if ast.unparse(call.func) in ("_v.put", "_v.fill"):
+            raise Unsupported("the assignment of a structure or array as a whole")
         raise Unsupported(f"the call {ast.unparse(call)}")
 
     def _call(self, name: str, arguments: list[Value]) -> Value:

@@ -25,7 +25,10 @@ from fieldtwin.plc.st.resource import line_of_error
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 BLOCKS = """
-TYPE Mode : (Idle, Run, Stop); Percent : INT(0..100); END_TYPE
+TYPE Mode : (Idle, Run, Stop); Percent : INT(0..100);
+  Point : STRUCT x, y : REAL; n : INT := 3; END_STRUCT;
+  Tank : STRUCT level : REAL; open : BOOL; at : Point; hist : ARRAY[1..4] OF INT; END_STRUCT;
+  Named : STRUCT n : INT; name : STRING[10]; END_STRUCT; END_TYPE
 VAR_GLOBAL total : DINT; shared : TON; END_VAR
 FUNCTION Clamp : REAL
 VAR_INPUT x, low, high : REAL; END_VAR
@@ -34,6 +37,13 @@ VAR y : REAL; END_VAR
   IF y < low THEN Clamp := low; RETURN; END_IF
   Clamp := MIN(y, high);
 END_FUNCTION
+FUNCTION_BLOCK Valve
+VAR_INPUT go : BOOL; END_VAR
+VAR_OUTPUT pos : Point; n : INT; END_VAR
+VAR own : Tank; END_VAR
+  IF go THEN own.level := own.level + 1.5; own.at.n := own.at.n + 1; END_IF
+  own.hist[2] := own.at.n; pos.x := own.level; n := own.hist[2];
+END_FUNCTION_BLOCK
 FUNCTION Twice : DINT
 VAR_EXTERNAL total : DINT; END_VAR
   Twice := total * 2;
@@ -85,6 +95,13 @@ WHOLE = {
         "own : DINT; meter : Meter;",
         "meter(by := n); own := Twice();",
     ),
+    "structures": (
+        "go : BOOL; n : INT;",
+        "a : Tank; p : Point; v : Valve; i : INT; many : ARRAY[1..3] OF Point; valves : ARRAY[0..1] OF Valve; k : INT;",
+        "a.level := a.level + 0.5; a.at.x := a.level * 2.0; a.open := go; FOR i := 1 TO 4 DO a.hist[i] := i + n; END_FOR\n"
+        "v(go := go); p.n := v.n; p.x := v.pos.x; many[2].x := p.x; many[1 + ABS(n MOD 3)].n := n; k := n MOD 2;\n"
+        "valves[ABS(k)](go := NOT go); k := valves[1].n;",
+    ),
     "RETURN": ("go : BOOL; n : INT;", "k : INT;", "IF n > 3 THEN k := n; RETURN; END_IF; k := k - 1;"),
     "subrange": ("n : INT;", "s : Percent; w : WORD;", "s := ABS(n MOD 90); w.3 := n > 2; w := SHL(w, 1) OR 1;"),
 }
@@ -96,6 +113,8 @@ PARTS = {
         "k := k + n; s := CONCAT('a', INT_TO_STRING(k)); k := k + LEN(s);",
     ),
     "grid": ("n : INT;", "g : ARRAY[1..2, 1..2] OF INT; k : INT;", "k := n; g[1, 2] := k; k := k + g[1, 2];"),
+    "a structure with a text": ("n : INT;", "s : Named; k : INT;", "s.n := s.n + n; s.name := 'a'; k := s.n;"),
+    "a copied structure": ("n : INT;", "p, q : Point; k : INT;", "p.n := n; q := p; k := q.n;"),
     "64 bits": ("n : INT;", "u : ULINT := 18446744073709551615; k : INT;", "k := n; u := u - 1; k := k + 1;"),
 }
 """By what stays Python: PROGRAMs that are translated in part."""

@@ -12,9 +12,10 @@ from fieldtwin.gateway.core.errors import NotAllowed, UsageError
 from fieldtwin.twin.plant.instance import runtime_root
 from fieldtwin.twin.site.data_files import find, template_of
 from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.template.detect import MANIFEST, is_template
 from fieldtwin.twin.template.pack import OUR_PROGRAMS
-from fieldtwin.twin.template.package import FolderPackage, Package, is_template, names_below, open_package, unpack
-from fieldtwin.twin.template.template import MANIFEST, MAX_MANIFEST_BYTES, is_code
+from fieldtwin.twin.template.package import FolderPackage, Package, names_below, open_package, unpack
+from fieldtwin.twin.template.template import MAX_MANIFEST_BYTES, is_code
 
 
 @dataclass(frozen=True, slots=True)

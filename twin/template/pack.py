@@ -25,9 +25,9 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.system import System
+from fieldtwin.twin.template.detect import MANIFEST
 from fieldtwin.twin.template.software import modules_hash, wheel_hash
 from fieldtwin.twin.template.template import (
-    MANIFEST,
     DocumentKind,
     Kind,
     Manifest,

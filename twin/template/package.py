@@ -22,8 +22,8 @@ from typing import IO, NamedTuple
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.files.input_file import open_input
+from fieldtwin.twin.template.detect import MANIFEST
 from fieldtwin.twin.template.template import (
-    MANIFEST,
     MAX_FILE_BYTES,
     MAX_FILES,
     MAX_MANIFEST_BYTES,
@@ -139,17 +139,6 @@ def open_package(path: Path, *, edited: bool = False) -> Iterator[Package]:
             yield package
     else:
         raise UsageError("no template", expected="a zip or a folder", got=str(path))
-
-
-def is_template(path: Path) -> bool:
-    """Return whether `path` is a folder with a manifest, or a file with the signature of a zip."""
-    if path.is_dir():
-        return (path / MANIFEST).is_file()
-    try:
-        with open_input(path) as file:
-            return file.read(4) == b"PK\x03\x04"
-    except (OSError, FileInvalid):
-        return False
 
 
 class FolderPackage(Package):

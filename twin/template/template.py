@@ -23,9 +23,9 @@ from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.plant.declared import declared_variables
 from fieldtwin.twin.plant.physical import EmbeddedControlSystem
 from fieldtwin.twin.site.system import System
+from fieldtwin.twin.template.detect import MANIFEST
 
 VERSION = 1
-MANIFEST = "template.json"
 MAX_FILES = 10_000
 MAX_PATH = 240
 MAX_NAME = 120

@@ -204,7 +204,7 @@ def _number_or_text(text: str) -> float | str:
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
     """Return the kind of `what` and its file: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
-    from fieldtwin.twin.template.package import is_template
+    from fieldtwin.twin.template.detect import is_template
 
     direct = Path(what)
     if is_template(direct):

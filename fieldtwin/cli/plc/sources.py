@@ -38,7 +38,7 @@ def source_file(source: str, dialect: str | None, libraries: tuple[Path, ...]) -
 
     Raises `UsageError` for a system with a dialect or libraries, which its file states.
     """
-    from fieldtwin.twin.template.package import is_template
+    from fieldtwin.twin.template.detect import is_template
 
     path = Path(source)
     if not is_template(path) and (path.is_dir() or (path.exists() and path.suffix.lower() not in _OF_SYSTEMS)):

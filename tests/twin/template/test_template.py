@@ -17,10 +17,10 @@ from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.run.template import system_file
 from fieldtwin.twin.template import software
 from fieldtwin.twin.template.check import differences, examine, software_difference
+from fieldtwin.twin.template.detect import MANIFEST
 from fieldtwin.twin.template.pack import TemplateExtras
 from fieldtwin.twin.template.package import Content, FolderPackage, ZipPackage, open_package
 from fieldtwin.twin.template.software import modules_hash, wheel_hash
-from fieldtwin.twin.template.template import MANIFEST
 
 
 @pytest.fixture
@@ -248,7 +248,7 @@ def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Pa
     with zipfile.ZipFile(wheel, "w") as archive:
         for parent, _, files in os.walk(CHECKOUT / "fieldtwin", followlinks=True):
             for path in (Path(parent, file) for file in files):
-                if path.suffix != ".pyc":
+                if path.parent.name != "__pycache__":
                     archive.write(path, path.relative_to(CHECKOUT).as_posix())
     packed(dam, tmp_path / "T", TemplateExtras(wheel=wheel))
     manifest = FolderPackage(tmp_path / "T").manifest

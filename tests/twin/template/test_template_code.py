@@ -14,9 +14,9 @@ from fieldtwin.run.template import ForeignParts, system_file
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.check import examine
+from fieldtwin.twin.template.detect import MANIFEST
 from fieldtwin.twin.template.package import FolderPackage
 from fieldtwin.twin.template.reach import reach
-from fieldtwin.twin.template.template import MANIFEST
 
 
 @pytest.fixture

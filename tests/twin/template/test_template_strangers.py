@@ -21,8 +21,9 @@ from fieldtwin.run.template import system_file
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.template.check import examine
+from fieldtwin.twin.template.detect import MANIFEST
 from fieldtwin.twin.template.package import FolderPackage, open_package
-from fieldtwin.twin.template.template import MANIFEST, check_path, parse_manifest
+from fieldtwin.twin.template.template import check_path, parse_manifest
 
 
 @pytest.fixture

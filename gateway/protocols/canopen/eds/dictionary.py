@@ -13,9 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 from types import MappingProxyType
-
-from canopen.objectdictionary import ODArray, ODRecord, ODVariable
-from canopen.objectdictionary.eds import import_eds
+from typing import TYPE_CHECKING
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.input_file import read_input, reading
@@ -25,6 +23,10 @@ from fieldtwin.gateway.protocols.canopen.cob_id import check_node
 from fieldtwin.gateway.protocols.canopen.eds.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.eds.text import EdsText, Section, decode_eds, read_eds_text
 from fieldtwin.gateway.protocols.canopen.eds.values import read_limit, read_value
+
+# The package imports python-can as well, which takes 50 ms of CPU time. So it is imported where a dictionary is parsed.
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
 """A larger EDS or DCF file is treated as a mistake; the largest known one has 2 MB."""
@@ -131,6 +133,8 @@ def parse_dictionary(
     $NODEID is replaced by `node_id`, or by the node ID of the DCF if `node_id` is None and the DCF states one. Files that the
     text names are read from `folder`, or not at all if `folder` is None.
     """
+    from canopen.objectdictionary.eds import import_eds
+
     if node_id is not None:
         check_node(node_id)
     eds = read_eds_text(text, path)
@@ -159,6 +163,8 @@ def _entries(
     objects: Iterable[ODVariable | ODArray | ODRecord], eds: EdsText, values: _Values
 ) -> dict[tuple[int, int], DictionaryEntry]:
     """Return every variable of the package's dictionary as an entry, in order of index and subindex."""
+    from canopen.objectdictionary import ODArray, ODVariable
+
     entries: dict[tuple[int, int], DictionaryEntry] = {}
     for item in objects:
         if item.index in _TYPE_AREA:

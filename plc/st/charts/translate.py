@@ -13,9 +13,10 @@ from typing import Any
 
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
 from fieldtwin.plc.st.charts.check import TIMED, charts_of, check_charts, indicators
+from fieldtwin.plc.st.classes.readable import READABLE
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse
-from fieldtwin.plc.st.syntax.walk import with_parts
+from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 
 _HIDDEN = "hidden_"
 STEP = "0step"
@@ -23,9 +24,14 @@ STEP = "0step"
 _BLOCKS = """
 FUNCTION_BLOCK hidden_chart VAR_INPUT hidden_started : BOOL; END_VAR END_FUNCTION_BLOCK
 FUNCTION_BLOCK hidden_step
-VAR_INPUT hidden_lost, hidden_gained : BOOL; END_VAR
+VAR_INPUT hidden_lost, hidden_gained, hidden_time_only : BOOL; END_VAR
 VAR_OUTPUT X : BOOL; T : TIME; hidden_rise, hidden_fall : BOOL; END_VAR
 VAR hidden_now : BOOL; hidden_timer : TON; END_VAR
+  IF hidden_time_only THEN
+    hidden_timer(IN := X, PT := T#100000d);
+    IF X THEN T := hidden_timer.ET; END_IF
+    RETURN;
+  END_IF
   hidden_now := (X AND NOT hidden_lost) OR hidden_gained;
   hidden_rise := hidden_now AND NOT X;
   hidden_fall := X AND NOT hidden_now;
@@ -89,7 +95,8 @@ def _without_charts(pou: t.Pou, shared: frozenset[str]) -> t.Pou:
     """Return a POU with its charts as statements. `shared` are the names of global variables, in lower case."""
     parts = {name: _Translation(pou, name, chart, shared) for name, chart in charts_of(pou).items()}
     variables = tuple(one for part in parts.values() for one in part.variables())
-    block = t.VarBlock(pou.pos, "VAR", frozenset(), variables)
+    access = frozenset({"PUBLIC"}) if READABLE in pou.modifiers else frozenset()
+    block = t.VarBlock(pou.pos, "VAR", access, variables)
     actions = tuple(
         replace(action, body=parts[action.name].body(), chart=None) if action.name in parts else action
         for action in pou.actions
@@ -134,6 +141,7 @@ class _Translation:
             for step in self._chart.steps
             for flag in ("0lost", "0gained")
         ]
+        statements += self._times()
         statements += self._chart.before
         transitions = sorted(
             self._chart.transitions,
@@ -149,6 +157,20 @@ class _Translation:
         statements += [self._execution(name) for name in self._controls]
         statements += self._indicators()
         return tuple(statements)
+
+    def _times(self) -> list[t.Statement]:
+        """Return statements that set the T of each step, on which a condition may depend, to the present time."""
+        conditions = (self._chart.before, tuple((one.condition, one.body) for one in self._chart.transitions))
+        used = {node.name.lower() for node in nodes(conditions) if isinstance(node, t.Ref) and _reads_time(node)}
+        statements: list[t.Statement] = []
+        for step in self._chart.steps:
+            if step.name.lower() in used:
+                statements += [
+                    _assign(step.pos, step.name, "0time_only", _true(step.pos)),
+                    _call(step.pos, step.name),
+                    _assign(step.pos, step.name, "0time_only", _false(step.pos)),
+                ]
+        return statements
 
     def _evolution(self, transition: t.Transition) -> t.Statement:
         """Return the clearing of a transition. An alternative branch of higher priority has already taken the steps."""
@@ -202,6 +224,12 @@ class _Translation:
 def control_of(name: str) -> str:
     """Return the name of the block that controls an action."""
     return f"0control_{name}"
+
+
+def _reads_time(ref: t.Ref) -> bool:
+    """Return whether a reference may be the T of a step."""
+    first = ref.selectors[0] if ref.selectors else None
+    return isinstance(first, t.Member) and first.name.lower() == "t"
 
 
 def _declared(pos: t.Pos, name: str, kind: str) -> t.VarDecl:

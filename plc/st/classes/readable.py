@@ -6,11 +6,15 @@ from dataclasses import replace
 
 from fieldtwin.plc.st.syntax import tree as t
 
+READABLE = "READABLE"
+"""A modifier of a POU whose steps can be read from outside. The steps become variables later (`fieldtwin.plc.st.charts`)."""
 _STATED = {"PUBLIC", "PROTECTED", "PRIVATE", "INTERNAL", "CONSTANT"}
 
 
 def readable(pou: t.Pou) -> t.Pou:
-    """Return a POU; if it is a function block or class, with public local variables, except those that state their access."""
+    """Return a POU; if it is a function block or class, with public steps and local variables, except variables that
+    state their access.
+    """
     if pou.kind not in ("FUNCTION_BLOCK", "CLASS"):
         return pou
     blocks = (
@@ -19,4 +23,4 @@ def readable(pou: t.Pou) -> t.Pou:
         else block
         for block in pou.blocks
     )
-    return replace(pou, blocks=tuple(blocks))
+    return replace(pou, blocks=tuple(blocks), modifiers=pou.modifiers | {READABLE})

@@ -1,7 +1,8 @@
 """PROGRAMs as function blocks, so that a test can declare, call and read them like any other block.
 
 In a test a program has no process image. So its inputs are set by the test, and IS_GOOD(x) reads the additional input
-``x_IS_GOOD``, which is TRUE at first. Its local variables can be read, as outputs are, and so can those of function blocks.
+``x_IS_GOOD``, which is TRUE at first. Its local variables can be read, as outputs are, and so can those of function blocks
+and the steps of charts.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fieldtwin.plc.st.classes.readable import readable
+from fieldtwin.plc.st.classes.readable import READABLE, readable
 from fieldtwin.plc.st.compiler.configurations.called import AS_BLOCK
 from fieldtwin.plc.st.compiler.configurations.located import KINDS
 from fieldtwin.plc.st.syntax import tree as t
@@ -50,7 +51,7 @@ def _block(program: t.Pou) -> t.Pou:
             t.VarBlock(program.pos, "VAR_INPUT", frozenset(), tuple(_quality(inputs[name]) for name in asked))
         )
     changed: t.Pou = _reading(program, set(asked))
-    modifiers = changed.modifiers | {AS_BLOCK}
+    modifiers = changed.modifiers | {AS_BLOCK, READABLE}
     return replace(changed, kind="FUNCTION_BLOCK", blocks=tuple(blocks), modifiers=modifiers)
 
 

@@ -79,8 +79,8 @@ def test_a_step_has_its_state_and_the_time_since_its_activation() -> None:
         seen.append((internal(made, "A.X"), internal(made, "B.X"), internal(made, "A.T")))
     ms = 1_000_000
     assert seen == [
-        (True, False, 0), (True, False, 10 * ms), (True, False, 20 * ms), (False, True, 20 * ms),
-        (False, True, 20 * ms), (True, False, 0), (True, False, 10 * ms),
+        (True, False, 0), (True, False, 10 * ms), (False, True, 20 * ms), (True, False, 0),
+        (True, False, 10 * ms), (False, True, 20 * ms), (True, False, 0),
     ]  # fmt: skip
     assert list(made.internal_names()) == ["A.X", "A.T", "B.X", "B.T"]
 

@@ -254,3 +254,24 @@ def test_a_dialect_applies_to_tests_and_programs(tmp_path: Path) -> None:
     beside = "{attribute 'qualified_only'} VAR_GLOBAL limit : INT := 3; END_VAR"
     (result,) = ran(tmp_path, "TEST 'x' ASSERT_EQ(pump.limit, 3); END_TEST", beside, dialect="codesys")
     assert not result.failed
+
+
+@pytest.mark.parametrize("kind", ["PROGRAM", "FUNCTION_BLOCK"])
+def test_the_steps_of_a_chart_can_be_read(tmp_path: Path, kind: str) -> None:
+    chart = f"""{kind} Sequence
+    INITIAL_STEP Idle: END_STEP
+    STEP Busy: END_STEP
+    TRANSITION FROM Idle TO Busy := Idle.T >= T#2s; END_TRANSITION
+    TRANSITION FROM Busy TO Idle := FALSE; END_TRANSITION
+    END_{kind}
+    """
+    (result,) = ran(
+        tmp_path,
+        """TEST 'steps' VAR s : Sequence; END_VAR
+        s(); ASSERT_TRUE(s.Idle.X);
+        ADVANCE_TIME(T#2s); s();
+        ASSERT_FALSE(s.Idle.X); ASSERT_EQ(s.Idle.T, T#2s); ASSERT_TRUE(s.Busy.X);
+        END_TEST""",
+        chart,
+    )
+    assert (result.error, result.failed) == ("", [])

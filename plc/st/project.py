@@ -29,6 +29,8 @@ _QUALIFIED_ONLY = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 """The pragma of CODESYS before a list of global variables that are used only as ``LIST.variable``."""
+_DECLARED = re.compile(r"<(?:\w+:)?(?:pou|dataType)\s[^>]*\bname\s*=\s*\"([^\"]*)\"")
+"""The names of declarations in a PLCopen XML file that cannot be read as a whole."""
 Texts = tuple[tuple[str, str], ...]
 """Files with their content."""
 MAX_SOURCE_BYTES = 8 * 1024 * 1024
@@ -43,9 +45,8 @@ def compile_source(
     With `machine_code` the programs get machine code (`fieldtwin.plc.st.native`), and a warning if that is not possible. Raises
     `FileInvalid` for the first error, with the others.
     """
-    names = frozenset(library.stem.lower() for library in libraries)
     made = _with_machine_code if machine_code else _compiled
-    return made(source_texts((path,)), source_texts(libraries), str(path), dialect, names)
+    return made(source_texts((path,)), source_texts(libraries), str(path), dialect, _names_of(libraries))
 
 
 def read_with(
@@ -60,7 +61,8 @@ def read_with(
     `changed` is applied to each file. Also return the other files as they were read. Raises `FileInvalid`.
     """
     library = _library(source_texts((*beside, *libraries)), dialect, changed)
-    return with_library(changed(_parsed(source_texts((path,)), dialect)), library), library.units
+    unit = with_library(changed(_parsed(source_texts((path,)), dialect)), library)
+    return _without_qualifiers(unit, dialect, _names_of(libraries)), library.units
 
 
 def source_texts(paths: tuple[Path, ...]) -> Texts:
@@ -84,8 +86,7 @@ def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect, names
     `names` are those of the libraries.
     """
     unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
-    if dialect.vendor:
-        unit = without_qualifiers(unit, STANDARD_NAMES | names)
+    unit = _without_qualifiers(unit, dialect, names)
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))
     return compile_unit(unit, path, tuple(dict.fromkeys(files)), dialect)
@@ -105,6 +106,15 @@ def _with_machine_code(
         return replace(unit, warnings=(*unit.warnings, warning))
 
 
+def _names_of(libraries: tuple[Path, ...]) -> frozenset[str]:
+    """Return the names of libraries, in lower case."""
+    return frozenset(library.stem.lower() for library in libraries)
+
+
+def _without_qualifiers(unit: SourceUnit, dialect: Dialect, names: frozenset[str]) -> SourceUnit:
+    return without_qualifiers(unit, STANDARD_NAMES | names) if dialect.vendor else unit
+
+
 def _library(
     texts: Texts, dialect: Dialect, changed: Callable[[SourceUnit], SourceUnit] = lambda unit: unit
 ) -> Library:
@@ -121,7 +131,7 @@ def _library(
                     library.add(changed(unit))
                     library.fail(names, error or whole)
             except FileInvalid as e:  # not even text of the language: the file's name is that of its declaration
-                library.fail((Path(path).stem,), e)
+                library.fail((Path(path).stem, *_DECLARED.findall(text)), e)
     return library
 
 

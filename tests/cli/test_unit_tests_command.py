@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fieldtwin.cli.test.test_command import command
-from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 SOURCE = """FUNCTION Clamp : INT
 VAR_INPUT x : INT; END_VAR
@@ -131,3 +131,42 @@ def test_coverage_needs_a_program_in_structured_text(project: Path) -> None:
     done = run("plc", "--coverage", "c.xml")
     assert isinstance(done.exception, UsageError)
     assert "--coverage needs programs in Structured Text" in str(done.exception)
+
+
+def test_a_folder_has_the_tests_in_the_files_of_programs(project: Path) -> None:
+    Path("plc/clamp.st").write_text(SOURCE + "TEST 'an upper limit'\n  ASSERT_EQ(Clamp(11), 10);\nEND_TEST\n")
+    Path("plc/other.st").write_text("// the TEST 'of nothing' has no END_TEST\nFUNCTION Other : INT END_FUNCTION\n")
+    done = run()
+    assert done.return_value == 0, done.output
+    assert "passed  an upper limit" in done.output
+    assert ["plc/clamp.st", "2/4", "1/3", "6,", "8"] in [line.split() for line in done.output.splitlines()]
+
+
+def test_a_folder_has_the_suites_of_tcunit_in_the_dialects_that_have_them(project: Path) -> None:
+    Path("plc/suite.st").write_text("""FUNCTION_BLOCK Suite EXTENDS TcUnit.FB_TestSuite
+        TEST('an upper limit'); AssertEquals_INT(10, Clamp(11), ''); TEST_FINISHED();
+        END_FUNCTION_BLOCK""")
+    done = run("plc", "--dialect", "twincat")
+    assert done.return_value == 0, done.output
+    assert "passed  an upper limit" in done.output
+    assert isinstance(run("plc").exception, UsageError)
+
+
+def test_a_test_uses_folders_below_its_own_and_the_names_of_libraries(project: Path) -> None:
+    Path("plc/lib").mkdir()
+    Path("plc/lib/user.st").write_text("FUNCTION Used : INT\nUsed := Tools.Twice(4);\nEND_FUNCTION")
+    Path("Tools").mkdir()
+    Path("Tools/twice.st").write_text("FUNCTION Twice : INT\nVAR_INPUT a : INT; END_VAR\nTwice := a * 2;\nEND_FUNCTION")
+    Path("plc/used.test.st").write_text("TEST 'used' ASSERT_EQ(Used() + Tools.Twice(1), 10); END_TEST")
+    done = run("plc", "--dialect", "codesys", "--library", "Tools")
+    assert done.return_value == 0, done.output
+
+
+def test_an_export_with_an_error_is_the_reason_why_its_program_cannot_be_tested(project: Path) -> None:
+    Path("plc/plant.xml").write_text("""<project><types><pous><pou name="Main" pouType="program"><interface/><body><FBD>
+        <outVariable localId="1"><position x="0" y="0"/><connectionPointIn><connection refLocalId="9"/></connectionPointIn>
+        <expression>x</expression></outVariable></FBD></body></pou></pous></types></project>""")
+    Path("plc/main.test.st").write_text("TEST 'main' VAR m : Main; END_VAR ASSERT_TRUE(TRUE); END_TEST")
+    error = run("plc/main.test.st").exception
+    assert isinstance(error, FileInvalid)
+    assert "a connection to the element 9, which does not exist" in str(error)

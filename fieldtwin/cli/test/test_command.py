@@ -38,7 +38,7 @@ from fieldtwin.cli.template_question import TemplateSearchOptions
 from fieldtwin.cli.test.plain_result import plain_result
 from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.cli.test.trace_files import trace_files
-from fieldtwin.cli.test.unit_tests import UnitTestOptions, is_unit_test, load_suites, run_suites
+from fieldtwin.cli.test.unit_tests import UnitTestOptions, is_unit_test, load_suites, run_suites, unit_tests_below
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
@@ -142,8 +142,9 @@ def command(
 ) -> int:
     """Run the scenarios and unit tests in FILES (for a folder, all in it; default: those of the working directory).
 
-    Scenarios are files *.scenario.yaml. Unit tests are TEST blocks in Structured Text, in files *.test.st; they run without
-    a system. The exit code is 0 if all passed, and 1 otherwise: a scenario that was skipped or is inconclusive has not passed.
+    Scenarios are files *.scenario.yaml. Unit tests are TEST blocks in Structured Text, in files *.test.st or in the file of a
+    program, and with --dialect codesys or twincat suites of TcUnit; they run without a system. The exit code is 0 if all
+    passed, and 1 otherwise: a scenario that was skipped or is inconclusive has not passed.
 
     \b
     --target local    gateway, PLC and emulators as processes, on ptys and
@@ -167,7 +168,7 @@ def command(
     from fieldtwin.scenarios.language.form import load_scenario
 
     target, controller = _controller(at.target, at.with_command)
-    paths, unit_tests = _found(files, with_unit_tests=target == "virtual" and not campaign.seeds)
+    paths, unit_tests = _found(files, units.dialect, with_unit_tests=target == "virtual" and not campaign.seeds)
     for option, given in (("--trace", trace), ("--progress", progress)):
         if given and len(paths) != 1:
             raise UsageError(f"{option} needs a single scenario", got=f"{len(paths)} of them")
@@ -357,7 +358,7 @@ def _check(target: str, at: TargetOptions) -> None:
         )
 
 
-def _found(files: tuple[str, ...], *, with_unit_tests: bool) -> tuple[list[Path], list[Path]]:
+def _found(files: tuple[str, ...], dialect: str, *, with_unit_tests: bool) -> tuple[list[Path], list[Path]]:
     """Return the scenarios and the files of unit tests that the user named, and those in the folders that the user named."""
     scenarios: list[Path] = []
     unit_tests: list[Path] = []
@@ -365,7 +366,7 @@ def _found(files: tuple[str, ...], *, with_unit_tests: bool) -> tuple[list[Path]
         path = Path(name)
         if path.is_dir():
             scenarios += sorted(path.rglob(f"*{SUFFIX}"))
-            unit_tests += sorted(path.rglob(f"*{TEST_SUFFIX}")) if with_unit_tests else []
+            unit_tests += unit_tests_below(path, dialect) if with_unit_tests else []
         elif not is_unit_test(path):
             scenarios.append(path)
         elif with_unit_tests:
@@ -376,7 +377,8 @@ def _found(files: tuple[str, ...], *, with_unit_tests: bool) -> tuple[list[Path]
                 got=name,
             )  # fmt: skip
     if not scenarios and not unit_tests:
-        raise UsageError("no scenarios and no unit tests", expected=f"files that end in {SUFFIX} or {TEST_SUFFIX}")
+        expected = f"files that end in {SUFFIX} or {TEST_SUFFIX}, or TEST blocks"
+        raise UsageError("no scenarios and no unit tests", expected=expected)
     return scenarios, unit_tests
 
 

@@ -1,7 +1,8 @@
-"""The part of `fieldtwin test` that runs unit tests in Structured Text (*.test.st)."""
+"""The part of `fieldtwin test` that runs unit tests in Structured Text."""
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import click
 from fieldtwin.cli.option_groups import option
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.plc.source_files import SUFFIXES, is_test_file
+from fieldtwin.plc.source_files import SUFFIXES, is_test_file, source_paths
 from fieldtwin.plc.st.dialects import DIALECTS, dialect_of
 
 if TYPE_CHECKING:
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from fieldtwin.plc.st.unit_tests.suite import Suite
     from fieldtwin.results.model import CheckResult, ScenarioResult
 
+_TESTS = re.compile(r"^\s*TEST\s+['\"].*\bEND_TEST\b", re.IGNORECASE | re.MULTILINE | re.DOTALL)
+"""TEST blocks in the file of a program."""
+_SUITES = re.compile(r"\bEXTENDS\s+(TcUnit\s*\.\s*)?FB_TestSuite\b", re.IGNORECASE)
+"""The declaration of a suite of TcUnit."""
 TARGET = "unit test"
 """The target of a unit test in reports, where a scenario has virtual, local, compose or real."""
 
@@ -52,6 +57,25 @@ class UnitTestOptions:
 def is_unit_test(path: Path) -> bool:
     """Return whether a file that the user named holds unit tests, not a scenario."""
     return is_test_file(path) or path.suffix.lower() in SUFFIXES
+
+
+def unit_tests_below(folder: Path, dialect: str) -> list[Path]:
+    """Return the files with unit tests in a folder and below it, sorted, without hidden ones.
+
+    They are the files `*.test.st`, the programs with TEST blocks, and in `codesys` and `twincat` the suites of TcUnit.
+    """
+    vendor = dialect_of(dialect).vendor
+    return sorted(path for path in source_paths(folder) if is_test_file(path) or _has_tests(path, vendor=vendor))
+
+
+def _has_tests(path: Path, *, vendor: bool) -> bool:
+    if path.suffix.lower() == ".xml":
+        return False
+    try:
+        text = path.read_text("utf-8", errors="replace")
+    except OSError:
+        return False
+    return _TESTS.search(text) is not None or (vendor and _SUITES.search(text) is not None)
 
 
 def load_suites(paths: list[Path], options: UnitTestOptions) -> list[Suite]:

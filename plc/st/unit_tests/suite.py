@@ -10,7 +10,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.error_collector import ErrorCollector
-from fieldtwin.plc.source_files import SUFFIXES, is_test_file, source_files
+from fieldtwin.plc.source_files import is_test_file, source_files, source_paths
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_unit
 from fieldtwin.plc.st.coverage.places import Place
 from fieldtwin.plc.st.coverage.probes import Probes
@@ -50,7 +50,8 @@ class Suite:
 def load_suite(
     path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = (), *, coverage: bool = True
 ) -> Suite:
-    """Read a file of tests. They may use the declarations of the other files in its folder, and of `libraries`.
+    """Read a file of tests. They may use the declarations of the other files in its folder and below it, and of
+    `libraries`.
 
     Without `coverage` the code has no probes, as in a plant.
 
@@ -62,7 +63,8 @@ def load_suite(
         raise FileInvalid("no test in this file", path=str(path), expected="TEST 'name' ... END_TEST")
     probes, unused = Probes(), Probes()
     if coverage:
-        left_out = {str(path), *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))}
+        own = {str(path)} if is_test_file(path) or not unit.tests else set()
+        left_out = {*own, *(one.pos.path for one in unit.pous if is_test_file(Path(one.pos.path)))}
         left_out |= {str(file) for library in libraries for file in source_files(library)} - set(map(str, beside))
         for other in others:
             unused.insert(other, left_out)
@@ -78,7 +80,8 @@ def load_suite(
 
 
 def _beside(path: Path) -> Iterator[Path]:
-    """Return the other source files in the folder of `path`, sorted."""
-    for file in sorted(path.parent.iterdir()):
-        if file.suffix.lower() in SUFFIXES and file.is_file() and file.name != path.name and file.name[0] != ".":
+    """Return the other source files in the folder of `path`, then those in folders below it, both sorted."""
+    folder = path.parent
+    for file in sorted(source_paths(folder), key=lambda one: (one.parent != folder, one)):
+        if file != path and (file.parent == folder or not is_test_file(file)):
             yield file

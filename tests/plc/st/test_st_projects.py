@@ -65,6 +65,15 @@ def test_a_folder_is_compiled_as_one_unit(folder: Path) -> None:
     assert made.y == 10  # type: ignore[attr-defined]
 
 
+def test_a_folder_may_have_xml_files_of_other_tools(folder: Path) -> None:
+    (folder / "beremiz.xml").write_text(
+        '<?xml version="1.0"?>\n<BeremizRoot URI_location=""><TargetType/></BeremizRoot>'
+    )
+    assert load_program("plc", (str(folder.parent),))
+    (folder / "damaged.xml").write_text('<?xml version="1.0"?>\n<project xmlns="http://www.plcopen.org/xml/tc6_0201">')
+    assert errors_of(folder) == ["/damaged.xml:2:54: not XML: no element found"]
+
+
 def test_an_error_in_a_scan_names_the_file_in_which_it_happened(folder: Path) -> None:
     made = load_source(folder)()
     made.x = 0  # type: ignore[attr-defined]

@@ -83,3 +83,21 @@ def test_the_choices_of_the_option_are_the_dialects() -> None:
     (option,) = (p for p in check.params if p.name == "dialect")
     assert isinstance(option.type, click.Choice)
     assert list(option.type.choices) == list(DIALECTS)
+
+
+def test_machine_code_lists_the_statements_that_stay_python(tmp_path: Path) -> None:
+    source = tmp_path / "p.st"
+    source.write_text(
+        "PROGRAM p\nVAR k : INT; s : STRING[9]; END_VAR\n  k := k + 1;\n  s := INT_TO_STRING(k);\n  k := k * 2;\nEND_PROGRAM\n"
+    )
+    done = checked(str(source), "--machine-code")
+    assert done.return_value == 0
+    assert f"{source}:4: stays Python: the variable s, because of its type" in done.output
+    assert "p: machine code for 2 of 3 statements" in done.output
+    (program,) = json.loads(checked(str(source), "--machine-code", "--json").output)["machine_code"]
+    assert (program["program"], program["statements"], [one["line"] for one in program["stays_python"]]) == (
+        "p",
+        3,
+        [4],
+    )
+    assert "machine_code" not in json.loads(checked(str(source), "--json").output)

@@ -12,7 +12,7 @@ from fieldtwin.cli.completions import st_warnings, systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.plc.checking import Checked, checked
-from fieldtwin.cli.plc.machine_code import stays_python
+from fieldtwin.cli.plc.machine_code import translated
 from fieldtwin.cli.plc.sources import (
     agreed_system,
     dialect_option,
@@ -78,8 +78,10 @@ def check(
     file = source_file(source, dialect, libraries)
     ids = chosen_ids(as_errors)
     found = checked({file: {}}, ids) if file is not None else _checked_system(source, sources, ids)
+    programs = translated(found.units) if machine_code else []
     if as_json:
-        click.echo(json.dumps(found.as_data(), indent=2))
+        more = {"machine_code": [program.as_data() for program in programs]} if machine_code else {}
+        click.echo(json.dumps({**found.as_data(), **more}, indent=2))
         return 1 if found.errors else 0
     for error in found.errors:
         stdout.print(str(error), soft_wrap=True, markup=False)
@@ -88,9 +90,8 @@ def check(
     for missing in found.missing():
         where = f"{missing.pos.path}:{missing.pos.line}:{missing.pos.column}"
         stdout.print(f"{where}: not imported: {missing.reason}", soft_wrap=True, markup=False)
-    if machine_code:
-        for line in stays_python(found.units):
-            stdout.print(line, soft_wrap=True, markup=False)
+    for line in (line for program in programs for line in program.lines()):
+        stdout.print(line, soft_wrap=True, markup=False)
     stdout.print(_summary(found), style="red" if found.errors else "green", soft_wrap=True, markup=False)
     return 1 if found.errors else 0
 

@@ -18,11 +18,17 @@ from fieldtwin.plc.debug.tracer import Resume, Tracer
 from fieldtwin.plc.program import ScanInfo
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_text
+from fieldtwin.plc.st.native.building import NoCompiler
 from fieldtwin.plc.st.native.machine import MachineCode, with_machine_code
 from fieldtwin.plc.st.native.suspension import resume, suspend
 from fieldtwin.plc.st.program import StProgram, load_source, program_class
 from fieldtwin.plc.st.resource import line_of_error
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
+
+try:
+    with_machine_code(compile_text("PROGRAM p VAR k : INT; END_VAR k := 1; END_PROGRAM"))
+except NoCompiler as missing:
+    pytest.skip(str(missing), allow_module_level=True)
 
 BLOCKS = """
 TYPE Mode : (Idle, Run, Stop); Percent : INT(0..100);

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Translated:
-    """What becomes machine code of a PROGRAM: how many of its `statements`, and the line and reason of those that stay Python."""
+    """The translation of a PROGRAM: the number of its `statements`, and the line and reason of those that stay Python."""
 
     name: str
     path: str

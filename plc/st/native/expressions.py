@@ -120,6 +120,8 @@ class Expressions:
 
     def element(self, node: ast.Subscript, kind: str = "array") -> tuple[str, Field]:
         """Return the C expression of an element of an array, and the field of the array."""
+        if isinstance(node.slice, ast.Slice):
+            raise Unsupported("a text")
         if not isinstance(node.value, ast.Attribute):
             raise Unsupported(f"the element {ast.unparse(node)}")
         array, field = self.place(node.value)
@@ -181,7 +183,7 @@ class Expressions:
             return Value(f"({value.hex()})", "float")
         if value is None:
             return Value(NONE, "optional")
-        raise Unsupported(f"the constant {value!r}")
+        raise Unsupported("a text" if isinstance(value, str) else f"the constant {value!r}")
 
     def _unaryop(self, node: ast.UnaryOp) -> Value:
         if isinstance(node.op, ast.Not):

@@ -148,7 +148,7 @@ class Expressions:
 
     def declared(self, *exprs: t.Expr) -> ty.Type | None:
         """Return the type of the first of `exprs` that is a variable or literal of a bit string type or BOOL, or None. In the
-        dialects of CODESYS, this includes integers.
+        dialects of CODESYS, this includes integers and enumerations.
         """
         for expr in exprs:
             if isinstance(expr, t.Literal | t.Ref):
@@ -158,10 +158,10 @@ class Expressions:
         return None
 
     def of_context(self, kind: ty.Type) -> bool:
-        """Return whether a constant that is shifted gets the type of the other operand, `kind`."""
-        return ty.of_bits(kind) or (
-            self.env.dialect.vendor and isinstance(kind, ty.Elementary) and ty.is_kind(kind, "int")
-        )
+        """Return whether a constant that is shifted, or the name of an enumerated value, gets the type of the other operand,
+        `kind`. The standard refuses the name of a value that several enumerations have (6.4.4.2).
+        """
+        return ty.of_bits(kind) or (self.env.dialect.vendor and (ty.is_kind(kind, "int") or isinstance(kind, ty.Enum)))
 
     def type_of(self, ref: t.Ref) -> ty.Type | None:
         """Return the type of a variable or of its part without compiling it, or None if it has no such part."""

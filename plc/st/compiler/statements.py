@@ -168,16 +168,20 @@ class Statements(Calls):
             self.out.line(self.value(call).code, s.pos)
 
     def _base_call(self, call: t.Call) -> None:
-        """Write ``SUPER()``, the call of the body of the base (6.6.6.4)."""
+        """Write ``SUPER()``, the call of the body of the base (6.6.6.4). The dialects of CODESYS also call it in a method."""
         assert self.own is not None
+        in_body = self.pou == self.owner
         base = self.own.ancestors[0]
         if call.arguments:
             self.env.fail(call.arguments[0].pos, f"{call.ref.name} takes no arguments: the base has the same variables")
-        if base.kind == "CLASS" or self.pou != self.owner:
+        if base.kind == "CLASS" or not (in_body or self.env.dialect.vendor):
             expected = f"{call.ref.name} in the body of a FUNCTION_BLOCK that extends a FUNCTION_BLOCK"
             self.env.fail(call.pos, f"{call.ref.name}()", expected=expected)
+        if not in_body and isinstance(base.type, ty.Block) and base.type.in_outs:
+            message = f"{call.ref.name}() in a method or action, and {base.name} has VAR_IN_OUT, which exist only in its own call"
+            self.env.fail(call.pos, message, expected=f"{call.ref.name}() in the body")
         note(self, base.key, call.pos)
-        self.out.line(f"B_{identifier(base.key)}.execute(self, now_ns)", call.pos)
+        self.out.line(f"B_{identifier(base.key)}.execute(self, {'now_ns' if in_body else '_c.now_ns'})", call.pos)
 
     def _is_action(self, pou: str, actions: frozenset[str], name: str) -> bool:
         return name in actions or f"{pou}.{name}" in self.env.missing
@@ -352,7 +356,7 @@ class Statements(Calls):
     def _label(self, label: t.CaseLabel, kind: ty.Type) -> tuple[int, int]:
         ends = []
         for expr in (label.low, label.high or label.low):
-            value = self.value(expr)
+            value = self.value(expr, kind if self.of_context(kind) else None)
             whole = ty.is_kind(value.type, "int", "bits") or isinstance(value.type, ty.Enum)
             if value.constant is None or not whole or meeting(self, value.type, kind, expr.pos) is None:
                 self.env.fail(expr.pos, "a label of CASE", expected=f"a constant of {kind}", got=str(value.type))

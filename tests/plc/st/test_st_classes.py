@@ -203,6 +203,27 @@ def test_calls_with_outputs_inside_an_expression_keep_their_order() -> None:
     assert got["c"].v_value == 2
 
 
+def test_codesys_calls_the_body_of_the_base_in_a_method() -> None:
+    before = """FUNCTION_BLOCK a VAR_OUTPUT n : INT; at : TIME; END_VAR VAR t : TON; END_VAR
+      n := n + 1; t(IN := TRUE, PT := T#1h, ET => at); END_FUNCTION_BLOCK
+    FUNCTION_BLOCK b EXTENDS a
+      METHOD PUBLIC twice SUPER^(); SUPER^(); END_METHOD
+      n := n + 100; END_FUNCTION_BLOCK
+    FUNCTION_BLOCK c EXTENDS b METHOD PUBLIC once SUPER^(); END_METHOD END_FUNCTION_BLOCK"""
+    found = run("one : c;", "one.twice(); one.once();", before, scans=3, dialect="codesys")
+    assert (found["one"].v_n, found["one"].v_at) == (306, 20_000_000)
+    referring = before.replace("VAR_OUTPUT", "VAR_IN_OUT io : INT; END_VAR VAR_OUTPUT", 1)
+    with pytest.raises(FileInvalid, match="and a has VAR_IN_OUT, which exist only in its own call"):
+        run("one : b;", "", referring, dialect="codesys")
+
+
+def test_a_body_and_a_method_that_call_each_other_are_refused() -> None:
+    before = """FUNCTION_BLOCK a METHOD PUBLIC m END_METHOD THIS^.m(); END_FUNCTION_BLOCK
+    FUNCTION_BLOCK b EXTENDS a METHOD PUBLIC m SUPER^(); END_METHOD END_FUNCTION_BLOCK"""
+    with pytest.raises(FileInvalid, match="calls itself"):
+        run("one : b;", "one();", before, dialect="codesys")
+
+
 @pytest.mark.parametrize(
     "statement",
     ["c[Next(calls := n)].Reset(5);", "r := c[Next(calls := n)].Up();", "r := c[Next(calls := n)].Up(EN := TRUE);"],

@@ -118,6 +118,16 @@ def test_matiec_shifts_a_constant_as_an_integer() -> None:
         compiled("d := SHL(1, 20);", "standard")
 
 
+def test_mux_selects_its_last_input_for_a_selector_beyond_it() -> None:
+    for dialect in ("codesys", "twincat"):
+        assert after("r := MUX(i, 1, 2, 3); d := MUX(9, 5, 6);", dialect)["r"] == 3
+        assert after("d := MUX(9, 5, 6);", dialect)["d"] == 6
+        with pytest.raises(LogicError, match="an index outside its array"):
+            after("r := MUX(-1, 1, 2, 3);", dialect)
+    with pytest.raises(LogicError, match="an index outside its array"):
+        after("r := MUX(i, 1, 2, 3);", "standard")
+
+
 def test_a_warning_has_id_file_line_and_column() -> None:
     (found,) = compiled("r := 1;\n  r := d;", "codesys").warnings
     assert str(found) == "p.st:4:8: ST002 DINT is converted to INT"

@@ -44,6 +44,30 @@ def test_the_type_that_a_value_must_have_decides_which_enumeration_is_meant(dial
     assert [found[name] for name in ("l", "m", "local", "a", "b", "n")] == [2, 2, 0, 1, 0, 2]
 
 
+SHARED = "TYPE A : (X, Y); B : (W, X, Z); END_TYPE"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "IF b = X THEN d := 1; END_IF",
+        "IF X = b THEN d := 1; END_IF",
+        "IF GE(b, X) AND LE(X, b) THEN d := 1; END_IF",
+        "CASE b OF W: d := 5; X: d := 1; END_CASE",
+        "d := SEL(a = Y, 0, 1); IF b <> X THEN d := 9; END_IF",
+    ],
+)
+def test_a_value_of_several_enumerations_has_the_type_of_the_other_operand_in_the_dialects_of_codesys(
+    body: str,
+) -> None:
+    """In an example of the standard, the comparison with such a name is an error (6.4.4.2)."""
+    variables = "a : A := Y; b : B := X; d : DINT;"
+    for dialect in ("codesys", "twincat"):
+        assert run(variables, body, SHARED, dialect=dialect)["d"] == 1
+    with pytest.raises(FileInvalid, match="X is a value of several types; expected A#X, B#X"):
+        run(variables, body, SHARED)
+
+
 def test_a_value_is_known_to_callers_where_a_parameter_demands_it() -> None:
     before = """FUNCTION_BLOCK fb VAR_INPUT s : (idle, run); END_VAR VAR_OUTPUT on : BOOL; END_VAR
     on := s = run; END_FUNCTION_BLOCK"""

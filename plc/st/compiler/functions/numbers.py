@@ -136,7 +136,10 @@ def _mux(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     selector, *choices = given
     place = number(x, selector, "int")
     codes, kind = _meeting(x, choices)
-    return Value(f"_v.pick({place.code}, {', '.join(codes)})", kind)
+    selected = place.code
+    if x.env.dialect.vendor:  # a selector beyond the inputs selects the last one
+        selected = f"min({selected}, {len(codes) - 1})"
+    return Value(f"_v.pick({selected}, {', '.join(codes)})", kind)
 
 
 @NUMBERS.add("MOVE", takes=ONE)

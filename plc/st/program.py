@@ -46,7 +46,7 @@ from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, attributes_of, state_of
 from fieldtwin.plc.st.runtime.lines import SOURCE, Record, forget, is_line, record_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
-from fieldtwin.plc.st.runtime.retention import described, dump, load, most_bytes, retained_part
+from fieldtwin.plc.st.runtime.retention import described, described_part, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.state_diagram import StateDiagram
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.variable_paths import VariablePaths
@@ -321,7 +321,10 @@ class StProgram(Program):
         return dump(value) if v.retain else retained_part(value)
 
     def retain_layout(self) -> Any:
-        return [[v.name, described(v.kind) if v.retain else "parts"] for v in self.st_retained]
+        return [
+            [v.name, (described if v.retain else described_part)(v.kind, self.st_value(v), self.st_unit.blocks)]
+            for v in self.st_retained
+        ]
 
     def retain_bytes(self) -> int:
         return sum(10 + len(v.name) + most_bytes(v.kind, self.st_kept(v)) for v in self.st_retained)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -10,20 +11,65 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.runtime.layouts import Union
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance
 
+Members = Mapping[str, Sequence[tuple[str, ty.Type]]]
+"""By the name of a function block or class in lower case: its variables, with their types."""
 
-def described(kind: ty.Type) -> Any:
-    """Return a description of a type by the names and elementary types of its values, as data for JSON."""
+
+def described(kind: ty.Type, value: Any, members: Members) -> Any:
+    """Return a description of the type of a retained value by the names and elementary types of its parts, as data for JSON.
+
+    The description does not include variables of VAR NON_RETAIN. Retained values of a different description cannot be restored.
+    """
     if isinstance(kind, ty.Array):
-        return [kind.ranges, described(kind.of)]
+        return [kind.ranges, described(kind.of, _first(value), members)]
     if isinstance(kind, ty.Struct):
-        fields = [[name, described(of)] for name, (_, of) in kind.fields.items()]
-        return {"union": fields, "packed": kind.packed} if kind.union else fields
+        if kind.union:
+            fields = [[name, described(of, None, members)] for name, (_, of) in kind.fields.items()]
+            return {"union": fields, "packed": kind.packed}
+        return [[n, described(of, getattr(value, f"m_{n}", None), members)] for n, (_, of) in kind.fields.items()]
     if isinstance(kind, ty.Block):
-        members = {**kind.inputs, **kind.outputs}
-        return [kind.name.lower(), [[name, described(of)] for name, (_, of) in members.items()]]
+        without = getattr(value, "non_retain", ())
+        parts = [(name, of) for name, of in _members(kind, members) if f"v_{name.lower()}" not in without]
+        named = [[name.lower(), described(of, _member(value, name), members)] for name, of in parts]
+        return [kind.name.lower(), named]
     if isinstance(kind, ty.Enum):
         return [kind.name.lower(), sorted(kind.values.items())]
     return str(kind)
+
+
+def described_part(kind: ty.Type, value: Any, members: Members) -> Any:
+    """Return a description of the variables in a value that are RETAIN in their function block; None if it has none."""
+    found: list[Any] = []
+    if isinstance(kind, ty.Array):
+        part = described_part(kind.of, _first(value), members)
+        return None if part is None else [kind.ranges, part]
+    if isinstance(kind, ty.Struct) and not kind.union:
+        for name, (_, of) in kind.fields.items():
+            part = described_part(of, getattr(value, f"m_{name}", None), members)
+            found += [[name, part]] if part is not None else []
+    elif isinstance(kind, ty.Block):
+        whole = getattr(value, "retain", ())
+        for name, of in _members(kind, members):
+            describe = described if f"v_{name.lower()}" in whole else described_part
+            part = describe(of, _member(value, name), members)
+            found += [[name.lower(), part]] if part is not None else []
+    return found or None
+
+
+def _members(kind: ty.Block, members: Members) -> Sequence[tuple[str, ty.Type]]:
+    """Return the variables of a function block; those of a block of the standard are its inputs and outputs."""
+    return members.get(kind.name.lower()) or [*kind.inputs.values(), *kind.outputs.values()]
+
+
+def _member(value: Any, name: str) -> Any:
+    return getattr(value, f"v_{name.lower()}", None)
+
+
+def _first(value: Any) -> Any:
+    """Return the first element of an array, which has the type of the others."""
+    while isinstance(value, list):
+        value = value[0] if value else None
+    return value
 
 
 def most_bytes(kind: ty.Type, now: Any) -> int:

@@ -438,7 +438,7 @@ def test_a_step_continues_and_an_active_step_cannot_be_removed(tmp_path: Path) -
     plc.change(edited(("T#300ms", "T#200ms"), text=chart))
     plc.until(began_ms + 190)
     assert plc.value("Fill.X") is True
-    plc.until(began_ms + 210)
+    plc.until(began_ms + 200)
     assert plc.value("Start.X") is True
     plc.until(began_ms + 250)
     assert plc.value("Fill.X") is True

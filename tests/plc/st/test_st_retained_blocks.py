@@ -89,3 +89,29 @@ def test_an_extending_block_retains_the_variables_of_its_base() -> None:
 def test_what_cannot_be_retained_is_an_error(before: str, message: str) -> None:
     with pytest.raises(FileInvalid, match=message):
         run("x : INT;", ";", before)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        ("text : STRING :=", "text : STRING[20] :=", False),
+        ("hours : INT;", "hours : INT; more : REAL;", False),
+        ("RETAIN total : INT;", "RETAIN more : REAL; total : INT;", False),
+        ("VAR NON_RETAIN last : INT;", "VAR NON_RETAIN last : DINT;", True),
+        ("since := since + by;", "since := since + 2;", True),
+    ],
+)
+@pytest.mark.parametrize("qualifier", ["", "RETAIN"])
+def test_retained_values_belong_to_the_declarations_of_their_block(
+    before: str, after: str, same: bool, qualifier: str
+) -> None:
+    main = f"PROGRAM p VAR {qualifier} s : ARRAY[1..2] OF Station; END_VAR s[1](); END_PROGRAM"
+    assert before in METER
+    layouts = [program(f"{text} {main}").retain_layout() for text in (METER, METER.replace(before, after))]
+    assert (layouts[0] == layouts[1]) is same
+
+
+def test_a_variable_that_is_not_retained_changes_no_retained_values() -> None:
+    main = "PROGRAM p VAR m : Meter; END_VAR m(); END_PROGRAM"
+    changed = METER.replace("VAR since : INT;", "VAR since : DINT; more : REAL;")
+    assert program(METER + main).retain_layout() == program(changed + main).retain_layout()

@@ -67,7 +67,9 @@ def main() -> int:
         cpu = [each for _, each in results]
         print(f"fieldtwin {command:<48}{median(cpu):>7.0f}, ratio {ratio(cpu, bare_cpu):.1f}")
     version = [duration for duration, _ in ours["--version"]]
-    print(f"ms, median: python -c pass {median([each for each, _ in bare]):.0f}, fieldtwin --version {median(version):.0f}\n")
+    print(
+        f"ms, median: python -c pass {median([each for each, _ in bare]):.0f}, fieldtwin --version {median(version):.0f}\n"
+    )
     goals = Goals()
     goals.most("fieldtwin --version", median(version), GOAL_MS, "ms")
     return goals.verdict()

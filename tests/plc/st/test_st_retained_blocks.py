@@ -115,3 +115,21 @@ def test_a_variable_that_is_not_retained_changes_no_retained_values() -> None:
     main = "PROGRAM p VAR m : Meter; END_VAR m(); END_PROGRAM"
     changed = METER.replace("VAR since : INT;", "VAR since : DINT; more : REAL;")
     assert program(METER + main).retain_layout() == program(changed + main).retain_layout()
+
+
+def test_global_variables_of_any_type_are_retained_if_their_list_is() -> None:
+    made, kept = restarted(f"""{METER}
+        VAR_GLOBAL RETAIN hours : INT := 5; day : Day; a : ARRAY[1..2] OF INT; name : STRING; m : Meter; unused : INT; END_VAR
+        VAR_GLOBAL others : INT; END_VAR
+        FUNCTION_BLOCK Clock hours := hours + 1; END_FUNCTION_BLOCK
+        PROGRAM p VAR c : Clock; END_VAR
+        c(); day.hours := hours; a[2] := a[2] + 3; name := CONCAT(name, 'x'); m(); others := others + 1; END_PROGRAM""")
+    found = made.st_resource.globals
+    assert (found.v_hours, found.v_day.m_hours, found.v_a, found.v_name) == (7, 7, [0, 6], "xx")
+    assert (found.v_m.v_total, found.v_others, found.v_unused) == (2, 0, 0)
+    assert list(kept) == ["hours", "day", "a", "name", "m"]
+
+
+def test_a_reference_in_a_retained_global_list_is_refused() -> None:
+    with pytest.raises(FileInvalid, match="x, a REF_TO INT, cannot be RETAIN"):
+        program("VAR_GLOBAL RETAIN x : REF_TO INT; END_VAR PROGRAM p x := NULL; END_PROGRAM")

@@ -67,7 +67,7 @@ def shared_addresses(blocks: Iterable[t.VarBlock]) -> Iterator[tuple[t.VarDecl, 
 
 @dataclass(frozen=True, slots=True)
 class Offered:
-    """A global variable that a program uses, and that has an address or located parts (`parts`).
+    """A global variable that a program uses, and that is retained, or has an address or located parts (`parts`).
 
     The program offers it, or its parts, as inputs, outputs or local variables. `name` is its name in the program, and `list` the
     name of its global list, in lower case. A `retain` variable keeps its value.
@@ -201,18 +201,23 @@ def _program(pou: t.Pou, known: frozenset[str]) -> t.Pou:
 
 
 def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
-    """Return the global variables with addresses or located parts that a program uses.
+    """Return the global variables with addresses or located parts, and the retained ones, that a program uses.
 
     `unit` is the result of `without_addresses`.
     """
     with_parts = holders(unit)
-    retained = {v.name.lower() for block in unit.globals if block.qualifiers & RETAIN for v in block.variables}
+    retained = {
+        (block.list.lower(), v.name.lower())
+        for block in unit.globals
+        if block.qualifiers & RETAIN
+        for v in block.variables
+    }
     located = {
         (block.list.lower(), v.name.lower()): v
         for block in unit.globals
         if "CONSTANT" not in block.qualifiers
         for v in block.variables
-        if v.location or type_name(v.type) in with_parts
+        if v.location or type_name(v.type) in with_parts or (block.list.lower(), v.name.lower()) in retained
     }
     by_address = {address_of(v.location): key for key, v in reversed(located.items()) if address_of(v.location)}
     found: dict[tuple[str, str], str] = {}
@@ -243,7 +248,7 @@ def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
                 short_name(address) if (address := address_of(v.location)) else f"{key[0]}.{name}" if key[0] else name
             )
         taken.add(name.lower() if not v.location else "")
-        offers.append(Offered(name, key[0], v, key[1] in retained))
+        offers.append(Offered(name, key[0], v, key in retained))
     return offers
 
 

@@ -97,15 +97,8 @@ class Programs(Bodies):
                     self._check_interface(v, kind, role or "")
                     if _is_reserved(v.name):
                         self.env.fail(v.pos, f"a PROGRAM's variable needs another name than {v.name}")
-                    if retain and ty.holds_interface(kind):
-                        hint = "a restart creates new instances, so assign the reference again"
-                        self.env.fail(v.pos, f"{v.name} is RETAIN and refers to an instance", hint=hint)
-                    if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
-                        self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
-                    if retain and isinstance(kind, ty.Pointer):
-                        self.env.fail(
-                            v.pos, f"{v.name}, a {kind}, cannot be RETAIN", hint="assign it in the first scan"
-                        )
+                    if retain:
+                        self._check_retained(v, kind)
                     attribute = f"v_{v.name.lower()}"
                     address, located = address_of(v.location), bool(v.location)
                     variables.append(
@@ -213,15 +206,15 @@ class Programs(Bodies):
                 )
 
     def _offered(self, pou: t.Pou, taken: set[str]) -> Iterator[ProgramVariable]:
-        """Yield the located global variables, and located parts of global variables, that a program uses. `taken` has the names
-        of its variables, in lower case.
+        """Yield the located and the retained global variables, and located parts of global variables, that a program uses.
+        `taken` has the names of its variables, in lower case.
         """
         for one in offered(self._unit, pou):
             symbol = self.variables.offered(one)
             if symbol is None or symbol.constant is not None:
                 continue
             of = self._offered_variable(one, symbol, taken, pou)
-            if one.variable.location:
+            if one.variable.location or one.retain:
                 yield of
             yield from self._parts_of(pou, of, f"{one.list}.{one.variable.name}", one.variable.name)
 
@@ -234,8 +227,19 @@ class Programs(Bodies):
         taken.add(name.lower())
         role = _ROLES[area_of(v.location)] if v.location else "local"
         self._check_interface(v, symbol.type, role)
+        if one.retain:
+            self._check_retained(v, symbol.type)
         attribute = symbol.code.rpartition(".")[2]
         return ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
+
+    def _check_retained(self, v: t.VarDecl, kind: ty.Type) -> None:
+        if ty.holds_interface(kind):
+            hint = "a restart creates new instances, so assign the reference again"
+            self.env.fail(v.pos, f"{v.name} is RETAIN and refers to an instance", hint=hint)
+        if isinstance(kind, ty.MessagesIn | ty.MessagesOut):
+            self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
+        if isinstance(kind, ty.Pointer):
+            self.env.fail(v.pos, f"{v.name}, a {kind}, cannot be RETAIN", hint="assign it in the first scan")
 
     def _check_interface(self, v: t.VarDecl, kind: ty.Type, role: str) -> None:
         if role == "local" or (isinstance(kind, ty.Array | ty.Struct) and _is_divisible(kind)):

@@ -79,8 +79,6 @@ class Variables:
     def declare_globals(self) -> None:
         """Declare all global variables, after the types are known."""
         for block in self.unit.globals:
-            if not all(v.location for v in block.variables):
-                self._no_retain(block, "a VAR_GLOBAL")
             for v in block.variables:
                 with self.env.declaring(v.name, self.env.faulty):
                     key = block.list.lower(), v.name.lower()
@@ -251,7 +249,7 @@ class Variables:
 
     def _no_retain(self, block: t.VarBlock, what: str) -> None:
         if block.qualifiers & {"RETAIN", "PERSISTENT"}:
-            hint = "VAR RETAIN of a PROGRAM, FUNCTION_BLOCK or CLASS can, and global variables with addresses"
+            hint = "VAR RETAIN of a PROGRAM, FUNCTION_BLOCK or CLASS can, and global variables"
             self.env.collected(self.env.error(block.pos, f"{what} cannot be RETAIN", hint=hint))
 
 

@@ -44,7 +44,7 @@ from fieldtwin.plc.st.drawing.live import Pictures, Reading, pictures_of
 from fieldtwin.plc.st.inspection import shown_value
 from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.resource import Resource, Together, attributes_of, state_of
-from fieldtwin.plc.st.runtime.lines import SOURCE, Record, forget, is_line, record_of
+from fieldtwin.plc.st.runtime.lines import SOURCE, Record, forget, indices_of, is_line, line_of, record_of
 from fieldtwin.plc.st.runtime.parts import assign, reached, value_of
 from fieldtwin.plc.st.runtime.retention import described, described_part, dump, load, most_bytes, retained_part
 from fieldtwin.plc.st.state_diagram import StateDiagram
@@ -109,6 +109,12 @@ class StProgram(Program):
         self.st_shown = False
         """Whether the tags have the values that the variables had after the last scan, which ended without an error."""
         self.st_retained = [v for v in self.st_declared.variables if v.retain or self.st_kept(v) is not None]
+        self.st_lines = {
+            name: (line_of(str(v.attribute)), indices_of(str(v.attribute)))
+            for name, v in self.st_variables.items()
+            if not v.shared and not v.steps
+        }
+        """For the variables of the PROGRAM itself: the attributes with the line and the indices of their last assignment."""
         self.st_places: dict[tuple[str, int], SourceLine] = {}
         """The lines that assigned outputs so far; all changes by one line share its object."""
         self.st_show()
@@ -222,15 +228,25 @@ class StProgram(Program):
         """Return the line that assigned the output, and its statement with what decided; for an output with its initial value,
         the line of its declaration.
         """
-        found = self.st_variables.get(name)
+        found, body = self.st_variables.get(name), self.st_body
+        lines = self.st_lines.get(name)
+        if lines is not None:
+            line = getattr(body, lines[0], 0)
+            if type(line) is int and line and not getattr(body, lines[1], ()):  # most of the changes of a scan
+                place = self.st_place((self.source_path, line))
+                return place, self.st_decisions.read_own(body, self.st_resource, name, (self.source_path, line))
         record = self.st_record(found) if found is not None else ()
         if found is None or not record:
             return None, None
-        source = record[1][:SOURCE]
+        place = self.st_place(record[1][:SOURCE])
+        return place, self.st_decisions.read(body, self.st_resource, name, record)
+
+    def st_place(self, source: tuple[str, int]) -> SourceLine:
+        """Return the line of a source; all changes by one line share its object."""
         place = self.st_places.get(source)
         if place is None:
             place = self.st_places[source] = SourceLine(*source)
-        return place, self.st_decisions.read(self.st_body, self.st_resource, name, record)
+        return place
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)

@@ -23,6 +23,7 @@ from fieldtwin.plc.st.plcopen.read import read_parts, read_plcopen
 from fieldtwin.plc.st.syntax import twincat
 from fieldtwin.plc.st.syntax.parse import parse_all, parse_parts
 from fieldtwin.plc.st.syntax.tree import SourceUnit
+from fieldtwin.plc.st.tcunit_suites import SUITE, without_suites
 
 _QUALIFIED_ONLY = re.compile(
     r"\{\s*attribute\s+'qualified_only'\s*\}(?:\s|\{[^}]*\}|//[^\n]*\n|\(\*.*?\*\))*VAR_GLOBAL",
@@ -85,7 +86,10 @@ def _compiled(texts: Texts, libraries: Texts, path: str, dialect: Dialect, names
 
     `names` are those of the libraries.
     """
-    unit = with_library(_parsed(texts, dialect), _library(libraries, dialect))
+    library, unit = _library(libraries, dialect), _parsed(texts, dialect)
+    if dialect.vendor and SUITE.lower() not in library.found:
+        unit = without_suites(unit)
+    unit = with_library(unit, library)
     unit = _without_qualifiers(unit, dialect, names)
     used = {declared.pos.path for declared in (*unit.types, *unit.globals, *unit.pous)}
     files = (*(file for file, _ in texts), *(file for file, _ in libraries if file in used))

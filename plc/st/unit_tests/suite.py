@@ -16,10 +16,11 @@ from fieldtwin.plc.st.coverage.places import Place
 from fieldtwin.plc.st.coverage.probes import Probes
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.project import read_with
+from fieldtwin.plc.st.tcunit_suites import is_suite
 from fieldtwin.plc.st.unit_tests.assertions import TranslatedTest
 from fieldtwin.plc.st.unit_tests.blocks import programs_as_blocks
 from fieldtwin.plc.st.unit_tests.run import TestResult, run_tests
-from fieldtwin.plc.st.unit_tests.tcunit import is_suite, suites_as_programs
+from fieldtwin.plc.st.unit_tests.tcunit import suites_as_programs
 from fieldtwin.plc.st.unit_tests.translate import tests_as_programs
 
 

@@ -17,9 +17,9 @@ from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.walk import nodes, with_parts
 from fieldtwin.plc.st.syntax.written import text_of
+from fieldtwin.plc.st.tcunit_suites import is_suite
 from fieldtwin.plc.st.unit_tests.assertions import ARRAYS, AssertionText, TranslatedTest, assertion, bound
 
-_SUITE = "FB_TestSuite"
 _EQUAL, _TRUE, _FALSE = "ASSERTEQUALS", "ASSERTTRUE", "ASSERTFALSE"
 _WITH_DELTA = ("ASSERTEQUALS_REAL", "ASSERTEQUALS_LREAL")
 _ARRAYS = re.compile(r"ASSERTARRAY(2D|3D)?EQUALS_\w+$")
@@ -39,11 +39,6 @@ def suites_as_programs(
         pous += [suite.block(), suite.program()]
         tests += suite.tests.values()
     return replace(unit, pous=tuple(pous)), tests
-
-
-def is_suite(pou: t.Pou) -> bool:
-    """Return whether a function block is a test suite."""
-    return any(kind.name.rpartition(".")[2].lower() == _SUITE.lower() for kind in pou.extends)
 
 
 @dataclass

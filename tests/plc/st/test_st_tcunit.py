@@ -8,6 +8,7 @@ import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.dialects import dialect_of
+from fieldtwin.plc.st.project import compile_source
 from fieldtwin.plc.st.unit_tests.run import TestResult
 from fieldtwin.plc.st.unit_tests.suite import load_suite
 
@@ -192,3 +193,27 @@ def test_ordered_tests_run_one_after_the_other(tmp_path: Path) -> None:
 def test_an_ordered_test_is_an_if_of_its_own(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="TEST_ORDERED"):
         ran(tmp_path, "METHOD One\nIF TEST_ORDERED('x') AND TRUE THEN TEST_FINISHED(); END_IF\nEND_METHOD")
+
+
+def test_the_source_of_a_program_may_have_suites(tmp_path: Path) -> None:
+    (tmp_path / "ramp.st").write_text(RAMP + "PROGRAM MAIN VAR ramp : FB_Ramp; END_VAR ramp(); END_PROGRAM")
+    (tmp_path / "suite.st").write_text(
+        "FUNCTION_BLOCK Suite EXTENDS TcUnit.FB_TestSuite TEST('x'); TEST_FINISHED(); END_FUNCTION_BLOCK\n"
+        "FUNCTION_BLOCK More EXTENDS Suite END_FUNCTION_BLOCK\n"
+        "PROGRAM PRG_TEST VAR suite : More; END_VAR TcUnit.RUN(); END_PROGRAM"
+    )
+    made = compile_source(tmp_path, dialect_of("twincat"))
+    assert [program.name for program in made.programs] == ["MAIN"]
+    assert [one.name for one in made.missing] == ["Suite", "More", "PRG_TEST"]
+    (tmp_path / "other.st").write_text("PROGRAM Other VAR s : Sute; t : Suite; END_VAR t(); END_PROGRAM")
+    with pytest.raises(FileInvalid, match="a type 'Sute' is not declared"):
+        compile_source(tmp_path / "other.st", dialect_of("twincat"))
+
+
+def test_suites_are_compiled_with_the_library_that_declares_their_base(tmp_path: Path) -> None:
+    (tmp_path / "suite.st").write_text("PROGRAM MAIN VAR s : Suite; END_VAR s(); END_PROGRAM\n"
+        "FUNCTION_BLOCK Suite EXTENDS TcUnit.FB_TestSuite END_FUNCTION_BLOCK")  # fmt: skip
+    (tmp_path / "TcUnit").mkdir()
+    (tmp_path / "TcUnit" / "base.st").write_text("FUNCTION_BLOCK FB_TestSuite END_FUNCTION_BLOCK")
+    made = compile_source(tmp_path / "suite.st", dialect_of("twincat"), (tmp_path / "TcUnit",))
+    assert [program.name for program in made.programs] == ["MAIN"]

@@ -57,6 +57,11 @@ _MEANINGS = {
         "a constant has the narrowest type that holds it, so a controller may lose bits.",
         "Write the type of the constant, such as `SHL(DWORD#1, n)`.",
     ),
+    "ST011": (
+        "A statement in a FOR alters the control variable of the loop, which IEC 61131-3 does not allow. The next iteration has "
+        "the altered value plus the step, so the loop can run more often or less often than its limits say, or without end.",
+        "Leave the loop with EXIT, skip an iteration with CONTINUE, or use WHILE.",
+    ),
     "ST100": (
         "A comment `fieldtwin: allow ID: REASON` accepts a warning in its line or the next one. This one names no warning, "
         "has no reason, or there is no such warning any more.",

@@ -27,6 +27,7 @@ WARNINGS = {
     "ST008": "operands of signed and unsigned types",
     "ST009": "FB_exit or FB_reinit, which is not called by itself",
     "ST010": "shift of a constant without a type",
+    "ST011": "control variable of FOR altered in its loop",
 }
 """The id and title of each warning about a construct of a dialect."""
 FINDINGS = {

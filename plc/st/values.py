@@ -205,6 +205,14 @@ def unaltered(taken: range, control: Callable[[], int]) -> Iterator[int]:
             )
 
 
+def following(taken: range, control: Callable[[], int]) -> Iterator[int]:
+    """Yield the values of a FOR's control variable that the loop alters: each one is its present value plus the step."""
+    value = taken.start
+    while value < taken.stop if taken.step > 0 else value > taken.stop:
+        yield value
+        value = control() + taken.step
+
+
 def copied(x: list[Any]) -> list[Any]:
     """Return a copy of an array; elements that are objects or arrays are copied too."""
     return [copied(e) if isinstance(e, list) else e.copy() if hasattr(e, "copy") else e for e in x]

@@ -67,7 +67,7 @@ def check(
     fieldtwin plc check plc/ --dialect codesys --error ST002
     fieldtwin plc check observatory
 
-    A warning marks a construct that only the dialect accepts (ST001 to ST010), or that is often a mistake (from ST101 on);
+    A warning marks a construct that only the dialect accepts (ST001 to ST011), or that is often a mistake (from ST101 on);
     `fieldtwin explain ST101` explains it. The comment `// fieldtwin: allow ST101: REASON`, in its line or the line above, accepts
     it. For a system, the bindings of its programs are checked too (ST111 to ST114); in the system file a comment begins with #.
     Parts of a PLCopen XML file that are not supported are listed too; they are errors only where a program uses them.

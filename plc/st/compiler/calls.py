@@ -304,13 +304,18 @@ class Calls(Expressions):
             if target.is_input:
                 hint = "it is an input; the dialects codesys, twincat and matiec accept this with a warning"
             self.env.fail(ref.pos, f"{ref.name} cannot be assigned to", hint=hint)
-        if any(control == target.code or control.startswith(f"{target.code}.") for control in self.controls):
-            self.env.fail(
-                ref.pos,
-                f"{ref.name} is the control variable of the FOR around this statement and cannot be altered here",
-                hint="leave the loop with EXIT, or use WHILE",
-            )
+        self._check_controls(ref, target)
         return target
+
+    def _check_controls(self, ref: t.Ref, target: Value) -> None:
+        """Refuse to alter the control variable of a FOR around the statement, or note it in the dialects of CODESYS."""
+        what = f"{ref.name} is the control variable of the FOR around this statement and"
+        for index, control in enumerate(self.controls):
+            if control == target.code and self.env.accepts("ST011", ref.pos, f"{what} is altered"):
+                self.altered.add(index)
+            elif control == target.code or control.startswith(f"{target.code}."):
+                hint = "leave the loop with EXIT, or use WHILE"
+                self.env.fail(ref.pos, f"{what} cannot be altered here", hint=hint)
 
     def in_out(
         self, expr: t.Expr | None, name: str, kind: ty.Type, call: t.Call, of: str, cells: dict[str, str]

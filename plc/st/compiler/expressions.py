@@ -46,6 +46,8 @@ class Expressions:
         self._deep = 0
         self.controls: list[str] = []
         """The control variables of the FOR loops around the statement."""
+        self.altered: set[int] = set()
+        """The indices in `controls` of those that a statement in their loop alters, in the dialects of CODESYS."""
         self.program_inputs: set[str] = set()
         """The inputs whose quality can be queried, when a PROGRAM is compiled."""
         self.own: Class | None = None

@@ -404,12 +404,19 @@ class Statements(Calls):
         self.out.line(f"{taken} = {code}", s.pos)
         own = target.code in (f"v_{s.variable.name.lower()}", f"self.v_{s.variable.name.lower()}")
         head = taken if own else f"_v.unaltered({taken}, lambda: {target.code})"
+        begin, indent = len(self.out.lines), "    " * self.out.depth
         self.controls.append(target.code)
         with self._loop(f"for {target.code} in {head}:", s.pos):
             self.body(s.body)
         self.controls.pop()
+        beyond = f"_v.beyond({taken})"
+        if len(self.controls) in self.altered:
+            self.altered.remove(len(self.controls))
+            head = f"_v.following({taken}, lambda: {target.code})"
+            self.out.lines[begin] = f"{indent}for {target.code} in {head}:", s.pos
+            beyond = f"({target.code} + {taken}.step if {taken} else {taken}.start)"
         with self.out.block("else:", s.pos):
-            self.out.line(f"{target.code} = {wrapped(f'_v.beyond({taken})', kind)}", s.pos)
+            self.out.line(f"{target.code} = {wrapped(beyond, kind)}", s.pos)
 
     def _while(self, s: t.While) -> None:
         with self._loop("while True:", s.pos):

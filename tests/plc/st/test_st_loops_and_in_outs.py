@@ -13,6 +13,9 @@ from hypothesis import strategies as st
 from st_bench import program, run, scan
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.program import ScanTooLong
+from fieldtwin.plc.st.compiler.compile import compile_text
+from fieldtwin.plc.st.dialects import DIALECTS
 from fieldtwin.plc.st.values import LogicError
 
 
@@ -94,6 +97,36 @@ def test_altering_the_control_variable_in_the_loop_is_refused(body: str) -> None
     with pytest.raises(FileInvalid, match="is the control variable of the FOR around this statement") as e:
         run("i, k : INT; s, t : S; b : B;", body, TYPES)
     assert e.value.line == 8
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("FOR i := 1 TO 9 DO k := k + 1; i := i + 2; END_FOR", (10, 3)),
+        ("FOR i := 1 TO 9 DO k := k + 1; i := 20; END_FOR", (21, 1)),
+        ("FOR i := 9 TO 1 BY -3 DO k := k + 1; IF k = 1 THEN i := 7; CONTINUE; END_IF END_FOR", (-2, 3)),
+        ("FOR i := 5 TO 1 DO i := 3; k := 1; END_FOR", (5, 0)),
+        ("FOR i := 1 TO 9 DO k := k + 1; i := 4; EXIT; END_FOR", (4, 1)),
+        ("FOR i := 1 TO 3 DO k := k + 1; FOR i := 1 TO 5 DO k := k + 10; END_FOR END_FOR", (7, 51)),
+        ("FOR i := 32766 TO 32767 DO k := k + 1; i := i; END_FOR", (-32768, 2)),
+        ("FOR i := 1 TO 9 DO k := k + 1; up(i); END_FOR", (10, 3)),
+        ("FOR i := 1 TO 2 DO i := i + 5; END_FOR; FOR i := 1 TO 3 DO k := k + 1; END_FOR", (4, 3)),
+    ],
+)
+def test_codesys_continues_with_the_altered_control_variable(body: str, expected: tuple[int, int]) -> None:
+    """CODESYS has a rule of its static analysis about such loops (SA0072), and compiles them."""
+    before = "FUNCTION up VAR_IN_OUT n : INT; END_VAR n := n + 2; END_FUNCTION"
+    found = run("i, k : INT;", body, before, dialect="codesys")
+    assert (found["i"], found["k"]) == expected
+    warnings = compile_text(
+        f"{before} PROGRAM p VAR i, k : INT; END_VAR {body} END_PROGRAM", "p.st", DIALECTS["codesys"]
+    ).warnings
+    assert {one.id for one in warnings} >= {"ST011"}
+
+
+def test_a_loop_that_sets_its_control_variable_back_is_endless() -> None:
+    with pytest.raises(ScanTooLong):
+        run("i : INT;", "FOR i := 1 TO 9 DO i := i - 1; END_FOR", dialect="codesys")
 
 
 def test_other_variables_and_later_loops_are_free() -> None:

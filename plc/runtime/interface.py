@@ -43,19 +43,33 @@ def _bound(
             user = f"{reader} uses it" if (reader := readers.get(tags[name], "")) else ""
         if new is None:
             if user:
-                yield f"{old.role.value} {name} is removed, but {user}"
+                yield f"{old.role.value} {name} is removed, but {user}: keep it, or {_remedy(user)}"
         elif user and _form(old) != _form(new):
-            yield f"{old.role.value} {name} changes ({_text(old)} -> {_text(new)}), but {user}"
+            change = f"({_text(old)} -> {_text(new)})"
+            yield f"{old.role.value} {name} changes {change}, but {user}: keep its declaration, or {_remedy(user)}"
         elif renamed := _renamed(old, new):
-            yield f"{name} has other numbers for its values, which displays would name wrongly: {renamed}"
+            yield (
+                f"{name} has other numbers for its values, which displays would name wrongly: {renamed}: keep the number of "
+                "each name and use new numbers for new names, or restart the run"
+            )
 
 
 def _added(running: BoundProgram, after: Mapping[str, Variable]) -> Iterator[str]:
     for name, new in after.items():
         if new.role is Role.INPUT and new.needs_tag and name not in running.inputs:
-            yield f"input {name} is new, and the system file has to bind it to a tag"
+            yield (
+                f"input {name} is new, and the system file has to bind it to a tag: add it there and restart the run, or "
+                "declare it in VAR"
+            )
         elif new.kind is TagKind.MESSAGE and name not in running.program.variables:
-            yield f"output {name} is new, and its messages need a place in the process image"
+            yield f"output {name} is new, and its messages need a place in the process image: restart the run"
+
+
+def _remedy(user: str) -> str:
+    """Return what else can be done if `user` prevents the change."""
+    if user.startswith("the system file"):
+        return "change the system file as well and restart the run"
+    return "change its user as well and restart the run"
 
 
 def _form(v: Variable) -> tuple[object, ...]:

@@ -1,8 +1,8 @@
 """Replaces programs in Structured Text while the PLC runs: between two scans, with the values of their variables.
 
 `prepare` compares new versions with the programs that run, and creates their instances. `OnlineChange.commit` then replaces all
-of them in one step, or raises an error and changes nothing. The process image, forces, retained variables and start conditions
-stay as they are.
+of them in one step, or raises an error and changes nothing. The process image, forces and start conditions stay as they are. The
+file of retained variables is replaced in the same step if they differ.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ class OnlineChange:
     _replacements: list[_Replacement] = field(default_factory=list)
     _globals: list[tuple[StProgram, StProgram, Move]] = field(default_factory=list)
     """For each resource that is replaced, one of its programs: as it runs, and as it will."""
+    _retention: bool = False
+    """Whether the retained variables differ."""
 
     @property
     def refused(self) -> bool:
@@ -81,13 +83,18 @@ class OnlineChange:
     def commit(self) -> None:
         """Replace the programs. Call it between two scans, in the thread that executes them.
 
-        Raises `ChangeRefused`, or `StepRemoved` for an active step that the new version does not have; nothing is changed then.
+        Raises `ChangeRefused`, `StepRemoved` for an active step that the new version does not have, or `Unreachable` if the file
+        of retained variables cannot be created; nothing is changed then.
         """
         self._check()
         for running, new, move in self._globals:
             move(running.st_resource.globals, new.st_resource.globals)
         for r in self._replacements:
             r.move(r.bound.program.st_body, r.new.st_body)  # type: ignore[attr-defined]
+        if self._retention:
+            later = {r.bound.name: BoundProgram(r.bound.name, r.new) for r in self._replacements}
+            programs = self.runner.programs
+            self.runner.retained.prepared(programs, [later.get(p.name, p) for p in programs])()
         for r in self._replacements:
             r.bound.program.st_become(r.new)  # type: ignore[attr-defined]
         self.runner.programs_changed([source for r in self._replacements for source in r.new_sources])
@@ -133,9 +140,10 @@ def prepare(runner: TaskRunner, versions: Mapping[str, Version]) -> OnlineChange
             found._globals.append((running, new, carrying[key].globals))
         move, own = carrying[key].program(running.st_declared, new.st_declared)
         if _tasks(units[0]) != _tasks(units[1]):
-            reasons.append("the tasks of its CONFIGURATION change, which the PLC takes at its start")
-        if layout_hash([bound]) != layout_hash([BoundProgram(bound.name, new)]):
-            reasons.append("its retained variables change, and their file holds those of the program that runs")
+            reasons.append(
+                "the tasks of its CONFIGURATION change, which the PLC takes at its start: keep them, or restart the run"
+            )
+        found._retention |= layout_hash([bound]) != layout_hash([BoundProgram(bound.name, new)])
         sources = tuple(source for source in runner.sources if source.program == bound.name)
         found.changes.append(ProgramChange(bound.name, _first_changed(sources, version), own, reasons))
         found._replacements.append(_Replacement(bound, Version(type(running), sources), new, version.sources, move))
@@ -143,7 +151,11 @@ def prepare(runner: TaskRunner, versions: Mapping[str, Version]) -> OnlineChange
         if change.program in owners:  # the first program of a resource also reports what the programs share
             change.differences.add(owners[change.program].shared)
         if names := change.differences.references:
-            change.refused.append(f"{', '.join(names)}: a reference cannot be taken over")
+            many = len(names) > 1
+            change.refused.append(
+                f"{', '.join(names)}: {'references refer to variables' if many else 'a reference refers to a variable'} of the "
+                "version that runs and cannot be taken over: restart the programs with `fieldtwin plc restart`"
+            )
     return found
 
 

@@ -69,6 +69,8 @@ class DecisionReader:
         """
         self._programs = {f"P_{identifier(one.name)}": one for one in unit.programs}
         """The programs of the unit by the names of their Python classes."""
+        self._where: Where | None = None
+        """That of the decision that was read last, because most decisions of a scan have the same one."""
 
     def read(self, body: Any, resource: Resource, name: str, record: Record) -> Decided | None:
         """Return the decision that assigned the variable `name`, with the present values; None if its statement is not known.
@@ -79,7 +81,9 @@ class DecisionReader:
         if not record:
             return None
         reader, instance = self._writer(body, record)
-        where = Where(self, body, resource, instance)
+        where = self._where
+        if where is None or where.root is not body or where.writer is not instance or where.resource is not resource:
+            where = self._where = Where(self, body, resource, instance)
         plan = reader.plan(record[1], name)
         if plan is None:
             return None

@@ -6,12 +6,13 @@ The runner is driven with a manual clock. Expected values of blocks come from IE
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
@@ -314,7 +315,6 @@ def test_the_version_before_can_return_with_the_values_of_now(tmp_path: Path) ->
             [("VAR_OUTPUT pump : BOOL; END_VAR", "VAR pump : BOOL; END_VAR")],
             "output pump changes (output of kind bool -> local of kind bool), but the system file binds it to d.pump",
         ),
-        ([("VAR n : INT;", "VAR RETAIN kept : INT; END_VAR VAR n : INT;")], "its retained variables change"),
         ([("mode : Mode;", "mode : Other;"), ("Mode#run", "Other#a")], "2 was stop and is c"),
     ],
 )
@@ -334,7 +334,10 @@ def test_a_reference_is_refused_because_it_refers_to_a_variable_of_the_version_t
     plc = Plc(tmp_path, body)
     plc.until(50)
     assert plc.outputs()["control.n"] == 5
-    assert plc.refused(edited(("ref^ + 1", "ref^ + 2"), text=body)) == "ref: a reference cannot be taken over"
+    assert plc.refused(edited(("ref^ + 1", "ref^ + 2"), text=body)) == (
+        "ref: a reference refers to a variable of the version that runs and cannot be taken over: restart the programs with "
+        "`fieldtwin plc restart`"
+    )
 
 
 def test_the_tasks_of_a_configuration_stay(tmp_path: Path) -> None:
@@ -344,7 +347,9 @@ def test_the_tasks_of_a_configuration_stay(tmp_path: Path) -> None:
     plc = Plc(tmp_path, BODY, BLOCKS + configuration)
     plc.until(50)
     later = BLOCKS + edited(("T#10ms", "T#20ms"), text=configuration)
-    assert plc.refused(BODY, later) == "the tasks of its CONFIGURATION change, which the PLC takes at its start"
+    assert plc.refused(BODY, later) == (
+        "the tasks of its CONFIGURATION change, which the PLC takes at its start: keep them, or restart the run"
+    )
     plc.change(edited(("n := n + 1;", "n := n + 100;")), BLOCKS + "\n" + configuration)
     plc.until(70)
     assert plc.outputs()["control.n"] == 106
@@ -375,7 +380,9 @@ def test_a_variable_that_another_program_reads_stays(tmp_path: Path) -> None:
     renamed = edited(
         ("n : INT;", "m : INT;"), ("n := n + 1;", "m := m + 1;"), ("at.x := n;", ""), ("n MOD 2", "m MOD 2")
     )
-    assert plc.refused(renamed) == "local n is removed, but program reader uses it"
+    assert plc.refused(renamed) == (
+        "local n is removed, but program reader uses it: keep it, or change its user as well and restart the run"
+    )
     plc.change(edited(("n := n + 1;", "n := n + 100;")))
     plc.until(80)  # the reader sees the value of the scan before
     assert (plc.outputs()["reader.seen"], plc.outputs()["control.n"]) == (106, 206)
@@ -421,6 +428,99 @@ def test_retained_variables_continue_and_are_saved(tmp_path: Path) -> None:
     assert plc.runner.retained.start == "warm start"
     plc.until(100)
     assert plc.outputs()["control.kept"] == 26 + 20
+
+
+RETAINED = edited(
+    ("VAR n : INT;", "VAR RETAIN kept : INT; gone : INT; typed : INT; END_VAR VAR n, plain : INT;"),
+    ("n := n + 1;", "n := n + 1; kept := kept + 1; gone := n; typed := n; plain := 100 + n;"),
+)
+RETAINED_LATER = edited(
+    ("kept : INT; gone : INT; typed : INT;", "kept : INT; typed : DINT := 7; added : INT := 40; plain : INT;"),
+    ("n, plain : INT;", "n : INT;"),
+    ("gone := n; typed := n; plain := 100 + n;", "added := added + 1;"),
+    text=RETAINED,
+)
+
+
+def started_again(plc: Plc) -> TaskRunner:
+    """Return the PLC of a new process that finds the files as a kill left them."""
+    bound = [p.bind(plc.config.python_path) for p in plc.config.programs]
+    layout = image_for(bound, PLANT)
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    image = layout.attach(memory)
+    return TaskRunner(replace(plc.config, layout=layout.describe()), image, lambda: plc.now_ns)
+
+
+def test_retained_variables_may_be_added_removed_and_change_their_type(tmp_path: Path) -> None:
+    plc = Plc(tmp_path, RETAINED)
+    plc.until(50)
+    assert plc.runner.retained.values() == {"control": {"kept": 5, "gone": 5, "typed": 5}}
+    change = plc.change(RETAINED_LATER)
+    differences = change.changes[0].differences
+    assert (differences.new, differences.removed) == (["added"], ["gone"])
+    assert differences.changed == ["typed (VAR INT -> VAR DINT)"]
+    plc.until(80)
+    now = {"control": {"kept": 8, "typed": 7, "added": 42, "plain": 106}}
+    assert plc.runner.retained.values() == now
+    # killed: the file is as the last scan left it
+    again = started_again(plc)
+    assert (again.retained.start, again.retained.values()) == ("warm start", now)
+
+
+def test_a_kill_between_the_edit_and_the_change_keeps_the_variables_that_are_the_same(tmp_path: Path) -> None:
+    plc = Plc(tmp_path, RETAINED)
+    plc.until(50)
+    plc.write(RETAINED_LATER)
+    again = started_again(plc)
+    assert again.retained.start == ("warm start; with initial values: control.typed, control.added, control.plain")
+    assert again.retained.values() == {"control": {"kept": 5, "typed": 7, "added": 40, "plain": 0}}
+    assert (tmp_path / "retain.old").exists()
+
+
+def test_a_return_to_the_version_before_keeps_what_both_retain(tmp_path: Path) -> None:
+    plc = Plc(tmp_path, RETAINED)
+    plc.until(50)
+    change = plc.change(RETAINED_LATER)
+    plc.runner.between_scans(prepare(plc.runner, change.before).commit)
+    plc.until(80)
+    kept = plc.runner.retained.values()["control"]
+    assert (kept["kept"], sorted(kept)) == (8, ["gone", "kept", "typed"])
+    # the file still has the later version, which the next start takes
+    again = started_again(plc)
+    assert again.retained.values()["control"]["kept"] == 8
+
+
+def test_the_first_and_the_last_retained_variable_may_come_and_go(tmp_path: Path) -> None:
+    plc = Plc(tmp_path)
+    plc.until(30)
+    retained = edited(("VAR n : INT;", "VAR RETAIN n : INT; END_VAR VAR"))
+    plc.change(retained)
+    plc.until(60)
+    assert plc.runner.retained.values() == {"control": {"n": 6}}
+    assert started_again(plc).retained.values() == {"control": {"n": 6}}
+    saves = plc.runner.retained.status().saves
+    plc.change(BODY)
+    plc.until(90)
+    assert plc.runner.retained.values() == {}
+    assert plc.outputs()["control.n"] == 9
+    assert not (tmp_path / "retain").exists()
+    plc.change(retained)
+    plc.until(110)
+    assert plc.runner.retained.values() == {"control": {"n": 11}}
+    assert plc.runner.retained.status().saves > saves
+
+
+def test_a_change_of_retained_variables_without_room_for_their_file_changes_nothing(tmp_path: Path) -> None:
+    plc = Plc(tmp_path, RETAINED)
+    plc.until(50)
+    plc.write(RETAINED_LATER)
+    change = plc.prepare()
+    (tmp_path / "retain.new").mkdir()
+    with pytest.raises(Unreachable, match="no file for retained variables"):
+        change.commit()
+    plc.until(80)
+    assert plc.runner.retained.values() == {"control": {"kept": 8, "gone": 8, "typed": 8}}
 
 
 def test_a_step_continues_and_an_active_step_cannot_be_removed(tmp_path: Path) -> None:

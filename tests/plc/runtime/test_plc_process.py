@@ -6,11 +6,12 @@ import asyncio
 import json
 import mmap
 import os
+import random
 import signal
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -364,3 +365,49 @@ def test_a_missing_empty_or_foreign_image_is_refused(tmp_path: Path) -> None:
     (tmp_path / "image").write_bytes(bytes(config.image_layout().size))
     with pytest.raises(FileInvalid, match="not a process image"):
         plc_main(config)
+
+
+ROUNDS = 6
+
+
+@pytest.mark.long
+@pytest.mark.timeout(240)
+def test_retained_variables_survive_a_kill_after_or_during_a_change_of_them(tmp_path: Path) -> None:
+    """Each round: the program gets a retained variable or loses it, and the process is killed during the change or after it."""
+    counting = "PROGRAM p VAR RETAIN kept : DINT;{} END_VAR kept := kept + 1;{} END_PROGRAM"
+    versions = [counting.format("", ""), counting.format(" more : DINT := 1000;", " more := more + 1;")]
+    source = tmp_path / "count.st"
+    program, chance = ProgramConfig("p", "count.st"), random.Random(1)
+    source.write_text(versions[0])
+
+    async def main() -> None:
+        kept = more = 0
+        for number in range(1, ROUNDS + 1):
+            (tmp_path / "image").unlink(missing_ok=True)
+            (tmp_path / "plc.sock").unlink(missing_ok=True)
+            config = config_in(tmp_path, program, cycle_ms=2, retain_path=str(tmp_path / "retain"))
+            async with plc_running(config) as (child, _, client):
+                status = await got(client, lambda s: s["state"] == "running" and s["scans"] > 0)
+                start = status["retain"]["start"]
+                assert start == "cold start" if number == 1 else start.startswith("warm start"), (number, start)
+                assert start == "warm start" or number % 3 == 1, (
+                    "the whole file is valid unless the change was not complete"
+                )
+                assert (await client.call("get"))["retained"]["p"]["kept"] > kept
+                now = (await got(client, lambda s: s["scans"] > 20))["retained"]["p"]
+                assert now.get("more", more) >= more, number
+                source.write_text(versions[number % 2])
+                prepared = await client.call("prepare_change", 60.0)
+                applied = asyncio.create_task(client.call("apply_change", number=prepared["number"]))
+                if number % 3:
+                    await applied
+                    now = (await got(client, lambda s: s["changes"]["count"] == 1))["retained"]["p"]
+                else:
+                    await asyncio.sleep(chance.random() / 500)
+                kept, more = now["kept"], now.get("more", 0)
+                child.kill()
+                await child.wait()
+                with suppress(RemoteError, Unreachable):
+                    await applied
+
+    run(main(), 230)

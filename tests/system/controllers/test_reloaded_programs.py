@@ -135,7 +135,8 @@ def test_a_reload_can_be_checked_refused_and_reversed(tmp_path: Path, monkeypatc
         assert f"{tmp_path}/pump.st:{line}:24: a variable 'nothing' is not declared" in reload(expected=3)
         write(tmp_path, ("go : INT;", "went : INT;"))
         refused = reload(expected=1)
-        assert "output go is removed, but the system file binds it to drive.run   (needs a restart)" in refused
+        assert "output go is removed, but the system file binds it to drive.run: keep it, or change" in refused
+        assert "(needs a restart)" in refused
         assert "Nothing was changed" in refused
         write(tmp_path, ("version := 1", "version := 2"))
         assert "1 change, which can be applied at run time" in reload("--check")

@@ -49,8 +49,11 @@ def module_of(text: str) -> ModuleType:
 
 
 def _folder() -> Path:
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(cache).expanduser() / "fieldtwin" / "machine-code"
+    """Return the folder of the compiled modules. Raises `NoCompiler` for a user without a home directory."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "fieldtwin" / "machine-code"
+    except RuntimeError as e:
+        raise NoCompiler("the user has no home directory; set XDG_CACHE_HOME") from e
 
 
 def _key(text: str) -> str:

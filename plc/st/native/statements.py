@@ -6,7 +6,7 @@ Each function returns 0, or 1 if Python must take over, or 2 if the statements o
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.plc.st.native.expressions import Expressions, Value, c_type
@@ -139,9 +139,9 @@ class _Body:
     def text(self, statements: Sequence[ast.stmt]) -> str:
         return "".join(self._statement(one) for one in statements)
 
-    def declarations(self, parameters: object) -> str:
+    def declarations(self, parameters: Iterable[str]) -> str:
         """Return the declarations of the C variables that are not parameters."""
-        given = set(parameters)  # type: ignore[call-overload]
+        given = set(parameters)
         kinds = self.expressions.locals
         made = "".join(f"{c_type(kind)} {name} = 0;\n" for name, kind in kinds.items() if name not in given)
         ranges = sorted(self.expressions.ranges)
@@ -166,9 +166,7 @@ class _Body:
                 raise Unsupported(ast.unparse(node))
             self._labels += 1
             names = [f"t{self._labels}_{n}" for n in range(len(value.elts))]
-            values = [
-                self.expressions.value(each) for each in value.elts
-            ]  # all are computed before the first assignment
+            values = [self.expressions.value(each) for each in value.elts]  # computed before the first assignment
             text = "".join(f"{c_type(v.kind)} {name} = {v.text};\n" for name, v in zip(names, values, strict=True))
             pairs = zip(target.elts, names, values, strict=True)
             return f"{{ {text}{''.join(self._set(one, Value(name, v.kind)) for one, name, v in pairs)} }}\n"

@@ -163,8 +163,8 @@ class Resource:
 
 def attributes_of(body: Any) -> dict[str, Any]:
     """Return the attributes of the object of a PROGRAM, whose class has slots if it has machine code."""
-    names = getattr(type(body), "__slots__", None)
-    return vars(body) if names is None else {name: getattr(body, name) for name in names if hasattr(body, name)}
+    names = (name for name in getattr(type(body), "__slots__", ()) if name != "__dict__" and hasattr(body, name))
+    return {**{name: getattr(body, name) for name in names}, **vars(body)}
 
 
 def line_of_error(error: BaseException, files: Sequence[str]) -> tuple[str, int] | None:
@@ -192,7 +192,7 @@ def _numbered(roots: tuple[Any, ...]) -> dict[int, int]:
         if isinstance(value, list):
             waiting += value
         elif hasattr(value, "__dict__"):
-            waiting += vars(value).values()
+            waiting += attributes_of(value).values()
         elif hasattr(value, "__slots__"):
             waiting += [getattr(value, name, None) for name in value.__slots__]
         else:

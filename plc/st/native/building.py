@@ -79,7 +79,7 @@ def _compile(text: str, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             source, made = Path(folder) / "program.c", Path(folder) / path.name
-            source.write_text(text, encoding="ascii")
+            source.write_text(text, encoding="utf-8")  # a name in a namespace has a dot that is not ASCII
             command = [*_command(), "-o", str(made), str(source), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
             if done.returncode:

@@ -181,8 +181,9 @@ class Layouts:
 def _assigned(init: ast.FunctionDef | None) -> Iterator[tuple[str, ast.expr]]:
     """Yield the attributes that a class sets first, each with its value."""
     for node in init.body if init is not None else ():
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Attribute):
-            yield node.targets[0].attr, node.value
+        target = node.targets[0] if isinstance(node, ast.Assign) else None
+        if isinstance(target, ast.Attribute) and isinstance(node, ast.Assign) and ast.unparse(target.value) == "self":
+            yield target.attr, node.value
 
 
 def _lines_in(node: ast.AST, owner: str) -> Iterator[str]:

@@ -98,11 +98,10 @@ def _written(reason: str) -> str:
 
 
 def _attributes(node: ast.ClassDef) -> list[str]:
-    """Return the attributes that the methods of a class set."""
+    """Return the attributes that the methods of a class set, and the dictionary for those that the run-time library sets."""
     set_in = [each for each in ast.walk(node) if isinstance(each, ast.Attribute) and isinstance(each.ctx, ast.Store)]
-    return list(
-        dict.fromkeys(each.attr for each in set_in if isinstance(each.value, ast.Name) and each.value.id == "self")
-    )
+    own = [each.attr for each in set_in if isinstance(each.value, ast.Name) and each.value.id == "self"]
+    return [*dict.fromkeys(own), "__dict__"]
 
 
 def _groups(

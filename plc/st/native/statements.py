@@ -36,6 +36,8 @@ class Translation:
     functions: dict[tuple[str, tuple[str, ...]], Function] = field(default_factory=dict)
     blocks: dict[str, str] = field(default_factory=dict)
     """By structure: the C function that executes the block."""
+    actions: dict[str, set[tuple[str, str]]] = field(default_factory=dict)
+    """By C function of an ACTION: the attributes that it uses."""
     shared: set[tuple[str, str]] = field(default_factory=set)
     """The global variables that blocks and FUNCTIONs use."""
     structures: dict[str, Layout] = field(default_factory=dict)
@@ -80,6 +82,26 @@ class Translation:
             )
             self.blocks[name] = f"x_{name}"
         return self.blocks[name]
+
+    def action(self, layout: Layout, name: str) -> tuple[str, set[tuple[str, str]]]:
+        """Return the C function of an ACTION, and the attributes that it uses. Raises `Unsupported`."""
+        c_name = f"a_{layout.name}_{name}"
+        if c_name not in self.actions:
+            method = layout.methods.get(name)
+            if method is None or len(method.args.args) != 1 or c_name in self._active:
+                raise Unsupported(f"a call of {name.partition('_')[2]}")
+            self._active.add(c_name)
+            try:
+                body = _Body(self, layout)
+                text = body.text(method.body)
+            finally:
+                self._active.discard(c_name)
+            self.texts.append(
+                f"static int {c_name}(struct S_{layout.name} *self, struct Context *c, struct S_globals *g) {{\n"
+                f"{body.declarations(())}{text}return 0; bail: return 1;\n}}\n"
+            )
+            self.actions[c_name] = body.expressions.used
+        return c_name, self.actions[c_name]
 
     def function(self, name: str, kinds: tuple[str, ...]) -> Function:
         """Return a FUNCTION for arguments of these kinds. Raises `Unsupported`."""
@@ -338,6 +360,12 @@ class _Body:
             function = self._unit.block(layout.name)
             arguments = "".join(f", {self.expressions.of_kind(each, 'int')}" for each in call.args)
             return f"if ({function}(&{text}, c, g{arguments})) goto bail;\n"
+        if isinstance(call.func, ast.Attribute) and ast.unparse(call.func.value) == "self" and self._layout is not None:
+            if call.args or call.keywords:
+                raise Unsupported(f"a call of {call.func.attr.partition('_')[2]}")
+            action, used = self._unit.action(self._layout, call.func.attr)
+            self.expressions.used |= used
+            return f"if ({action}(self, c, g)) goto bail;\n"
         if ast.unparse(call.func) in ("_v.put", "_v.fill"):
             raise Unsupported("the assignment of a structure or array as a whole")
         raise Unsupported(f"the call {ast.unparse(call)}")

@@ -22,7 +22,7 @@ from fieldtwin.plc.st.native.building import NoCompiler
 from fieldtwin.plc.st.native.machine import MachineCode, with_machine_code
 from fieldtwin.plc.st.native.suspension import resume, suspend
 from fieldtwin.plc.st.program import StProgram, load_source, program_class
-from fieldtwin.plc.st.resource import line_of_error
+from fieldtwin.plc.st.resource import attributes_of, line_of_error
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 try:
@@ -108,6 +108,13 @@ WHOLE = {
         "v(go := go); p.n := v.n; p.x := v.pos.x; many[2].x := p.x; many[1 + ABS(n MOD 3)].n := n; k := n MOD 2;\n"
         "valves[ABS(k)](go := NOT go); k := valves[1].n;",
     ),
+    "actions": (
+        "go : BOOL; n : INT;",
+        "k, m : INT; t : TON;",
+        "IF go THEN Up(); ELSE Down(); END_IF; t(IN := go, PT := T#20ms);\n"
+        "ACTION Up: k := k + n; IF k > 100 THEN RETURN; END_IF; m := m + 1; END_ACTION\n"
+        "ACTION Down: k := k - 1; total := total + k; END_ACTION",
+    ),
     "RETURN": ("go : BOOL; n : INT;", "k : INT;", "IF n > 3 THEN k := n; RETURN; END_IF; k := k - 1;"),
     "subrange": ("n : INT;", "s : Percent; w : WORD;", "s := ABS(n MOD 90); w.3 := n > 2; w := SHL(w, 1) OR 1;"),
 }
@@ -151,10 +158,12 @@ def content(value: Any) -> Any:
         return tuple(type(each).__name__ if hasattr(each, "execute") else content(each) for each in value)
     if isinstance(value, list):
         return [content(each) for each in value]
+    if hasattr(value, "__dict__") and not callable(value):
+        return content(attributes_of(value))
     names = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
-    if names and not isinstance(value, bool | int | str):
-        return {name: content(getattr(value, name)) for name in names if hasattr(value, name)}
-    return content(vars(value)) if hasattr(value, "__dict__") and not callable(value) else value
+    if isinstance(value, bool | int | str) or not names:
+        return value
+    return {name: content(getattr(value, name)) for name in names if hasattr(value, name)}
 
 
 class Both:

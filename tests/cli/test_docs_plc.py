@@ -81,11 +81,11 @@ def test_the_chart_fills_settles_and_counts_a_batch_once() -> None:
         (5050, True, 2),
         (5060, True, 0),
     )
-    for ms, start, level in scans:  # the condition of a transition sees the T of the scan before
+    for ms, start, level in scans:  # the condition of a transition sees the T of the present scan
         tank.start, tank.level = start, float(level)
         st_scan(tank, 2, ms)
         seen.append((tank.valve, tank.batches))
-    assert seen == [(False, 0), (True, 1), (True, 1), (False, 1), (False, 1), (False, 1), (True, 2)]
+    assert seen == [(False, 0), (True, 1), (True, 1), (False, 1), (False, 1), (True, 2), (True, 2)]
 
 
 def test_every_command_that_the_page_names_exists() -> None:

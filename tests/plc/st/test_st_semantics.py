@@ -159,7 +159,6 @@ def test_comments_nest_and_hide_whatever_is_in_them() -> None:
         ("TYPE A : (x); B : (y); END_TYPE PROGRAM p VAR a : A; END_VAR\nCASE a OF y: ; END_CASE END_PROGRAM",
          2, 11, "a label of CASE"),
         ("PROGRAM p VAR s : STRING; END_VAR\ns := T#1s * s; END_PROGRAM", 2, 11, "operands of *"),
-        ("VAR_GLOBAL RETAIN\n x : INT; END_VAR", 1, 1, "RETAIN"),
         ("FUNCTION f : INT\nVAR RETAIN x : INT; END_VAR END_FUNCTION", 2, 1, "RETAIN"),
         ("FUNCTION f : INT VAR f : INT; END_VAR f := 1; END_FUNCTION", 1, 10, "name of the function's result"),
         ("PROGRAM p VAR a : INT; b : INT := a; END_VAR END_PROGRAM", 1, 35, "'a' is not declared"),

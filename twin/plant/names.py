@@ -35,4 +35,6 @@ def incomplete_in(system: System, programs: Iterable[BoundProgram]) -> frozenset
     A program is also complete if all its variables are bound to tags, although it then publishes no name.
     """
     known = {*system.devices, *system.buses, *(program.name for program in programs)}
-    return frozenset({*system.file.data["devices"], *system.file.data["buses"], *system.plc.programs} - known)
+    return frozenset(
+        {*system.file.data.get("devices", {}), *system.file.data.get("buses", {}), *system.plc.programs} - known
+    )

@@ -322,8 +322,8 @@ class SystemForm(SiteModel):
 
     fieldtwin: Literal[1]
     system: Name = Field(examples=["mysite"])
-    buses: dict[Name, BusForm] = Field(min_length=1)
-    devices: dict[Name, DeviceForm] = Field(min_length=1)
+    buses: dict[Name, BusForm] = Field(default={}, description="none only with programs of the PLC")
+    devices: dict[Name, DeviceForm] = Field(default={}, description="none only with programs of the PLC")
     plc: PlcForm = Field(default=PlcForm(), description="default: no programs, only the gateway")
     remote: Literal["local", "remote"] = "local"
     commands: CommandsForm = CommandsForm()
@@ -434,6 +434,6 @@ class PrototypeForm(SiteModel):
     prototype_of: str = Field(examples=["mysite.yaml"])
     unmapped: Literal["refuse"] = "refuse"
     seed: int = 1
-    buses: dict[Name, BusMappingForm | Literal["plant"]]
+    buses: dict[Name, BusMappingForm | Literal["plant"]] = Field(default={})
     simulations: dict[Name, SimulationForm] = Field(default={})
-    devices: dict[Name, EmulatedForm]
+    devices: dict[Name, EmulatedForm] = Field(default={})

@@ -89,9 +89,19 @@ def load_system(name: str, profiles: Iterable[Path] = (), errors: ErrorCollector
         return _resolve(file, form, path, tuple(profiles), collector)
 
 
+def _check_sections(file: YamlFile, form: SystemForm) -> None:
+    """Raise `FileInvalid` for buses without devices, and for a system with neither devices nor programs."""
+    if form.buses and not form.devices:
+        raise file.error(("buses",), "no device is on the buses", expected="`devices` with at least one device")
+    if not form.devices and not form.plc.programs:
+        expected = "`buses` and `devices`, or `plc` with a program that needs no field devices"
+        raise file.error((), "a system without devices and programs", expected=expected)
+
+
 def _resolve(
     file: YamlFile, form: SystemForm, path: Path, profiles: tuple[Path, ...], errors: ErrorCollector
 ) -> System:
+    _check_sections(file, form)
     buses: dict[str, BusConfig] = {}
     for name, bus in form.buses.items():
         with errors.collect():
@@ -170,7 +180,7 @@ def _device(
 ) -> DeviceConfig:
     loc: tuple[Key, ...] = ("devices", name)
     if d.bus not in buses:
-        if d.bus in file.data["buses"]:
+        if d.bus in file.data.get("buses", {}):
             raise FollowingError(f"the bus {d.bus!r} has an error", path=file.path)
         raise file.error(
             (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=did_you_mean(d.bus, buses)

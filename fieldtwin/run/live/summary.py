@@ -329,6 +329,8 @@ def _published_checks(run: RunFacts) -> list[str]:
     if published["wrong"]:
         told = f"{published['wrong']} published values never occurred in their device"
         return [told, *published["examples"], *messages]
+    if not run.system.devices:  # a PLC that only a client of its servers uses
+        return messages
     return messages if published["checked"] else ["no value was published with good quality", *messages]
 
 

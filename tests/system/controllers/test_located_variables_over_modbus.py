@@ -10,6 +10,7 @@ import json
 import shutil
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from procs import CHECKOUT, Fieldtwin, fieldtwin, wait_for
@@ -183,3 +184,23 @@ def test_the_variables_of_an_instance_have_the_registers_of_var_config(
     assert struct.unpack(">h", words(client, 20, 1)) == (51,)
     plc = run.control("p", "plc")
     assert [row["value"] for row in plc("image", tags=["main.gain.y", "main.gain.x"])["tags"]] == [51, 10]
+
+
+@pytest.mark.long
+def test_a_plc_without_field_devices_serves_its_variables(tmp_path: Path) -> None:
+    (tmp_path / "main.st").write_text("PROGRAM Main VAR scans AT %QW3 : INT; END_VAR scans := scans + 1; END_PROGRAM")
+    (tmp_path / "line.yaml").write_text(
+        "fieldtwin: 1\nsystem: line\nplc:\n  programs:\n    main: {source: main.st}\n"
+        'serve:\n  hmi: {url: "tcp://127.0.0.1:1502", addresses: openplc, write: true}\n'
+    )
+    with fieldtwin(
+        tmp_path / "r", "run", str(tmp_path / "line.yaml"), "--prototype", "--instance", "p", "--json"
+    ) as run:
+        gateway = run.control("p", "gateway")
+        address = wait_for(lambda: gateway("get")["serve"]["hmi"]["listening"], 20, "a server")
+        client = ModbusTcpClient("127.0.0.1", port=int(str(address).rpartition(":")[2]))
+        assert client.connect()
+        wait_for(lambda: not client.read_holding_registers(3, count=1).isError(), 20, "the PLC's first scan")
+        before = words(client, 3, 1)
+        wait_for(lambda: words(client, 3, 1) != before, 5, "another scan")
+        client.close()

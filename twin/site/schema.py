@@ -5,9 +5,9 @@ The plant reads `SystemForm` only. `PrototypeForm` describes a separate file, wh
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from fieldtwin.twin.site.alarm_forms import AlarmForm
 from fieldtwin.twin.site.base_forms import (
@@ -174,10 +174,15 @@ class StartForm(SiteModel):
     )
 
 
+_SOURCE_OR_FILES = {
+    "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": 32}]
+}
+
+
 class ProgramForm(SiteModel):
     """A program of the PLC: its source, and the tags to which its variables are bound."""
 
-    source: str = Field(examples=["control.st"])
+    source: Annotated[str, WithJsonSchema(_SOURCE_OR_FILES)] = Field(examples=["control.st", ["main.st", "blocks.st"]])
     dialect: Literal["standard", "codesys", "twincat", "matiec"] = Field(
         default="standard", description="of a source in Structured Text"
     )
@@ -207,6 +212,18 @@ class ProgramForm(SiteModel):
         description="for `plc prove`: by name an expression over its variables that is TRUE before every scan, such as a limit "
         "of an input",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_files(cls, data: Any) -> Any:
+        """Take the first of several files for the source, and the others like libraries: it uses their declarations."""
+        files = data.get("source") if isinstance(data, dict) else None
+        if not isinstance(files, list) or not files or not all(isinstance(one, str) for one in files):
+            return data
+        libraries = data.get("libraries", [])
+        if not isinstance(libraries, list):
+            return data
+        return {**data, "source": files[0], "libraries": [*files[1:], *libraries]}
 
 
 class TaskForm(SiteModel):

@@ -134,9 +134,9 @@ class Expressions:
         owner = node.value.id if isinstance(node.value, ast.Name) else ""
         if owner == "_c":
             if node.attr in ("now_ns", "scan_ns", "left", "scan"):
-                return Value(f"c->{'now_ns' if node.attr == 'scan_ns' else node.attr}", "int")
+                return Value(f"c->f_{'now_ns' if node.attr == 'scan_ns' else node.attr}", "int")
             if node.attr == "first_scan":
-                return Value("c->first_scan", "bool")
+                return Value("c->f_first_scan", "bool")
             raise Unsupported(f"_c.{node.attr}")
         if owner == "self" and node.attr in self._constants:
             return self._constant(ast.Constant(self._constants[node.attr]))  # type: ignore[arg-type]

@@ -57,13 +57,11 @@ class ModuleText:
         return one.size if one.kind == "array" else 0 if one.kind in ("line", "lines") else 1
 
     def text(self) -> str:
-        layouts = [self._globals, *self.classes]
+        blocks = len(self._translation.structures)
+        layouts = [_CONTEXT, *self.classes[:blocks], self._globals, *self.classes[blocks:]]
         parts = [
             files("fieldtwin.plc.st.native").joinpath("runtime.h").read_text(encoding="ascii"),
-            *(self._structure(layout) for layout in [*self._translation.structures.values()]),
-            self._structure(self._globals),
-            *(self._structure(layout) for layout in self.classes[len(self._translation.structures) :]),
-            self._entries(_CONTEXT),
+            *(self._structure(layout) for layout in layouts),
             *(self._entries(layout) for layout in layouts),
             self._tables(),
             *self._translation.texts,
@@ -77,10 +75,9 @@ class ModuleText:
         return f"struct S_{layout.name} {{\n  PyObject *object;\n{members}}};\n"
 
     def _entries(self, layout: Layout) -> str:
-        structure = f"struct {'Context' if layout is _CONTEXT else f'S_{layout.name}'}"
         entries, objects = "", 0
         for one in layout.fields.values():
-            entries += f"  {self._entry(layout is _CONTEXT, structure, one, objects)},\n"
+            entries += f"  {self._entry(layout, one, objects)},\n"
             objects += self._objects_of(one)
         names = "".join(f'"{name}", ' for name in layout.fields)
         return (
@@ -89,8 +86,7 @@ class ModuleText:
             f"static Py_ssize_t O_{layout.name}[{len(layout.fields) + 1}];\n"
         )
 
-    def _entry(self, context: bool, structure: str, one: Field, objects: int) -> str:
-        member = one.name if context else one.c_name
+    def _entry(self, layout: Layout, one: Field, objects: int) -> str:
         kind, of, block = _KINDS.get(one.kind, one.kind.upper()), "0", "0"
         if one.kind in ("block", "blocks"):
             block = str(self._numbers[one.of])
@@ -98,7 +94,7 @@ class ModuleText:
             of = _KINDS[one.of]
         elif one.kind == "line" and one.values:
             kind = "RECORD"
-        return f"{{{kind}, {of}, {block}, {one.size}, {objects}, offsetof({structure}, {member})}}"
+        return f"{{{kind}, {of}, {block}, {one.size}, {objects}, offsetof(struct S_{layout.name}, {one.c_name})}}"
 
     def _tables(self) -> str:
         layouts = [_CONTEXT, self._globals, *self.classes]
@@ -106,9 +102,8 @@ class ModuleText:
         return f"static const struct Class TABLE[] = {{\n{rows}}};\nenum {{ COUNT = {len(layouts)} }};\n"
 
     def _row(self, of: Layout) -> str:
-        size = f"sizeof(struct {'Context' if of is _CONTEXT else f'S_{of.name}'})"
         tables = f"E_{of.name}, N_{of.name}, O_{of.name}"
-        return f"{_values(of)}, {len(of.fields)}, {self._objects[of.name]}, {size}, {tables}"
+        return f"{_values(of)}, {len(of.fields)}, {self._objects[of.name]}, sizeof(struct S_{of.name}), {tables}"
 
     def _run(self, run: Run) -> str:
         name, layout = run.c_name, run.layout
@@ -125,7 +120,7 @@ static const int UG_{name}[] = {{{", ".join(map(str, [*uses["_G"], 0]))}}};
 static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_t count) {{
   static struct S_{layout.name} now, old;
   static struct S_globals g_now, g_old;
-  static struct Context c_now, c_old;
+  static struct S_Context c_now, c_old;
   static PyObject *objects[{objects}], *g_objects[{shared}], *c_objects[{len(_CONTEXT.fields)}];
   const struct Values s = {{(char *)&now, (char *)&old, objects}}, g = {{(char *)&g_now, (char *)&g_old, g_objects}};
   const struct Values c = {{(char *)&c_now, (char *)&c_old, c_objects}};
@@ -136,7 +131,7 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
       || load_globals(b, UG_{name}, {len(uses["_G"])}, given[2], &g)) Py_RETURN_NONE;
   int result = {name}(&now, &c_now, &g_now);
   if (result != 1) {{
-    int64_t scan = c_now.scan;
+    int64_t scan = c_now.f_scan;
     PyObject *published = PyObject_GetAttrString(given[1], "published");
     struct Publication p;
     int is_published = published && PyTuple_CheckExact(published);

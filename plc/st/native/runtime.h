@@ -13,7 +13,6 @@
 enum { BOOL, INT, FLOAT, OPTIONAL, BLOCK, BLOCKS, ARRAY, LINE, RECORD, LINES };
 enum { MAX_VALUES = 8 };
 
-struct Context { int64_t now_ns, left, scan; char first_scan; };
 struct Line { int32_t code, count; };
 /* The record of an assignment by the statement of `maker`; NULL for a FUNCTION, which has no object. */
 struct Record { int32_t code, count; PyObject *maker; int64_t key; int64_t values[MAX_VALUES]; };
@@ -164,7 +163,7 @@ INLINE int take(int kind, PyObject *v, const struct Values *s, size_t offset, in
 FAST static int load(const struct Bound *b, int of, const int *use, int n, PyObject *o, const struct Values *s) {
   const struct Class *c = &CLASSES[of];
   if (o == NULL || Py_TYPE(o) != b->types[of]) return 1;
-  if (of > 1) *(PyObject **)s->now = o;  /* the structure of each class but the context begins with its object */
+  *(PyObject **)s->now = o;  /* each structure begins with its object */
   for (int k = 0; k < n; k++) {
     int i = use ? use[k] : k;
     const struct Entry *e = &c->entries[i];

@@ -77,7 +77,7 @@ class Translation:
             self.shared |= {one for one in body.expressions.used if one[0] == "_G"}
             arguments = "".join(f", int64_t {one.arg}" for one in method.args.args[1:])
             self.texts.append(
-                f"static int x_{name}(struct S_{name} *self, struct Context *c, struct S_globals *g{arguments}) {{\n"
+                f"static int x_{name}(struct S_{name} *self, struct S_Context *c, struct S_globals *g{arguments}) {{\n"
                 f"{body.declarations(one.arg for one in method.args.args)}{text}return 0; bail: return 1;\n}}\n"
             )
             self.blocks[name] = f"x_{name}"
@@ -97,7 +97,7 @@ class Translation:
             finally:
                 self._active.discard(c_name)
             self.texts.append(
-                f"static int {c_name}(struct S_{layout.name} *self, struct Context *c, struct S_globals *g) {{\n"
+                f"static int {c_name}(struct S_{layout.name} *self, struct S_Context *c, struct S_globals *g) {{\n"
                 f"{body.declarations(())}{text}return 0; bail: return 1;\n}}\n"
             )
             self.actions[c_name] = body.expressions.used
@@ -124,9 +124,7 @@ class Translation:
                 raise Unsupported(f"the function {name.partition('_')[2]}, which has no result")
             c_name = "_".join([name, *kinds])
             arguments = "".join(f", {c_type(kind)} {one}" for one, kind in zip(names, kinds, strict=True))
-            head = (
-                f"static int {c_name}(struct Context *c, struct S_globals *g, {c_type(body.result)} *result{arguments})"
-            )
+            head = f"static int {c_name}(struct S_Context *c, struct S_globals *g, {c_type(body.result)} *result{arguments})"
             made = f"{head} {{\n{body.declarations(names)}{text}return 0; bail: return 1;\n}}\n"
             self.functions[key] = Function(c_name, body.result, made)
             self.texts.append(made)
@@ -140,7 +138,7 @@ class Translation:
         body = _Body(self, layout, returned=RETURNED)
         text = body.text(statements)
         self.texts.append(
-            f"static int {c_name}(struct S_{layout.name} *self, struct Context *c, struct S_globals *g) {{\n"
+            f"static int {c_name}(struct S_{layout.name} *self, struct S_Context *c, struct S_globals *g) {{\n"
             f"{body.declarations(())}{text}return 0; bail: return 1;\n}}\n"
         )
         return body.expressions.used | self.shared
@@ -213,7 +211,7 @@ class _Body:
             if isinstance(target.value, ast.Name) and target.value.id == "_c":
                 if target.attr != "left":
                     raise Unsupported(ast.unparse(target))
-                return f"c->left = {value.text};\n"
+                return f"c->f_left = {value.text};\n"
             text, field = self.expressions.place(target)
             kind, given = field.kind, f"{text} = {value.text};"
         else:
@@ -232,7 +230,7 @@ class _Body:
         text, field = self.expressions.place(target)
         if field.kind != "line":
             raise Unsupported(ast.unparse(target))
-        return self._record(f"&{text}", field, value)
+        return self._record(f"(&{text})", field, value)
 
     def _element_line(self, target: ast.Subscript, value: ast.expr) -> str:
         assert isinstance(target.value, ast.Attribute)
@@ -248,23 +246,22 @@ class _Body:
             raise Unsupported("a record without the number of the scan")
         return self._record(f"record_at((struct Lines *)&{text}, {array.size}, {index})", field, value)
 
-    def _record(self, text: str, field: Field, value: ast.expr) -> str:
+    def _record(self, line: str, field: Field, value: ast.expr) -> str:
         """Translate a record: a constant, or the number of the scan, a constant, the object, and values of indices."""
         if isinstance(value, ast.Constant) or (isinstance(value, ast.Tuple) and _is_constant(value)):
-            line = text.removeprefix("&")
-            return f"{line}.code = {self._unit.constant(value)}; {line}.count = -1;\n"
+            return f"{line}->code = {self._unit.constant(value)}; {line}->count = -1;\n"
         maker = ast.unparse(value.elts[2]) if isinstance(value, ast.Tuple) else ""
         if not isinstance(value, ast.Tuple) or ast.unparse(value.elts[0]) != "_c.scan" or maker not in ("self", "None"):
             raise Unsupported("a record of an assignment")
-        given = [self.expressions.of_kind(each, "int") for each in value.elts[RECORD_HEAD:]]
-        if any(self.expressions.value(each).kind != "int" for each in value.elts[RECORD_HEAD:]):
+        given = [self.expressions.value(each) for each in value.elts[RECORD_HEAD:]]
+        if any(each.kind != "int" for each in given):
             raise Unsupported("an index that is not an integer")
         field.values = max(field.values, 1, len(given))
         code = self._unit.constant(value.elts[1])
-        texts = [f"record_->values[{n}] = {each};" for n, each in enumerate(given)]
+        texts = [f"record_->values[{n}] = {each.text};" for n, each in enumerate(given)]
         of = "(PyObject *)self->object" if maker == "self" else "NULL"
         body = f"record_->code = {code}; record_->maker = {of}; record_->count = {len(given)}; {' '.join(texts)}"
-        return f"{{ struct Record *record_ = {text}; {body} }}\n"
+        return f"{{ struct Record *record_ = {line}; {body} }}\n"
 
     # -- control ------------------------------------------------------------------------------------------------------
 

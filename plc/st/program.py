@@ -33,7 +33,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.classes.instance_variables import is_instance_variable
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
-from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance
+from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, declared_name
 from fieldtwin.plc.st.compiler.pous.programs import METHODS, CompiledProgram, ProgramVariable, connection
 from fieldtwin.plc.st.compiler.scope import identifier
 from fieldtwin.plc.st.coverage.recording import active_recording
@@ -281,7 +281,7 @@ class StProgram(Program):
         """Return the pictures of the program. They are made once for a class."""
         if cls.st_pictures is None:
             variables = [(v.name, v.kind) for v in cls.st_declared.variables]
-            cls.st_pictures = pictures_of(cls.st_unit, cls.st_declared.name, variables)
+            cls.st_pictures = pictures_of(cls.st_unit, cls.st_declared.declared_name, variables)
         return cls.st_pictures
 
     def drawings(self) -> list[tuple[str, str]]:
@@ -399,7 +399,7 @@ def program_class(
     and of the program, if they are known already; the `source` of the unit is not used then.
     """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
-    names = [*(p.name for p in unit.programs), *missing]
+    names = [*(p.name for p in unit.programs if p.declared_name == p.name), *missing]
     instance = instance_of(unit, name)
     wanted = instance.program if instance is not None else name or (names[0] if len(names) == 1 else "")
     found = next((p for p in unit.programs if p.name.lower() == wanted.lower()), None)
@@ -413,18 +413,20 @@ def program_class(
             expected=", ".join((*names, *(one.name for one in unit.instances))) or "a PROGRAM in the file",
             hint="write SOURCE:NAME, because it has several" if len(names) > 1 else "",
         )
-    connecting = [one.name for one in unit.instances if one.program == found.name and one.connected]
-    if instance is None and connecting:
+    special = [one for one in unit.instances if declared_name(one.program) == found.name and one.is_special]
+    if instance is None and special:
         hint = "write SOURCE:NAME with the name of one of them"
-        message = f"which program of the configuration is meant, because they connect the variables of {found.name}"
-        raise FileInvalid(message, path=unit.path, expected=", ".join(connecting), hint=hint)
+        connecting = any(one.connected for one in special)
+        why = "connect the variables" if connecting else "have different values for variables"
+        message = f"which program of the configuration is meant, because they {why} of {found.name}"
+        raise FileInvalid(message, path=unit.path, expected=", ".join(one.name for one in special), hint=hint)
     connected = instance.connected if instance is not None else frozenset()
     tags = {v.name: made for v in found.variables if (made := _tag_of(v, connected)) is not None}
     if takes_writes:
         tags = {WRITES: message_input(), **tags}
     decided = DecisionReader(
         unit,
-        found.name,
+        found.declared_name,
         found.own,
         decisions_of(unit.source) if decisions is None else decisions,
         frozenset(v.name.lower() for v in found.variables if v.role == "input"),
@@ -479,7 +481,7 @@ def _class_of(
         "__module__": __name__,
         **{name: _Method(getattr(StProgram, name)) if name in METHODS else tag for name, tag in tags.items()},
     }
-    made: type[StProgram] = type(found.name, (StProgram,), body)
+    made: type[StProgram] = type(found.declared_name, (StProgram,), body)
     made.variables = {**StProgram.variables, **{name: replace(tag, name=name) for name, tag in tags.items()}}
     return made
 
@@ -526,11 +528,11 @@ def instance_of(unit: CompiledUnit, name: str = "") -> CompiledInstance | None:
 
     An empty `name` stands for the only PROGRAM of the unit. Return None if no program or several programs match.
     """
-    programs = [p.name for p in unit.programs]
+    programs = [p.name for p in unit.programs if p.declared_name == p.name]
     wanted = (name or (programs[0] if len(programs) == 1 else "")).lower()
     if wanted not in {program.lower() for program in programs}:
         return next((one for one in unit.instances if one.name.lower() == wanted), None)
-    found = [one for one in unit.instances if one.program.lower() == wanted]
+    found = [one for one in unit.instances if declared_name(one.program).lower() == wanted]
     return found[0] if len(found) == 1 else None
 
 

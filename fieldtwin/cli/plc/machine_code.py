@@ -43,7 +43,7 @@ def translated(units: Iterable[CompiledUnit]) -> list[Translated]:
     found = []
     for unit in units:
         made = translation_of(unit)
-        for program in unit.programs:
+        for program in (one for one in unit.programs if one.declared_name == one.name):
             name = f"P_{identifier(program.name)}"
             kept = tuple((one.line, one.reason) for one in made.kept.get(name, ()))
             found.append(Translated(program.name, program.path, made.statements.get(name, 0), kept))

@@ -21,7 +21,12 @@ from fieldtwin.plc.st.classes.instance_variables import without_instance_variabl
 from fieldtwin.plc.st.classes.structures import with_inherited_members
 from fieldtwin.plc.st.compiler.assignments import Arrays, Assigned, Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.called import with_called_programs
-from fieldtwin.plc.st.compiler.configurations.instances import CompiledInstance, compiled_instances, with_configured
+from fieldtwin.plc.st.compiler.configurations.instances import (
+    CompiledInstance,
+    compiled_instances,
+    declared_name,
+    with_configured,
+)
 from fieldtwin.plc.st.compiler.configurations.located import (
     misplaced,
     overlaps,
@@ -234,12 +239,13 @@ class _Unit:
 
     def _names(self) -> Iterator[tuple[str, str]]:
         for pou in self.unit.pous:
-            yield pou.name.lower(), pou.name
+            yield pou.name.lower(), declared_name(pou.name)
             for name in (*(one.name for one in pou.actions), *(one.name for one in pou.methods)):
                 yield f"{pou.name}.{name}".lower(), name
 
     def _kinds(self) -> tuple[str, ...]:
-        pous = [pou.kind.lower().replace("_", " ") for pou in self.unit.pous if not is_hidden(pou.name)]
+        declared = (pou for pou in self.unit.pous if declared_name(pou.name) == pou.name and not is_hidden(pou.name))
+        pous = [pou.kind.lower().replace("_", " ") for pou in declared]
         variables = sum(len(block.variables) for block in self.unit.globals)
         return (*pous, *["type"] * len(self.unit.types), *["global variable"] * variables)
 

@@ -117,7 +117,7 @@ class DecisionReader:
 
     def _program(self, program: CompiledProgram) -> DecisionReader:
         """Return the reader of a program as others see it, which also shows its inputs."""
-        return self._other(program.name.lower(), program.own)
+        return self._other(program.declared_name.lower(), program.own)
 
     def _values(self, plan: _Plan, record: Record, where: Where) -> tuple[Decided, list[tuple[Access, Found]]]:
         """Return a decision with its values, and the variables that are followed."""

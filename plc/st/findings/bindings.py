@@ -40,12 +40,12 @@ def binding_findings(
 def _read_variables(program: StProgram) -> frozenset[str]:
     """Return the variables that the PROGRAM and its methods use, in lower case."""
     unit = program.st_unit.source
-    own = [pou for pou in unit.pous if pou.name.lower() == program.st_declared.name.lower()]
+    own = [pou for pou in unit.pous if pou.name.lower() == program.st_declared.declared_name.lower()]
     refs = [
         one for pou in own for one in nodes((pou.body, pou.actions, pou.chart, pou.methods)) if isinstance(one, t.Ref)
     ]
     connected = [name for one in unit.instances for name in (one.name.lower(), one.program.lower())]
-    if program.st_declared.name.lower() in connected:  # a CONFIGURATION may read its variables
+    if program.st_declared.declared_name.lower() in connected:  # a CONFIGURATION may read its variables
         return frozenset(v.name.lower() for v in program.st_declared.variables)
     return frozenset(ref.name.lower() for ref in refs)
 

@@ -132,7 +132,7 @@ def _refuse_shared(question: Question, compiled: CompiledUnit) -> None:
 
     The programs that it calls are part of it.
     """
-    others = [p.name for p in compiled.programs if p.name.lower() != question.program.lower()]
+    others = [p.name for p in compiled.programs if p.declared_name.lower() != question.program.lower()]
     blocks = [block for block in question.unit.globals if "CONSTANT" not in block.qualifiers and block.variables]
     if others and blocks:
         shared = blocks[0].variables[0]

@@ -335,13 +335,17 @@ class Instance:
 
 @dataclass(frozen=True, slots=True)
 class ConfiguredVariable:
-    """A variable in VAR_CONFIG: the address of a variable that is declared at ``%I*`` or similar, or its initial value."""
+    """A variable in VAR_CONFIG: the address of a variable that is declared at ``%I*`` or similar, or its initial value.
+
+    `path` is that of the source, and `target` the one that the compiler uses, in lower case; "" before it is known.
+    """
 
     pos: Pos
     path: tuple[str, ...]
     location: str
     type: TypeSpec
     initial: Init | None
+    target: str = ""
 
 
 @dataclass(frozen=True, slots=True)

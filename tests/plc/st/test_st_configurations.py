@@ -136,8 +136,8 @@ def test_var_config_gives_an_address_and_an_initial_value() -> None:
         ),
         (
             "END_CONFIGURATION",
-            "VAR_CONFIG a.n : INT := 1; b.n : INT := 2; END_VAR END_CONFIGURATION",
-            "two programs of one type have different values",
+            "VAR_CONFIG a.n : INT := 1; a.n : INT := 2; END_VAR END_CONFIGURATION",
+            "VAR_CONFIG a.n: it has a value already",
         ),
     ],
 )

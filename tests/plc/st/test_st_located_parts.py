@@ -252,17 +252,17 @@ def test_wrong_places_of_addresses_are_refused(text: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ("a.fault AT %IX0.1", "a.flaw AT %IX0.1", "VAR_CONFIG main.a.flaw: no variable at .* has this path"),
+        ("a.fault AT %IX0.1", "a.flaw AT %IX0.1", "VAR_CONFIG Res.main.a.flaw: no variable at .* has this path"),
         ("a.fault AT %IX0.1", "b.fault AT %IX0.1", "VAR_CONFIG Res.main.b.fault: Main has no such variable"),
-        ("a.fault AT %IX0.1", "a.fault AT %QX0.7", r"VAR_CONFIG main.a.fault: the address %QX0.7; expected an address in %I"),
-        ("a.fault AT %IX0.1", "a.fault AT %I*", r"VAR_CONFIG main.a.fault: the address %I\*; expected"),
-        ("a.starts AT %MW7 : INT", "a.starts AT %MW7 : UINT", "VAR_CONFIG main.a.starts: another type; expected INT; got UINT"),
+        ("a.fault AT %IX0.1", "a.fault AT %QX0.7", r"VAR_CONFIG Res.main.a.fault: the address %QX0.7; expected an address in %I"),
+        ("a.fault AT %IX0.1", "a.fault AT %I*", r"VAR_CONFIG Res.main.a.fault: the address %I\*; expected"),
+        ("a.starts AT %MW7 : INT", "a.starts AT %MW7 : UINT", "VAR_CONFIG .*main.a.starts: another type; expected INT; got UINT"),
         (
             "more[3].run AT %QX0.2",
-            "more[3].run AT %QX0.1", "VAR_CONFIG main.more.3..run: %QX0.1 is the address of another variable",
+            "more[3].run AT %QX0.1", "VAR_CONFIG Res.main.more.3..run: %QX0.1 is the address of another variable",
         ),
         ("a(on := TRUE);", "a(on := %QX0.1);", "VAR_CONFIG main.a.run: %QX0.1 is the address of another variable"),
-        ("more[3].run", "more[4].run", "VAR_CONFIG main.more.4..run: no variable at"),
+        ("more[3].run", "more[4].run", "VAR_CONFIG Res.main.more.4..run: no variable at"),
         ("more[3].run", "more[i].run", "not a path such as Resource.Instance.Variable"),
         ("Res.main.a.fault", "Main.a.fault", "VAR_CONFIG Main.b.fault: no program of the configuration"),
     ],

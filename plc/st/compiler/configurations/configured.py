@@ -16,12 +16,12 @@ from fieldtwin.plc.st.syntax.addresses import address_of, area_of
 class ConfiguredParts:
     """The variables in VAR_CONFIG that belong to instances of function blocks or to structures.
 
-    `unit.configured` has only these, with the name of a PROGRAM or of a global variable at the beginning of each path.
+    `unit.configured` has only these, with the name of a PROGRAM or of a global variable at the beginning of each `target`.
     """
 
     def __init__(self, env: Environment, declarations: Declarations, unit: t.SourceUnit) -> None:
         self._env, self._declarations = env, declarations
-        self._stated = {".".join(one.path).lower(): one for one in unit.configured}
+        self._stated = {one.target: one for one in unit.configured}
         self._globals = {
             name.lower() for b in unit.globals for name in (b.list, *(v.name for v in b.variables)) if name
         }

@@ -13,6 +13,14 @@ from fieldtwin.plc.st.syntax.addresses import address_of, area_of
 from fieldtwin.plc.st.syntax.errors import invalid
 from fieldtwin.plc.st.syntax.written import text_of
 
+COPY = ".."
+"""It separates the names of a PROGRAM and of the program of a configuration for which the PROGRAM is copied."""
+
+
+def declared_name(name: str) -> str:
+    """Return the name of a POU as the source declares it, also of a copy."""
+    return name.partition(COPY)[0]
+
 
 @dataclass(frozen=True, slots=True)
 class CompiledTask:
@@ -30,12 +38,20 @@ class CompiledTask:
 
 @dataclass(frozen=True, slots=True)
 class CompiledInstance:
-    """A program that a configuration runs: its name, the PROGRAM, its task, and the variables of the program that it connects."""
+    """A program that a configuration runs: its name, the PROGRAM, its task, and the variables of the program that it connects.
+
+    `program` is a copy of the PROGRAM (`with_configured`) if VAR_CONFIG gives this program values of its own.
+    """
 
     name: str
     program: str
     task: CompiledTask | None
     connected: frozenset[str]
+
+    @property
+    def is_special(self) -> bool:
+        """Return whether the program differs from others of its type."""
+        return bool(self.connected) or declared_name(self.program) != self.program
 
 
 def compiled_instances(
@@ -81,61 +97,110 @@ def _task(env: Environment, task: t.Task, declarations: Declarations) -> Compile
 def with_configured(unit: t.SourceUnit, *, vendor: bool) -> t.SourceUnit:
     """Return `unit` with the addresses and initial values of VAR_CONFIG in the declarations of its programs.
 
-    The result keeps those of parts of variables (`configured`); each path begins with the name of a PROGRAM or global variable.
-    In a vendor's dialect a path may begin with the name of a PROGRAM, because its project has no CONFIGURATION.
-    Raises `FileInvalid` for a variable that does not exist or already has an address, and for programs of one type with
-    different values.
+    If the programs of one type differ in them, each program with values of its own gets a copy of its PROGRAM (`copy_of`).
+    The result keeps the variables of parts (`configured`); each `target` begins with the name of a PROGRAM, or of its copy, or
+    of a global variable. In a vendor's dialect a path may begin with the name of a PROGRAM, because its project has no
+    CONFIGURATION. Raises `FileInvalid` for a variable that does not exist or already has an address or a value.
     """
     if not unit.configured:
         return unit
-    changed: dict[tuple[str, str], t.ConfiguredVariable] = {}
-    for one in unit.configured:
-        program, name = _target(unit, one, vendor=vendor)
-        before = changed.setdefault((program.name.lower() if program else "", name), one)
-        if (before.location, before.initial) != (one.location, one.initial):
-            _fail(one, "two programs of one type have different values", expected="a PROGRAM for each of them")
-    parts = tuple(
-        replace(one, path=tuple(part for part in (program, name) if part))
-        for (program, name), one in changed.items()
-        if "." in name or "[" in name
-    )
-    pous = tuple(_with_values(pou, changed) if pou.kind == "PROGRAM" else pou for pou in unit.pous)
-    return replace(unit, pous=pous, configured=parts)
-
-
-def _target(unit: t.SourceUnit, one: t.ConfiguredVariable, *, vendor: bool) -> tuple[t.Pou | None, str]:
-    """Return the program that declares a variable of VAR_CONFIG, and the variable's path in it, in lower case.
-
-    The program is None for a part of a global variable.
-    """
+    values = _values_of(unit, vendor=vendor)
     programs = {pou.name.lower(): pou for pou in unit.pous if pou.kind == "PROGRAM"}
-    instances = {instance.name.lower(): programs.get(instance.program.lower()) for instance in unit.instances}
+    of_global = values.pop("", {})
+    parts = [replace(one, target=path) for path, one in of_global.items()]
+    pous: dict[str, list[t.Pou]] = {}
+    renamed: dict[str, str] = {}
+    for key, program in programs.items():
+        instances = [one.name.lower() for one in unit.instances if one.program.lower() == key]
+        own = {name: values[f"{key}{COPY}{name}"] for name in instances if f"{key}{COPY}{name}" in values}
+        common = values.get(key, {})
+        if _are_common(instances, own):
+            common, own = {**common, **next(iter(own.values()), {})}, {}
+        pous[key] = [_with_values(program, common), *(
+            _with_values(copy_of(program, name), {**common, **changed}) for name, changed in own.items()
+        )]  # fmt: skip
+        renamed |= {name: copy_of(program, name).name for name in own}
+        for of, changed in ((program, common), *((copy_of(program, n), {**common, **c}) for n, c in own.items())):
+            parts += [
+                replace(one, target=f"{of.name.lower()}.{path}") for path, one in changed.items() if _is_part(path)
+            ]
+    return replace(
+        unit,
+        pous=tuple(one for pou in unit.pous for one in (pous[pou.name.lower()] if pou.kind == "PROGRAM" else [pou])),
+        instances=tuple(replace(one, program=renamed.get(one.name.lower(), one.program)) for one in unit.instances),
+        configured=tuple(parts),
+    )
+
+
+def copy_of(program: t.Pou, instance: str) -> t.Pou:
+    """Return the copy of a PROGRAM for one program of a configuration. No source can declare a POU with its name."""
+    return replace(program, name=f"{program.name}{COPY}{instance}")
+
+
+def _are_common(instances: list[str], own: dict[str, dict[str, t.ConfiguredVariable]]) -> bool:
+    """Return whether the PROGRAM itself can have the values that VAR_CONFIG states for its `instances`: there is only one, or
+    all have the same initial values and no addresses, because programs at one address share one variable.
+    """
+    if len(instances) <= 1 or not own:
+        return True
+    first, *others = ({path: (v.location, v.initial) for path, v in of.items()} for of in own.values())
+    addresses = any(location for location, _ in first.values())
+    return len(own) == len(instances) and not addresses and all(other == first for other in others)
+
+
+def _values_of(unit: t.SourceUnit, *, vendor: bool) -> dict[str, dict[str, t.ConfiguredVariable]]:
+    """Return the variables of VAR_CONFIG by PROGRAM, by program of a configuration (``program..instance``), or "" for global
+    ones, and then by their path in it, in lower case.
+    """
+    found: dict[str, dict[str, t.ConfiguredVariable]] = {}
+    for one in unit.configured:
+        owner, path = _target(unit, one, vendor=vendor)
+        before = found.setdefault(owner, {}).setdefault(path, one)
+        if (before.location, before.initial) != (one.location, one.initial):
+            place = f"line {before.pos.line}"
+            _fail(one, "it has a value already", expected=f"one entry for the variable, which is in {place}")
+    return found
+
+
+def _is_part(path: str) -> bool:
+    return "." in path or "[" in path
+
+
+def _target(unit: t.SourceUnit, one: t.ConfiguredVariable, *, vendor: bool) -> tuple[str, str]:
+    """Return the owner of a variable of VAR_CONFIG as in `_values_of`, and the variable's path in it, in lower case."""
+    programs = {pou.name.lower(): pou for pou in unit.pous if pou.kind == "PROGRAM"}
+    instances = {instance.name.lower(): instance for instance in unit.instances}
     path = [name.lower() for name in one.path]
     if path[0] not in instances and len(path) > 1 and path[1] in instances:
-        path.pop(0)  # the resource
-    program = instances.get(path[0]) or (programs.get(path[0]) if vendor else None)
+        resource = instances[path[1]].resource
+        if path.pop(0) != resource.lower() and resource:
+            _fail(one, f"no resource {one.path[0]}", expected=resource)
+    instance = instances.get(path[0])
+    program = programs.get(instance.program.lower() if instance else path[0] if vendor else "")
     if program is None:
         names = {name.lower() for b in unit.globals for name in (b.list, *(v.name for v in b.variables)) if name}
         if len(path) > 1 and path[0].partition("[")[0] in names:
-            return None, ".".join(path)
+            return "", ".".join(path)
         known = [i.name for i in unit.instances] or [pou.name for pou in programs.values() if vendor]
         _fail(one, "no program of the configuration has this name", expected=", ".join(known) or "a CONFIGURATION")
+    owner = (copy_of(program, instance.name) if instance else program).name.lower()
     declared = {v.name.lower(): v for block in program.blocks for v in block.variables}
     name = path[1].partition("[")[0] if len(path) > 1 else ""
     variable = declared.get(name)
     if variable is None:
         _fail(one, f"{program.name} has no such variable", expected=", ".join(v.name for v in declared.values()))
-    if len(path) > 2 or "[" in path[1]:
-        return program, ".".join(path[1:])
-    if one.location and (address_of(variable.location) or area_of(variable.location) != area_of(one.location)):
-        wanted = f"{variable.name} AT %{area_of(one.location)}* in {program.name}"
-        _fail(one, f"{variable.name} cannot get the address {one.location}", expected=wanted)
-    return program, path[1]
+    inside = ".".join(path[1:])
+    if not _is_part(inside) and one.location:
+        area = area_of(one.location)
+        if address_of(variable.location) or area_of(variable.location) != area:
+            wanted = f"{variable.name} AT %{area}* in {program.name}"
+            _fail(one, f"{variable.name} cannot get the address {one.location}", expected=wanted)
+    return owner, inside
 
 
-def _with_values(pou: t.Pou, changed: dict[tuple[str, str], t.ConfiguredVariable]) -> t.Pou:
+def _with_values(pou: t.Pou, changed: dict[str, t.ConfiguredVariable]) -> t.Pou:
     def configured(v: t.VarDecl) -> t.VarDecl:
-        one = changed.get((pou.name.lower(), v.name.lower()))
+        one = changed.get(v.name.lower())
         if one is None:
             return v
         return replace(v, location=one.location or v.location, initial=one.initial or v.initial)

@@ -115,7 +115,9 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
     for pou in unit.pous:
         names = [*_addresses(pou.blocks)] if pou.kind in _BLOCKS else []
         names += [node.name for node in nodes(pou) if isinstance(node, t.Ref) and node.name.startswith("%")]
+        several = [one for one in unit.instances if one.program.lower() == pou.name.lower()][1:]
         places += [(pou.name.lower(), name) for name in names]
+        places += [(f"{pou.name.lower()}{number}", name) for number in range(len(several)) for name in names]
     places += [
         ("", ref.name) for ref in nodes(_connections(unit)) if isinstance(ref, t.Ref) and ref.name.startswith("%")
     ]

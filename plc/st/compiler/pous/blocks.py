@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.assignments import Recorded, is_recorded
+from fieldtwin.plc.st.compiler.configurations.instances import declared_name
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT, FIXED
 from fieldtwin.plc.st.compiler.pous.functions import Functions
 from fieldtwin.plc.st.compiler.pous.variables import Variables
@@ -75,7 +76,8 @@ class Bodies:
             for v in block.variables if block.kind in ("VAR_IN_OUT", "VAR_TEMP") else ():
                 symbol = symbols.get(v.name.lower())
                 if symbol is not None:
-                    reason = f"{v.name} is a {block.kind} of {pou.name} and does not exist while a method is executed"
+                    owner = declared_name(pou.name)
+                    reason = f"{v.name} is a {block.kind} of {owner} and does not exist while a method is executed"
                     found[v.name.lower()] = replace(symbol, refused=reason)
         return found
 

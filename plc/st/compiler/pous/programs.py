@@ -11,6 +11,7 @@ from fieldtwin.plc.program import Program
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.assignments import Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.configured import ConfiguredParts
+from fieldtwin.plc.st.compiler.configurations.instances import declared_name
 from fieldtwin.plc.st.compiler.configurations.located import Offered, offered
 from fieldtwin.plc.st.compiler.configurations.parts import MAX_PARTS, Parts
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
@@ -60,11 +61,16 @@ class ProgramVariable:
 
 @dataclass(frozen=True, slots=True)
 class CompiledProgram:
-    """A PROGRAM, and the file in which it is declared."""
+    """A PROGRAM, or its copy for a program of a configuration, and the file in which it is declared."""
 
     name: str
     path: str
     variables: tuple[ProgramVariable, ...]
+
+    @property
+    def declared_name(self) -> str:
+        """Return the name of the PROGRAM in the source."""
+        return declared_name(self.name)
 
     @property
     def own(self) -> list[tuple[str, ty.Type]]:
@@ -172,7 +178,7 @@ class Programs(Bodies):
         if argument.name.lower() in {name.lower() for name in known}:
             return True
         message, expected = (
-            f"{pou.name} has no {what} {argument.name!r}",
+            f"{declared_name(pou.name)} has no {what} {argument.name!r}",
             ", ".join(known) or f"a program with an {what}",
         )
         self.env.collected(self.env.error(argument.pos, message, expected=expected))
@@ -222,7 +228,7 @@ class Programs(Bodies):
         v, address = one.variable, address_of(one.variable.location)
         name = short_name(address) if _is_reserved(one.name) and address else one.name
         if name.lower() in taken or (_is_reserved(name) and v.location):
-            expected = f"a name that {pou.name} does not use"
+            expected = f"a name that {declared_name(pou.name)} does not use"
             self.env.fail(v.pos, f"the global variable {v.name} needs another name", expected=expected)
         taken.add(name.lower())
         role = _ROLES[area_of(v.location)] if v.location else "local"

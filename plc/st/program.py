@@ -518,7 +518,7 @@ def _tag_of(v: ProgramVariable, connected: frozenset[str]) -> Variable | None:
         words=tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else (),
         address=v.location,
         needs_tag=not (v.optional or v.name.lower() in connected),
-        located=v.optional,
+        located=v.optional and not v.unused,
         type=str(ty.plain(v.kind)),
     )
 

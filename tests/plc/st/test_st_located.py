@@ -37,7 +37,7 @@ def roles(made: Any) -> dict[str, tuple[Role, str]]:
     return {v.name: (v.role, v.address) for v in made.variables.values()}
 
 
-def test_a_program_offers_the_located_globals_that_it_uses() -> None:
+def test_a_program_offers_the_located_globals_that_it_uses_and_those_that_no_program_uses() -> None:
     made: Any = program(
         GLOBALS
         + """FUNCTION_BLOCK Count VAR_EXTERNAL level : INT; END_VAR level := level + 1; END_FUNCTION_BLOCK
@@ -51,6 +51,7 @@ END_PROGRAM"""
         "start": (Role.INPUT, "%IX0.0"),
         "lamp": (Role.OUTPUT, "%QX0.0"),
         "level": (Role.LOCAL, "%MW3"),
+        "spare": (Role.OUTPUT, "%QX0.7"),
     }
     scan(made)
     assert (made.lamp, made.level) == (False, 5)
@@ -80,9 +81,21 @@ def test_a_value_that_does_not_fit_the_size_of_its_address_is_refused() -> None:
 @pytest.mark.parametrize("declared", ["PROGRAM p VAR lamp AT %QX0.0 : BOOL; END_VAR", GLOBALS + "PROGRAM p"])
 def test_an_address_and_the_variable_that_is_declared_there_are_the_same(declared: str) -> None:
     made: Any = program(f"{declared}\n%Q0.0 := TRUE; %QX0.1 := lamp; END_PROGRAM")
-    assert set(roles(made)) == {"lamp", "QX0_1"}
+    assert set(roles(made)) - {"start", "level", "spare"} == {"lamp", "QX0_1"}
     scan(made)
     assert (made.lamp, made.QX0_1) == (True, True)
+
+
+def test_a_global_that_a_different_program_uses_is_not_offered() -> None:
+    text = GLOBALS + "PROGRAM a lamp := level > 3; END_PROGRAM PROGRAM b VAR n : INT; END_VAR n := n + 1; END_PROGRAM"
+    assert set(roles(program(text, "a"))) == {"lamp", "level", "start", "spare"}
+    assert set(roles(program(text, "b"))) == {"n", "start", "spare"}
+
+
+@pytest.mark.parametrize("declared", ["AT %QX0.7 : BOOL", "AT %MW3 : STRING", "AT %QX0.7 : ARRAY[1..2] OF BOOL"])
+def test_an_unused_global_that_a_program_cannot_offer_is_no_error(declared: str) -> None:
+    text = f"VAR_GLOBAL tag {declared}; END_VAR PROGRAM p VAR tag, QX0_7 : INT; END_VAR tag := QX0_7; END_PROGRAM"
+    assert set(roles(program(text))) == {"tag", "QX0_7"}
 
 
 def test_programs_that_declare_one_address_share_the_variable() -> None:

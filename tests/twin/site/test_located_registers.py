@@ -9,7 +9,7 @@ import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.runtime.serve import ServedTag
-from fieldtwin.twin.plant.physical import image_layout
+from fieldtwin.twin.plant.physical import image_layout, program_warnings
 from fieldtwin.twin.site.system import System, load_system
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "first-bug"
@@ -101,6 +101,34 @@ def test_programs_of_one_source_share_an_address_and_others_do_not(tmp_path: Pat
     assert [tag.address for tag in served(one)] == [1024, 1025]
     with pytest.raises(FileInvalid, match=r"%MW0 is a variable of two programs: p\.m and q\.m"):
         system_of(tmp_path, "m AT %MW0 : INT;", programs="p: {source: p.st}, q: {source: p.st}")
+
+
+UNUSED = """VAR_GLOBAL
+  q AT %QW3 : INT := 5; m AT %MW9 : INT := 9; i AT %IX2.0 : BOOL := TRUE; text AT %MW10 : STRING; a AT %QW20 : ARRAY[1..2] OF INT;
+END_VAR
+PROGRAM one VAR q : INT; END_VAR END_PROGRAM
+PROGRAM two VAR n : INT; END_VAR n := n + 1; END_PROGRAM
+"""
+
+
+def test_a_global_variable_that_no_program_uses_is_served(tmp_path: Path) -> None:
+    """OpenPLC serves each address of a project, also if no statement reads or writes it."""
+    (tmp_path / "two.st").write_text(UNUSED)
+    programs = "one: {source: two.st:one}, two: {source: two.st:two}"
+    system = system_of(tmp_path, "", "addresses: openplc, write: true", programs)
+    tags = {tag.tag: (tag.table, tag.address, tag.variable, tag.constant) for tag in served(system)}
+    assert tags == {
+        "one.QW3": ("holding", 3, "one.QW3", None),
+        "one.m": ("holding", 1033, "one.m", None),
+        "one.i": ("discrete", 16, "", True),
+    }
+    assert program_warnings(system) == ()
+
+
+def test_a_global_variable_that_only_one_program_uses_belongs_to_this_program(tmp_path: Path) -> None:
+    (tmp_path / "two.st").write_text(UNUSED.replace("n := n + 1", "m := m + 1"))
+    system = system_of(tmp_path, "", programs="one: {source: two.st:one}, two: {source: two.st:two}")
+    assert sorted(tag.tag for tag in served(system)) == ["one.QW3", "one.i", "two.m"]
 
 
 @pytest.mark.parametrize(

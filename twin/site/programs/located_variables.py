@@ -60,7 +60,7 @@ def served_by_address(
                     f"{v.location} is a variable of two programs: {before[0].tag} and {name}.{v.name}",
                     expected="one variable for each address",
                 )
-            if before is None or before[0].constant is not None:
+            if before is None or (before[0].constant is not None and served.constant is None):
                 found[place] = served, storage
     return [served for served, _ in found.values()]
 

@@ -17,11 +17,10 @@ an address and its place to the manufacturer; OpenPLC has one area for each size
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from fieldtwin.plc.st.compiler.configurations.parts import holders, type_name
 from fieldtwin.plc.st.syntax import tree as t
-from fieldtwin.plc.st.syntax.addresses import address_of, area_of, bits_of, short_name
+from fieldtwin.plc.st.syntax.addresses import address_of, area_of, bits_of
 from fieldtwin.plc.st.syntax.walk import nodes
 
 KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
@@ -41,7 +40,7 @@ def misplaced(unit: t.SourceUnit) -> Iterator[tuple[t.Pos, str, str]]:
     for pou in unit.pous:
         for part in (pou, *pou.methods):
             for block in part.blocks:
-                for v in _located([block]):
+                for v in located_in([block]):
                     where = f"{v.name} AT {v.location}: an address in {block.kind} of a {part.kind}"
                     if block.kind not in _BLOCKS.get(part.kind, ()):
                         expected = "VAR, VAR_INPUT or VAR_OUTPUT of a PROGRAM or FUNCTION_BLOCK, or VAR_GLOBAL"
@@ -65,20 +64,6 @@ def shared_addresses(blocks: Iterable[t.VarBlock]) -> Iterator[tuple[t.VarDecl, 
             yield variable, other
 
 
-@dataclass(frozen=True, slots=True)
-class Offered:
-    """A global variable that a program uses, and that is retained, or has an address or located parts (`parts`).
-
-    The program offers it, or its parts, as inputs, outputs or local variables. `name` is its name in the program, and `list` the
-    name of its global list, in lower case. A `retain` variable keeps its value.
-    """
-
-    name: str
-    list: str
-    variable: t.VarDecl
-    retain: bool
-
-
 def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
     """Return `unit` with the located variables of its programs in the blocks where they belong, in their order.
 
@@ -87,16 +72,16 @@ def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
     """
     uses = _uses(unit)
     shared = {address for address, places in uses.items() if len(places) > 1 or not places[0]}
-    declared = set(_addresses(unit.globals))
+    declared = set(addresses_in(unit.globals))
     programs = [pou for pou in unit.pous if pou.kind == "PROGRAM"]
     others = [pou for pou in unit.pous if pou.kind in _BLOCKS and pou.kind != "PROGRAM"]
     stated = {
         address_of(v.location): (v, block.qualifiers & RETAIN)
         for pou in (*reversed(others), *reversed(programs))
         for block in pou.blocks
-        for v in _located([block])
+        for v in located_in([block])
     }
-    local = set(_addresses(block for pou in programs for block in pou.blocks))
+    local = set(addresses_in(block for pou in programs for block in pou.blocks))
     added = []
     for address in uses:
         if address in shared | (uses.keys() - local) and address not in declared:
@@ -111,15 +96,15 @@ def without_addresses(unit: t.SourceUnit) -> t.SourceUnit:
 def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
     """Return the addresses that a unit uses, each with the POUs that use it; "" stands for VAR_GLOBAL."""
     found: dict[str, list[str]] = {}
-    places = [("", address) for address in _addresses(unit.globals)]
+    places = [("", address) for address in addresses_in(unit.globals)]
     for pou in unit.pous:
-        names = [*_addresses(pou.blocks)] if pou.kind in _BLOCKS else []
+        names = [*addresses_in(pou.blocks)] if pou.kind in _BLOCKS else []
         names += [node.name for node in nodes(pou) if isinstance(node, t.Ref) and node.name.startswith("%")]
         several = [one for one in unit.instances if one.program.lower() == pou.name.lower()][1:]
         places += [(pou.name.lower(), name) for name in names]
         places += [(f"{pou.name.lower()}{number}", name) for number in range(len(several)) for name in names]
     places += [
-        ("", ref.name) for ref in nodes(_connections(unit)) if isinstance(ref, t.Ref) and ref.name.startswith("%")
+        ("", ref.name) for ref in nodes(connections(unit)) if isinstance(ref, t.Ref) and ref.name.startswith("%")
     ]
     for place, address in places:
         if place not in found.setdefault(address, []):
@@ -129,7 +114,7 @@ def _uses(unit: t.SourceUnit) -> dict[str, list[str]]:
 
 def used_addresses(unit: t.SourceUnit) -> frozenset[str]:
     """Return the addresses that a unit uses, in their normal form."""
-    return frozenset(_uses(unit)) | frozenset(_addresses(block for pou in unit.pous for block in pou.blocks))
+    return frozenset(_uses(unit)) | frozenset(addresses_in(block for pou in unit.pous for block in pou.blocks))
 
 
 def overlaps(unit: t.SourceUnit, *, in_bytes: bool) -> Iterator[tuple[t.Pos, str, str]]:
@@ -138,9 +123,9 @@ def overlaps(unit: t.SourceUnit, *, in_bytes: bool) -> Iterator[tuple[t.Pos, str
     The items are the place, the address, and the earlier address (`fieldtwin.plc.st.syntax.addresses.bits_of`).
     """
     places = [
-        (address_of(v.location), v.pos) for v in _located((*unit.globals, *(b for p in unit.pous for b in p.blocks)))
+        (address_of(v.location), v.pos) for v in located_in((*unit.globals, *(b for p in unit.pous for b in p.blocks)))
     ]
-    refs = (node for node in nodes((unit.pous, _connections(unit))) if isinstance(node, t.Ref))
+    refs = (node for node in nodes((unit.pous, connections(unit))) if isinstance(node, t.Ref))
     direct = sorted(
         ((ref.name, ref.pos) for ref in refs if ref.name.startswith("%")),
         key=lambda one: (one[1].path, one[1].line, one[1].column),
@@ -159,7 +144,7 @@ def overlaps(unit: t.SourceUnit, *, in_bytes: bool) -> Iterator[tuple[t.Pos, str
             first.setdefault(bit, address)
 
 
-def _connections(unit: t.SourceUnit, program: str = "") -> tuple[t.Argument, ...]:
+def connections(unit: t.SourceUnit, program: str = "") -> tuple[t.Argument, ...]:
     """Return what configurations connect with variables of programs, or of the PROGRAM `program`, in lower case."""
     return tuple(
         argument
@@ -169,17 +154,19 @@ def _connections(unit: t.SourceUnit, program: str = "") -> tuple[t.Argument, ...
     )
 
 
-def _addresses(blocks: Iterable[t.VarBlock]) -> Iterator[str]:
-    return (address for v in _located(blocks) if (address := address_of(v.location)))
+def addresses_in(blocks: Iterable[t.VarBlock]) -> Iterator[str]:
+    """Return the full addresses of the variables in `blocks`, in their normal form."""
+    return (address for v in located_in(blocks) if (address := address_of(v.location)))
 
 
-def _located(blocks: Iterable[t.VarBlock]) -> Iterator[t.VarDecl]:
+def located_in(blocks: Iterable[t.VarBlock]) -> Iterator[t.VarDecl]:
+    """Return the variables in `blocks` that have an address, also one without a number."""
     return (v for block in blocks for v in block.variables if v.location)
 
 
 def _undeclared(unit: t.SourceUnit, address: str) -> t.VarDecl:
     """Return the declaration of an address that has none, at its first use."""
-    everything = nodes((unit.pous, _connections(unit)))
+    everything = nodes((unit.pous, connections(unit)))
     uses = (node for node in everything if isinstance(node, t.Ref) and node.name == address)
     pos = min((use.pos for use in uses), key=lambda pos: (pos.line, pos.column))
     return t.VarDecl(pos, address, t.NamedType(pos, _TYPES[address[2]]), None, address)
@@ -200,101 +187,3 @@ def _program(pou: t.Pou, known: frozenset[str]) -> t.Pou:
             else:
                 blocks.append(t.VarBlock(block.pos, kind, block.qualifiers, (v,)))
     return replace(pou, blocks=tuple(blocks))
-
-
-def offered(unit: t.SourceUnit, program: t.Pou) -> list[Offered]:
-    """Return the global variables with addresses or located parts, and the retained ones, that a program uses.
-
-    `unit` is the result of `without_addresses`.
-    """
-    with_parts = holders(unit)
-    retained = {
-        (block.list.lower(), v.name.lower())
-        for block in unit.globals
-        if block.qualifiers & RETAIN
-        for v in block.variables
-    }
-    located = {
-        (block.list.lower(), v.name.lower()): v
-        for block in unit.globals
-        if "CONSTANT" not in block.qualifiers
-        for v in block.variables
-        if v.location or type_name(v.type) in with_parts or (block.list.lower(), v.name.lower()) in retained
-    }
-    by_address = {address_of(v.location): key for key, v in reversed(located.items()) if address_of(v.location)}
-    found: dict[tuple[str, str], str] = {}
-    """The used variables with their names in the program."""
-
-    def add(key: tuple[str, str] | None) -> None:
-        if key is not None:
-            name = located[key].name
-            found.setdefault(key, short_name(name) if name.startswith("%") else name)
-
-    for pou in _reached(unit, program):
-        own = {v.name.lower() for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
-        for v in (v for b in pou.blocks if b.kind == "VAR_EXTERNAL" for v in _located([b]) if pou is program):
-            found[by_address[address_of(v.location)]] = v.name
-            own.add(v.name.lower())
-        for address in _addresses(pou.blocks) if pou.kind != "PROGRAM" else ():
-            add(by_address.get(address))
-        for ref in (node for node in nodes((pou.body, pou.actions, pou.methods)) if isinstance(node, t.Ref)):
-            add(_global(ref, own, located, by_address))
-    for ref in (n for n in nodes(_connections(unit, program.name.lower())) if isinstance(n, t.Ref)):
-        add(_global(ref, set(), located, by_address))
-    taken = {v.name.lower() for b in program.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables}
-    offers = []
-    for key in (key for key in located if key in found):
-        v, name = located[key], found[key]
-        if name.lower() in taken:
-            name = (
-                short_name(address) if (address := address_of(v.location)) else f"{key[0]}.{name}" if key[0] else name
-            )
-        taken.add(name.lower() if not v.location else "")
-        offers.append(Offered(name, key[0], v, key in retained))
-    return offers
-
-
-def _global(
-    ref: t.Ref, own: set[str], located: dict[tuple[str, str], t.VarDecl], by_address: dict[str, tuple[str, str]]
-) -> tuple[str, str] | None:
-    """Return the list and the name of the located global variable to which `ref` refers; None for any other reference."""
-    if ref.name.startswith("%"):
-        return by_address.get(ref.name)
-    name = ref.name.lower()
-    if name in own:
-        return None
-    first = ref.selectors[0] if ref.selectors else None
-    if isinstance(first, t.Member) and (name, first.name.lower()) in located:
-        return name, first.name.lower()
-    return next((key for key in located if key[1] == name), None)
-
-
-def _reached(unit: t.SourceUnit, program: t.Pou) -> list[t.Pou]:
-    """Return a program and the POUs that it calls or contains, directly or through others, with their bases."""
-    pous = {pou.name.lower(): pou for pou in unit.pous}
-    types: dict[str, list[t.TypeSpec]] = {}
-    for declared in unit.types:
-        if not isinstance(declared, t.EnumDecl):
-            inner = [v.type for v in declared.fields] if isinstance(declared, t.StructDecl) else [declared.type]
-            types[declared.name.lower()] = inner
-    instances = {v.name.lower(): v.type for block in unit.globals for v in block.variables}
-    found, seen, waiting = [program], {program.name.lower()}, [program]
-    while waiting:
-        pou = waiting.pop(0)
-        names = [*pou.extends]
-        everything = [*nodes((pou.blocks, pou.body, pou.actions, pou.methods))]
-        names += [node for node in everything if isinstance(node, t.NamedType)]
-        used = {name.name.lower() for name in names}
-        for ref in (node for node in everything if isinstance(node, t.Ref)):
-            of_list = ref.selectors[0] if ref.selectors else None
-            for name in (ref.name.lower(), of_list.name.lower() if isinstance(of_list, t.Member) else ""):
-                used |= {n.name.lower() for n in nodes(instances.get(name)) if isinstance(n, t.NamedType)}
-        used |= {node.ref.name.lower() for node in everything if isinstance(node, t.Call)}
-        new = used - seen
-        while new:
-            seen |= new
-            waiting += (more := [pous[name] for name in sorted(new) if name in pous])
-            found += more
-            inside = nodes(tuple(spec for name in new for spec in types.get(name, ())))
-            new = {n.name.lower() for n in inside if isinstance(n, t.NamedType)} - seen
-    return found

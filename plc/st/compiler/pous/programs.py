@@ -12,7 +12,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.assignments import Recorded, is_recorded
 from fieldtwin.plc.st.compiler.configurations.configured import ConfiguredParts
 from fieldtwin.plc.st.compiler.configurations.instances import declared_name
-from fieldtwin.plc.st.compiler.configurations.located import Offered, offered
+from fieldtwin.plc.st.compiler.configurations.offers import Offered, Offers
 from fieldtwin.plc.st.compiler.configurations.parts import MAX_PARTS, Parts
 from fieldtwin.plc.st.compiler.pous.blocks import Bodies
 from fieldtwin.plc.st.compiler.pous.functions import Functions
@@ -57,6 +57,8 @@ class ProgramVariable:
     steps: tuple[Key, ...] = ()
     of_block: str = ""
     """The function block, in lower case, of which it is a variable."""
+    unused: bool = False
+    """Whether it is a global variable that no program uses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +87,7 @@ class Programs(Bodies):
         super().__init__(variables, functions)
         self._unit = unit
         self._parts = Parts(unit, self.declarations)
+        self._offers = Offers(unit)
         self.configured = ConfiguredParts(self.env, self.declarations, unit)
         self.recorded: dict[str, Recorded] = {}
         """By class of a PROGRAM: the attributes whose assignments are recorded, among them its outputs and local variables."""
@@ -215,9 +218,11 @@ class Programs(Bodies):
         """Yield the located and the retained global variables, and located parts of global variables, that a program uses.
         `taken` has the names of its variables, in lower case.
         """
-        for one in offered(self._unit, pou):
+        for one in self._offers.of(pou):
             symbol = self.variables.offered(one)
             if symbol is None or symbol.constant is not None:
+                continue
+            if one.unused and (one.name.lower() in taken or _is_reserved(one.name) or not _is_bindable(symbol.type)):
                 continue
             of = self._offered_variable(one, symbol, taken, pou)
             if one.variable.location or one.retain:
@@ -236,7 +241,9 @@ class Programs(Bodies):
         if one.retain:
             self._check_retained(v, symbol.type)
         attribute = symbol.code.rpartition(".")[2]
-        return ProgramVariable(name, role, symbol.type, one.retain, attribute, True, address, optional=True)
+        return ProgramVariable(
+            name, role, symbol.type, one.retain, attribute, True, address, optional=True, unused=one.unused
+        )
 
     def _check_retained(self, v: t.VarDecl, kind: ty.Type) -> None:
         if ty.holds_interface(kind):

@@ -9,7 +9,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.classes.inheritance import INHERITED
 from fieldtwin.plc.st.compiler.calls import Calls
-from fieldtwin.plc.st.compiler.configurations.located import Offered
+from fieldtwin.plc.st.compiler.configurations.offers import Offered
 from fieldtwin.plc.st.compiler.declarations import Declarations
 from fieldtwin.plc.st.compiler.initial.order import in_order
 from fieldtwin.plc.st.compiler.initial.values import InitialValues

@@ -40,7 +40,7 @@ class CompiledTask:
 class CompiledInstance:
     """A program that a configuration runs: its name, the PROGRAM, its task, and the variables of the program that it connects.
 
-    `program` is a copy of the PROGRAM (`with_configured`) if VAR_CONFIG gives this program values of its own.
+    `program` is a copy of the PROGRAM (`with_configured`) if VAR_CONFIG gives this program different values.
     """
 
     name: str
@@ -97,7 +97,7 @@ def _task(env: Environment, task: t.Task, declarations: Declarations) -> Compile
 def with_configured(unit: t.SourceUnit, *, vendor: bool) -> t.SourceUnit:
     """Return `unit` with the addresses and initial values of VAR_CONFIG in the declarations of its programs.
 
-    If the programs of one type differ in them, each program with values of its own gets a copy of its PROGRAM (`copy_of`).
+    If the programs of one type differ in them, each program with different values gets a copy of its PROGRAM (`copy_of`).
     The result keeps the variables of parts (`configured`); each `target` begins with the name of a PROGRAM, or of its copy, or
     of a global variable. In a vendor's dialect a path may begin with the name of a PROGRAM, because its project has no
     CONFIGURATION. Raises `FileInvalid` for a variable that does not exist or already has an address or a value.

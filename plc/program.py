@@ -91,7 +91,8 @@ class Variable:
     `initial` is its value before the first scan. `max_bytes` and `depth` apply to message outputs. The value of a `retain`
     variable is kept when the process ends. `limits` are shown to users, and a force must be within them. `words` are the names of
     its values. `address` is the direct address of a `located` variable, such as ``%QX0.0``; "" if it is not known yet. An input
-    without `needs_tag` keeps its value while the system file binds it to no tag.
+    without `needs_tag` keeps its value while the system file binds it to no tag. Users do not see a `hidden` variable, which no
+    source declares.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Variable:
     located: bool = False
     type: str = ""
     """The type of the variable in the source; empty if the language of the program has no types of IEC 61131-3."""
+    hidden: bool = False
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:

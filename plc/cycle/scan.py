@@ -155,7 +155,7 @@ class Scan:
             item = _Input(bound.name, bound.program, variable, spec, index, binding)
             (self._messages if item.message else self._plain).append(item)
             own[variable.name] = item
-        namespace, names = bound.program.__dict__, [v.name for v in bound.variables(Role.INPUT)]
+        namespace, names = bound.program.__dict__, [v.name for v in bound.variables(Role.INPUT) if not v.hidden]
         self._seen[bound.name] = lambda: {
             name: _as_text(value) if isinstance(value := namespace[name], tuple) else value for name in names
         }

@@ -48,6 +48,7 @@ def _variables(bound: BoundProgram) -> dict[str, Any]:
             "words": {str(code): word for code, word in v.words},
         }
         for v in bound.program.variables.values()
+        if not v.hidden
     }
 
 

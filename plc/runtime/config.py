@@ -76,7 +76,8 @@ class PlcConfig:
     a stop by the watchdog, the programs start again `restart_after_ms` later, at most `max_restarts` times in a row.
     `retain_path`: the file of retained variables, ``""`` for none; with `cold` they begin with their initial values.
     `outputs_first`: outputs are published at the start of the cycle. `audit_path`: the file that records what users do to the
-    PLC, ``""`` for none.
+    PLC, ``""`` for none. `users`: by tag, what uses variables of programs, such as ``alarm high``, so that an online change must
+    not remove them.
     """
 
     image_path: str
@@ -97,6 +98,7 @@ class PlcConfig:
     cold: bool = False
     outputs_first: bool = False
     audit_path: str = ""
+    users: dict[str, list[str]] = field(default_factory=dict)
 
     def image_layout(self) -> ImageLayout:
         return ImageLayout.from_description(self.layout)

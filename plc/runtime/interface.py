@@ -7,7 +7,7 @@ no value.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.binding import BoundProgram
@@ -16,11 +16,11 @@ from fieldtwin.plc.st.program import StProgram, with_interface
 
 
 def fitted(
-    made: type[StProgram], running: BoundProgram, readers: Mapping[str, str]
+    made: type[StProgram], running: BoundProgram, readers: Mapping[str, list[str]]
 ) -> tuple[type[StProgram], list[str]]:
     """Return the class `made` with the interface of the program that runs, and the reasons why it cannot replace that program.
 
-    `readers` has, by tag, what uses variables of programs, such as ``program alarms``.
+    `readers` has, by tag, what uses variables of programs, such as ``program pump`` or ``alarm high``.
     """
     before, after = running.program.variables, made.variables
     reasons = [*_bound(running, before, after, readers), *_added(running, after)]
@@ -30,23 +30,29 @@ def fitted(
 
 
 def _bound(
-    running: BoundProgram, before: Mapping[str, Variable], after: Mapping[str, Variable], readers: Mapping[str, str]
+    running: BoundProgram,
+    before: Mapping[str, Variable],
+    after: Mapping[str, Variable],
+    readers: Mapping[str, list[str]],
 ) -> Iterator[str]:
     tags = {v.name: tag for v, tag in running.published()} | {name: b.tag for name, b in running.inputs.items()}
     for name, old in before.items():
-        new, user = after.get(name), ""
+        new, user, form = after.get(name), "", _form
+        remedy = "change its user as well and restart the run"
         if name in running.inputs or name in running.outputs:
             user = f"the system file binds it to {tags[name]}"
+            remedy = "change the system file as well and restart the run"
         elif old.kind is TagKind.MESSAGE:
             user = "its messages are in the process image"
-        elif name in tags:
-            user = f"{reader} uses it" if (reader := readers.get(tags[name], "")) else ""
+        elif used_by := readers.get(tags.get(name, "")):
+            user = f"{_listed(used_by)} use{'s' if len(used_by) == 1 else ''} it"
+            remedy, form = _remedy(used_by), _read_form
         if new is None:
             if user:
-                yield f"{old.role.value} {name} is removed, but {user}: keep it, or {_remedy(user)}"
-        elif user and _form(old) != _form(new):
+                yield f"{old.role.value} {name} is removed, but {user}: keep it, or {remedy}"
+        elif user and form(old) != form(new):
             change = f"({_text(old)} -> {_text(new)})"
-            yield f"{old.role.value} {name} changes {change}, but {user}: keep its declaration, or {_remedy(user)}"
+            yield f"{old.role.value} {name} changes {change}, but {user}: keep its declaration, or {remedy}"
         elif renamed := _renamed(old, new):
             yield (
                 f"{name} has other numbers for its values, which displays would name wrongly: {renamed}: keep the number of "
@@ -65,15 +71,23 @@ def _added(running: BoundProgram, after: Mapping[str, Variable]) -> Iterator[str
             yield f"output {name} is new, and its messages need a place in the process image: restart the run"
 
 
-def _remedy(user: str) -> str:
-    """Return what else can be done if `user` prevents the change."""
-    if user.startswith("the system file"):
-        return "change the system file as well and restart the run"
-    return "change its user as well and restart the run"
+def _remedy(users: Sequence[str]) -> str:
+    """Return what else can be done if `users` prevent the change. Servers follow the addresses in the source at a start."""
+    changed = [user for user in users if not user.startswith("server ")]
+    return f"change {_listed(changed)} as well and restart the run" if changed else "restart the run"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _form(v: Variable) -> tuple[object, ...]:
     return v.role, v.kind, v.max_bytes, v.depth
+
+
+def _read_form(v: Variable) -> tuple[object, ...]:
+    """Return the properties on which what reads a variable depends: an output may become a local, and the reverse."""
+    return v.role is Role.INPUT, v.kind
 
 
 def _text(v: Variable) -> str:

@@ -176,12 +176,12 @@ class PlcProcess:
         )
         if is_brief:
             return brief
-        outputs = runner.outputs.last()
+        outputs, hidden = runner.outputs.last(), runner.hidden_tags()
         return WholePlcStatus(
             **structs.asdict(brief),
             retained=runner.retained.values(),
-            inputs={tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
-            outputs=outputs,
+            inputs={tag: value.describe(now_ns) for tag, value in runner.inputs().items() if tag not in hidden},
+            outputs={tag: value for tag, value in outputs.items() if tag not in hidden},
             variables={f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         )
 

@@ -19,7 +19,7 @@ from typing import Any
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec, consumed_name
 from fieldtwin.gateway.core.image.layout import RegionLayout
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram, created_again
@@ -28,7 +28,7 @@ from fieldtwin.plc.cycle.publishing import OutputImage, TagChange
 from fieldtwin.plc.cycle.scan import Scan
 from fieldtwin.plc.cycle.start import InputsMissing, Starts
 from fieldtwin.plc.cycle.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
-from fieldtwin.plc.program import Program
+from fieldtwin.plc.program import Program, Role
 from fieldtwin.plc.runtime.config import PlcConfig, TaskSpec
 from fieldtwin.plc.runtime.retain import Retained
 from fieldtwin.plc.runtime.sources import ProgramSource, sources
@@ -133,10 +133,16 @@ class TaskRunner:
             for bound, p in zip(self.programs, self.config.programs, strict=True)
         ]
 
-    def readers(self) -> dict[str, str]:
-        """Return what uses variables of programs, by tag: other programs, and the tasks that they trigger."""
-        found = {b.tag: f"program {bound.name}" for bound in self.programs for b in bound.inputs.values()}
-        return found | {spec.single: f"task {spec.name}" for spec in self.config.tasks if spec.single}
+    def readers(self) -> dict[str, list[str]]:
+        """Return what uses variables of programs, by tag: other programs, the tasks that they trigger, and `PlcConfig.users`."""
+        found = {tag: list(users) for tag, users in self.config.users.items()}
+        for bound in self.programs:
+            for binding in bound.inputs.values():
+                found.setdefault(binding.tag, []).append(f"program {bound.name}")
+        for spec in self.config.tasks:
+            if spec.single:
+                found.setdefault(spec.single, []).append(f"task {spec.name}")
+        return {tag: list(dict.fromkeys(users)) for tag, users in found.items()}
 
     def _assemble(self, programs: list[BoundProgram], cold: bool) -> None:
         config = self.config
@@ -492,6 +498,11 @@ class TaskRunner:
     def _is_now(self, tag: str, inputs: bool) -> Scalar | None:
         return self.input(tag).value if inputs else self.outputs.last()[tag]
 
+    def hidden_tags(self) -> frozenset[str]:
+        """Return the tags of hidden variables, with the counters of their messages, which users do not see."""
+        tags = [b.inputs[v.name].tag for b in self.programs for v in b.variables(Role.INPUT) if v.hidden]
+        return frozenset(tags).union(map(consumed_name, tags))
+
     def _variables_of(self, tag: str, inputs: bool) -> list[tuple[Program, str]]:
         """Return the variables of programs that belong to a tag."""
         if inputs:
@@ -604,7 +615,9 @@ def _inside(spec: TagSpec, value: Scalar) -> None:
         )
 
 
-def _fitted(new: BoundProgram, old: BoundProgram, readers: Mapping[str, str], together: dict[Any, Any]) -> BoundProgram:
+def _fitted(
+    new: BoundProgram, old: BoundProgram, readers: Mapping[str, list[str]], together: dict[Any, Any]
+) -> BoundProgram:
     """Return `new` with the interface of `old`, which it replaces. Raises `FileInvalid` if the image does not allow it."""
     if new.program.variables == old.program.variables:
         return new

@@ -45,8 +45,9 @@ class TagView:
         self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}
 
     def names(self) -> list[str]:
-        """Return every tag once, inputs first."""
-        return list(self._specs[INPUTS] | self._specs[OUTPUTS])
+        """Return every tag once, inputs first, without those of hidden variables."""
+        hidden = self._runner.hidden_tags()
+        return [name for name in self._specs[INPUTS] | self._specs[OUTPUTS] if name not in hidden]
 
     def internal_names(self) -> list[str]:
         """Return the variables that are not tags, at most `MAX_INTERNAL` of each program."""

@@ -423,7 +423,7 @@ def program_class(
     connected = instance.connected if instance is not None else frozenset()
     tags = {v.name: made for v in found.variables if (made := _tag_of(v, connected)) is not None}
     if takes_writes:
-        tags = {WRITES: message_input(), **tags}
+        tags = {WRITES: replace(message_input(), hidden=True), **tags}
     decided = DecisionReader(
         unit,
         found.declared_name,

@@ -37,6 +37,7 @@ from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role, Variable
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
 from fieldtwin.twin.plant.alarms import load_alarms
+from fieldtwin.twin.plant.variable_users import variable_users
 from fieldtwin.twin.site.schema import StartForm
 from fieldtwin.twin.site.system import System
 
@@ -332,6 +333,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         retain_path=str(run_dir / "retain"),
         cold=cold,
         outputs_first=system.plc.outputs_at == "start",
+        users=variable_users(system),
     )
 
 

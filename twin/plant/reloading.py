@@ -142,12 +142,26 @@ def _unexplained(old: System, new: System) -> list[ConfigChange]:
         before = old.devices[name]
         if _fixed(device) != _fixed(before) or device.canopen != before.canopen:
             found.append(_change(new.file, ("devices", name), "", "", live=False))
-    if new.serving != old.serving or new.plc != old.plc:
+    located = list(_located(old, new))
+    found += located
+    if (new.serving != old.serving and not located) or new.plc != old.plc:
         found.append(_change(new.file, ("serve",), "", "", live=False))
     # A tag that became secret needs a restart: the process that serves metrics keeps the old list.
     if new.exported_tags != old.exported_tags:
         found.append(_change(new.file, ("metrics",), "", "", live=False))
     return found
+
+
+def _located(old: System, new: System) -> Iterator[ConfigChange]:
+    """Yield a change for each server whose located variables are different in the sources of the programs."""
+    before = {server.name: server for server in old.serving.serve}
+    for server in new.serving.serve:
+        if server.name not in before or server == before[server.name]:
+            continue
+        names = sorted({tag.tag for tag in {*server.tags} ^ {*before[server.name].tags}})
+        if names:
+            change = _change(new.file, ("serve", server.name), "", "", live=False)
+            yield replace(change, what=f"serve.{server.name}: the registers of {', '.join(names)} change with the source")
 
 
 def _fixed(device: DeviceConfig) -> tuple[object, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,15 @@ from rich.text import Text
 
 from fieldtwin.console import stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.runtime.tag_view import MAX_AT_ONCE, matches
 from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
 from fieldtwin.run.processes.plc_client import running_instances
 
 REFRESH_S = 0.25
+NAMES_EVERY = 8
+"""After so many refreshes the live table reads the names of the variables again, because an online change may add some."""
 IN_A_PIPE = 500
 ROOM_FOR_LIMITS = 100
 """A terminal with at least this many columns also shows the limits."""
@@ -148,13 +151,26 @@ def print_table(table: Table) -> None:
 async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
     client = await ControlClient.connect_unix(path)
     try:
-        names = await chosen_tags(client, patterns)
         with Live(console=stdout, auto_refresh=False, transient=True) as live:
-            while True:
-                live.update(tag_table(await ask_rows(client, names)), refresh=True)
+            async for rows in live_rows(client, patterns):
+                live.update(tag_table(rows), refresh=True)
                 await asyncio.sleep(REFRESH_S)
     finally:
         await client.aclose()
+
+
+async def live_rows(client: ControlClient, patterns: tuple[str, ...]) -> AsyncIterator[list[Row]]:
+    """Yield the rows of the tags that match, without end, with the variables that online changes add and remove."""
+    names: list[str] = []
+    for n in count():
+        if n % NAMES_EVERY == 0:
+            names = await chosen_tags(client, patterns)
+        try:
+            rows = await ask_rows(client, names)
+        except RemoteError:  # a variable was removed since the names were read
+            names = await chosen_tags(client, patterns)
+            rows = await ask_rows(client, names)
+        yield rows
 
 
 def print_status(status: PlcStatus) -> None:

@@ -381,11 +381,43 @@ def test_a_variable_that_another_program_reads_stays(tmp_path: Path) -> None:
         ("n : INT;", "m : INT;"), ("n := n + 1;", "m := m + 1;"), ("at.x := n;", ""), ("n MOD 2", "m MOD 2")
     )
     assert plc.refused(renamed) == (
-        "local n is removed, but program reader uses it: keep it, or change its user as well and restart the run"
+        "local n is removed, but program reader uses it: keep it, or change program reader as well and restart the run"
     )
     plc.change(edited(("n := n + 1;", "n := n + 100;")))
     plc.until(80)  # the reader sees the value of the scan before
     assert (plc.outputs()["reader.seen"], plc.outputs()["control.n"]) == (106, 206)
+
+
+@pytest.mark.parametrize(
+    ("users", "reason"),
+    [
+        (
+            ["alarm high"],
+            "local n is removed, but alarm high uses it: keep it, or change alarm high as well and restart the run",
+        ),
+        (
+            ["alarm high", "invariant never 1", "server hmi"],
+            "local n is removed, but alarm high, invariant never 1 and server hmi use it: keep it, or change alarm high and "
+            "invariant never 1 as well and restart the run",
+        ),
+        (["server hmi"], "local n is removed, but server hmi uses it: keep it, or restart the run"),
+    ],
+)
+def test_a_variable_that_the_system_file_uses_stays(tmp_path: Path, users: list[str], reason: str) -> None:
+    """Defect: an alarm on a variable that a change removed was never raised again."""
+    plc = Plc(tmp_path, users={"control.n": users})
+    plc.until(50)
+    renamed = edited(
+        ("n : INT;", "m : INT;"), ("n := n + 1;", "m := m + 1;"), ("at.x := n;", ""), ("n MOD 2", "m MOD 2")
+    )
+    assert plc.refused(renamed) == reason
+    typed = edited(("n : INT;", "n : REAL;"), ("n := n + 1;", "n := 1.0;"), ("at.x := n;", ""), ("n MOD 2 = 0", "TRUE"))
+    assert "local n changes (local of kind int -> local of kind real), but" in plc.refused(typed)
+    as_output = edited(("VAR n : INT;", "VAR_OUTPUT n : INT := 9; END_VAR VAR"))
+    change = plc.change(as_output)
+    assert change.changes[0].differences.changed == ["n (VAR INT -> VAR_OUTPUT INT)"]
+    plc.until(80)
+    assert plc.outputs()["control.n"] == 9 + 2
 
 
 def test_programs_of_one_file_continue_with_one_set_of_global_variables(tmp_path: Path) -> None:

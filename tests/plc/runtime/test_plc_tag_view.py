@@ -11,11 +11,14 @@ import pytest
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import INPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.plc_variables import writes_tag
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.runtime.about import describe_programs
 from fieldtwin.plc.runtime.acts import Acts
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
 from fieldtwin.plc.runtime.runner import TaskRunner
 from fieldtwin.plc.runtime.tag_view import TagView, matches
+from fieldtwin.plc.st.program import WRITES
 from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
 
 MS = 1_000_000
@@ -85,6 +88,28 @@ def test_every_tag_has_the_details_for_an_engineer(tmp_path: Path) -> None:
         rig.view.describe(["tank.level"] * 65, 0, 0)
     with pytest.raises(UsageError, match=r"no tag or variable 'tank\.\*'"):
         rig.view.describe(["tank.*"], 0, 0)
+
+
+def test_the_input_for_the_writes_of_servers_is_not_shown(tmp_path: Path) -> None:
+    """Defect: users saw the message input `st_writes` of a program, which their source does not declare."""
+    (tmp_path / "count.st").write_text("PROGRAM count VAR n AT %MW0 : INT; END_VAR n := n + 1; END_PROGRAM")
+    writes = writes_tag("count")
+    program = ProgramConfig("count", "count.st", {WRITES: InputBinding(writes.name)}, takes_writes=True)
+    layout = image_for([program.bind((str(tmp_path),))], {writes.name: writes})
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    image = layout.attach(memory)
+    config = PlcConfig("", layout.describe(), "", (program,), python_path=(str(tmp_path),))
+    now = [0]
+    runner = TaskRunner(config, image, lambda: now[0])
+    runner.start()
+    image.writer(INPUTS).publish([TagValue(0, Quality.GOOD) for _ in layout.regions[0].tags], 0)
+    runner.run_once()
+    assert TagView(image, runner).names() == ["count.n"]
+    assert runner.hidden_tags() == {"count.st_writes", "count.st_writes.consumed"}
+    (change,) = runner.why("count.n")
+    assert change["inputs"] == {}
+    assert list(describe_programs(runner.programs, runner.sources)["count"]["variables"]) == ["n"]
 
 
 def test_patterns_select_tags() -> None:
